@@ -1,0 +1,33 @@
+# `make demo` runs the whole pipeline with the tiny preset, `make test` the tests. Both install what they need.
+# Needs: Python 3.12 within reach (or the network, where uv can fetch one) and git.
+SHELL := /bin/bash
+UV := $(shell command -v uv 2>/dev/null || echo .bootstrap/bin/uv)
+RUN := $(UV) run --frozen
+
+.PHONY: demo test lint install record clean
+
+demo: install
+	$(RUN) worldline pipeline --preset tiny
+
+test: install
+	$(RUN) pytest
+
+lint: install
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) lint-imports
+	$(RUN) pyright
+
+install: | $(UV)
+	$(UV) sync --frozen --extra sim
+
+.bootstrap/bin/uv:
+	python3 -m venv .bootstrap
+	.bootstrap/bin/pip install --quiet uv
+
+# The recordings that the demo uses, made again from their seeds (needs software GL, see README).
+record: install
+	$(RUN) worldline record --config configs/recording/sample.yaml --output artifacts/recorded
+
+clean:
+	rm -rf .bootstrap .venv

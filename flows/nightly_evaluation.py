@@ -1,0 +1,32 @@
+"""The nightly flow: roll out and evaluate the shipped checkpoints, and compare with the nights before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from prefect import flow, task
+from worldline_core.report.nightly import compare_with_history
+
+from tasks.artifact_task import ArtifactReference, artifact_task
+from worldline_core.config import load_config
+from worldline_core.pipeline.config import PipelineConfig
+from worldline_core.pipeline.plan import plan, without_training
+
+compare_nights = task(compare_with_history, name="compare_nights", persist_result=False)
+
+
+@flow(name="nightly-evaluation")
+def nightly_evaluation(
+    preset: str | None = "nightly",
+    config: Path | None = None,
+    overrides: tuple[str, ...] = (),
+    artifacts: Path = Path("artifacts"),
+) -> Path:
+    """Rollouts and evaluations of the shipped checkpoints; returns the folder of the comparison."""
+    settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
+    done: dict[str, ArtifactReference] = {}
+    for node in without_training(plan(settings, Path.cwd())):
+        inputs = {name: done[source] if isinstance(source, str) else source for name, source in node.inputs.items()}
+        done[node.name] = artifact_task(node.step)(node.config, inputs, store_root=artifacts.resolve(), name=node.name)
+    scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
+    return compare_nights(scores, artifacts.resolve() / "nightly")

@@ -1,0 +1,96 @@
+"""A step of the core as a Prefect task whose cache is the artifact store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from prefect import Task
+from prefect.cache_policies import CachePolicy
+from prefect.context import TaskRunContext
+
+from worldline_core.config.base import StrictModel
+from worldline_core.pipeline.steps import Step, get_step, run_step
+from worldline_core.store.store import ArtifactStore
+
+
+class ArtifactReference(StrictModel):
+    """What travels between tasks: where an artifact lies and what is in it. Small, JSON, no data."""
+
+    step: str
+    path: Path
+    digest: str
+
+
+class ArtifactTask:
+    """Calls one step through Prefect.
+
+    Prefect's cache key is the store's own key (step, version, config, digests of the inputs), so Prefect shows a
+    task as cached exactly when the store has the artifact. A record whose artifact was deleted is refreshed.
+    """
+
+    def __init__(self, step: Step) -> None:
+        self.step = step
+        self._task = Task(
+            fn=_run_step,
+            name=step.name,
+            description=step.summary,
+            cache_policy=CachePolicy.from_cache_key_fn(_cache_key),
+            persist_result=True,
+            result_serializer="json",
+        )
+
+    def __call__(
+        self,
+        config: StrictModel,
+        inputs: Mapping[str, Path | ArtifactReference],
+        *,
+        store_root: Path,
+        name: str | None = None,
+    ) -> ArtifactReference:
+        """Run the step (or find it done). ``name`` is what Prefect shows; the step's name by default."""
+        store = ArtifactStore(store_root)
+        references = {key: _reference(value, store) for key, value in inputs.items()}
+        finished = store.find(self.step.name, _key(store, self.step, config, references)) is not None
+        runnable = self._task.with_options(refresh_cache=not finished, task_run_name=name or self.step.name)
+        result = runnable(
+            self.step.name,
+            config.model_dump(mode="json"),
+            {key: value.model_dump(mode="json") for key, value in references.items()},
+            str(store.root),
+        )
+        return ArtifactReference.model_validate(result)
+
+
+def _run_step(
+    step_name: str, config: dict[str, Any], inputs: dict[str, dict[str, Any]], store_root: str
+) -> dict[str, Any]:
+    """The body of every task: plain JSON in and out, so that any task runner can carry it."""
+    folders = {name: Path(value["path"]) for name, value in inputs.items()}
+    model = get_step(step_name).load_config().model_validate(config)
+    artifact = run_step(ArtifactStore(Path(store_root)), step_name, model, folders)
+    return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest).model_dump(mode="json")
+
+
+def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:
+    step = get_step(parameters["step_name"])
+    config = step.load_config().model_validate(parameters["config"])
+    inputs = {name: ArtifactReference.model_validate(value) for name, value in parameters["inputs"].items()}
+    return f"{step.name}-{_key(ArtifactStore(Path(parameters['store_root'])), step, config, inputs)}"
+
+
+def _key(store: ArtifactStore, step: Step, config: StrictModel, inputs: Mapping[str, ArtifactReference]) -> str:
+    digests = {name: reference.digest for name, reference in sorted(inputs.items())}
+    return store.key(step.name, step.version, config, digests)
+
+
+def _reference(value: Path | ArtifactReference, store: ArtifactStore) -> ArtifactReference:
+    if isinstance(value, ArtifactReference):
+        return value
+    return ArtifactReference(step="folder", path=value.resolve(), digest=store.input_digest(value))
+
+
+def artifact_task(step_name: str) -> ArtifactTask:
+    """The Prefect task of a step."""
+    return ArtifactTask(get_step(step_name))

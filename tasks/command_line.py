@@ -1,0 +1,95 @@
+"""One step alone, from the command line: the same config and the same store as in a flow, no Prefect server."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from worldline_core.config import load_config
+from worldline_core.errors import ConfigError, WorldLineError
+from worldline_core.pipeline.steps import get_step, run_step
+from worldline_core.store.store import Artifact, ArtifactStore
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments that say which configuration and which store a command works on."""
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("--preset", help="a preset in configs/ (default: tiny)")
+    choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+    )
+    parser.add_argument(
+        "--artifacts", type=Path, default=Path("artifacts"), help="where artifacts live (default: artifacts)"
+    )
+
+
+def add_task_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of a standalone step."""
+    add_config_arguments(parser)
+    parser.add_argument(
+        "--input", action="append", default=[], metavar="NAME=FOLDER", dest="inputs",
+        help="feed this folder instead of the artifact that the preset would use",
+    )  # fmt: skip
+    parser.add_argument(
+        "--node", help="which node of the run, when a step occurs more than once (rollout.shipped_stage2)"
+    )
+
+
+def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
+    """Run one step with parsed arguments."""
+    step = get_step(step_name)
+    store = ArtifactStore(arguments.artifacts)
+    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "tiny"
+    from worldline_core.pipeline.sources import source_inputs
+
+    if arguments.inputs or not step.inputs:
+        config = load_config(
+            step.load_config(), preset=preset, path=arguments.config, overrides=arguments.overrides, section=step_name
+        )
+        inputs = source_inputs(config, Path.cwd()) if step_name == "curate" else {}
+        return run_step(store, step_name, config, inputs | dict(_parse_input(text) for text in arguments.inputs))
+
+    from worldline_core.pipeline.config import PipelineConfig
+    from worldline_core.pipeline.plan import plan, run_node
+
+    whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    nodes = plan(whole, Path.cwd())
+    candidates = [node.name for node in nodes if node.step == step_name]
+    name = arguments.node or (step_name if step_name in candidates or not candidates else "")
+    if not name:
+        raise ConfigError(f"{step_name} occurs more than once in this run", expected=f"--node with one of {candidates}")
+    return run_node(name, nodes, store)
+
+
+def _parse_input(text: str) -> tuple[str, Path]:
+    name, separator, folder = text.partition("=")
+    if not separator or not name or not folder:
+        raise ConfigError("An input has the form NAME=FOLDER", got=text)
+    return name, Path(folder)
+
+
+def run_task_command(step_name: str, argv: Sequence[str] | None = None) -> None:
+    """Entry point of ``python -m tasks.<step>``."""
+    parser = argparse.ArgumentParser(prog=f"python -m tasks.{step_name}", description=get_step(step_name).summary)
+    add_task_arguments(parser)
+    arguments = parser.parse_args(argv)
+    exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments)))
+
+
+def print_artifact(artifact: Artifact) -> None:
+    """One line that a script can cut: where the artifact is, its digest, and whether it was there already."""
+    print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
+
+
+def exit_with_clear_errors(action: Callable[[], object]) -> None:
+    """Run a command; a WorldLineError is printed without a traceback and ends it with status 1."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        action()
+    except WorldLineError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from error

@@ -1,0 +1,87 @@
+"""The strict YAML loader: every mistake names its file and dotted path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from worldline_core.config import StrictModel, load_config
+from worldline_core.config.loader import apply_overrides, preset_names, preset_path, read_yaml
+from worldline_core.errors import ConfigError
+
+
+class Inner(StrictModel):
+    rate: float = 1.0
+    steps: int = 3
+
+
+class Outer(StrictModel):
+    inner: Inner = Inner()
+    name: str = "x"
+
+
+def _write(folder: Path, text: str) -> Path:
+    path = folder / "c.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_reads_and_overrides(tmp_path: Path) -> None:
+    path = _write(tmp_path, "inner: {rate: 0.5}\nname: run\n")
+    config = load_config(Outer, path=path, overrides=["inner.steps=9", "name=other"])
+    assert config == Outer(inner=Inner(rate=0.5, steps=9), name="other")
+    assert load_config(Inner, path=path, section="inner") == Inner(rate=0.5)
+
+
+def test_unknown_key_suggests_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"inner\.stepz: unknown key; did you mean 'steps'"):
+        load_config(Outer, path=_write(tmp_path, "inner: {stepz: 4}"))
+
+
+def test_unknown_override_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"inner\.rat: unknown key"):
+        load_config(Outer, path=_write(tmp_path, "name: x"), overrides=["inner.rat=2"])
+
+
+def test_bad_value_names_its_path(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"inner\.steps: .*valid integer"):
+        load_config(Outer, path=_write(tmp_path, "inner: {steps: many}"))
+
+
+def test_not_a_number_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"inner\.rate: .*finite"):
+        load_config(Outer, path=_write(tmp_path, "inner: {rate: .nan}"))
+
+
+def test_duplicate_key_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="given twice"):
+        read_yaml(_write(tmp_path, "a: 1\na: 2\n"))
+
+
+def test_object_construction_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Not valid YAML"):
+        read_yaml(_write(tmp_path, "a: !!python/object/apply:os.system ['true']"))
+
+
+def test_missing_file_and_wrong_shape(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No such configuration file"):
+        read_yaml(tmp_path / "none.yaml")
+    with pytest.raises(ConfigError, match="holds one mapping"):
+        read_yaml(_write(tmp_path, "- 1\n- 2\n"))
+
+
+def test_override_forms(tmp_path: Path) -> None:
+    assert apply_overrides({"a": {"b": 1}}, ["a.c=[1, 2]", "d=null"]) == {"a": {"b": 1, "c": [1, 2]}, "d": None}
+    with pytest.raises(ConfigError, match=r"form a\.b=value"):
+        apply_overrides({}, ["a.b"])
+    with pytest.raises(ConfigError, match="not a mapping"):
+        apply_overrides({"a": 1}, ["a.b=2"])
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        apply_overrides({}, ["a=[1"])
+
+
+def test_unknown_preset_lists_those_there_are() -> None:
+    assert "tiny" in preset_names()
+    with pytest.raises(ConfigError, match="did you mean 'tiny'"):
+        preset_path("tinny")

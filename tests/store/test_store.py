@@ -1,0 +1,170 @@
+"""The store: content keys, atomic finish, continuation after a kill, verification."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from worldline_core.config import StrictModel
+from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
+from worldline_core.store.digest import digest_folder, digest_value
+from worldline_core.store.store import ArtifactStore
+
+
+class CountConfig(StrictModel):
+    upto: int = 5
+    seed: int = 7
+
+
+def count(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """Writes one file a number and skips those that are there: a step that continues."""
+    written = 0
+    for number in range(config.upto):
+        path = output / f"{number}.txt"
+        if not path.exists():
+            write_bytes_atomic(path, str(number).encode())
+            written += 1
+    (output / "run").mkdir(exist_ok=True)
+    (output / "run" / "timing.txt").write_text(str(time.time()))
+    return {"written": written}
+
+
+def test_second_run_is_cached(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    first = store.run("count", 1, count, CountConfig(), {})
+    second = store.run("count", 1, count, CountConfig(), {})
+    assert not first.cached
+    assert second.cached
+    assert (second.path, second.digest) == (first.path, first.digest)
+    store.verify(second)
+
+
+@pytest.mark.parametrize("change", ["config", "version", "step", "input"])
+def test_key_depends_on_everything_that_matters(tmp_path: Path, change: str) -> None:
+    store = ArtifactStore(tmp_path)
+    base = store.key("count", 1, CountConfig(), {"a": "x"})
+    other = {
+        "config": store.key("count", 1, CountConfig(upto=6), {"a": "x"}),
+        "version": store.key("count", 2, CountConfig(), {"a": "x"}),
+        "step": store.key("recount", 1, CountConfig(), {"a": "x"}),
+        "input": store.key("count", 1, CountConfig(), {"a": "y"}),
+    }[change]
+    assert base != other
+    assert base == store.key("count", 1, CountConfig(), {"a": "x"})
+
+
+def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+
+    def fail_halfway(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        count(CountConfig(upto=2), inputs, output)
+        raise DataError("stopped", where="halfway")
+
+    with pytest.raises(DataError, match="stopped"):
+        store.run("count", 1, fail_halfway, CountConfig(), {})
+    assert store.find("count", store.key("count", 1, CountConfig(), {})) is None
+    artifact = store.run("count", 1, count, CountConfig(), {})
+    manifest = json.loads((artifact.path / "manifest.json").read_text())
+    assert manifest["resumed"] is True
+    assert manifest["metrics"] == {"written": 3}
+    assert manifest["seeds"] == {"seed": 7}
+    undisturbed = ArtifactStore(tmp_path / "other").run("count", 1, count, CountConfig(), {})
+    assert undisturbed.digest == artifact.digest
+
+
+def _slow_count(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    for number in range(config.upto):
+        path = output / f"{number}.txt"
+        if not path.exists():
+            write_bytes_atomic(path, str(number).encode())
+            time.sleep(0.05)
+    return {}
+
+
+def _run_slow(root: Path) -> None:
+    ArtifactStore(root).run("slow", 1, _slow_count, CountConfig(upto=40), {})
+
+
+def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
+    process = multiprocessing.get_context("fork").Process(target=_run_slow, args=(tmp_path / "killed",))
+    process.start()
+    deadline = time.time() + 30
+    while time.time() < deadline and len(list((tmp_path / "killed").rglob("[0-9]*.txt"))) < 3:
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    partial = list((tmp_path / "killed" / "slow").glob("*.partial"))
+    assert len(partial) == 1
+    _run_slow(tmp_path / "killed")
+    _run_slow(tmp_path / "undisturbed")
+    digests = [
+        json.loads(next((tmp_path / name / "slow").glob("*/manifest.json")).read_text())["digest"]
+        for name in ("killed", "undisturbed")
+    ]
+    assert digests[0] == digests[1]
+    assert not list((tmp_path / "killed" / "slow").glob("*.partial"))
+
+
+def test_deleting_an_artifact_rebuilds_it(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    first = store.run("count", 1, count, CountConfig(), {})
+    (first.path / "manifest.json").unlink()
+    again = store.run("count", 1, count, CountConfig(), {})
+    assert not again.cached
+    assert again.digest == first.digest
+
+
+def test_changed_artifact_is_noticed(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    artifact = store.run("count", 1, count, CountConfig(), {})
+    (artifact.path / "3.txt").write_text("33")
+    with pytest.raises(ArtifactError, match="changed after it was finished"):
+        store.verify(artifact)
+
+
+def test_damaged_manifest_is_named(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    artifact = store.run("count", 1, count, CountConfig(), {})
+    (artifact.path / "manifest.json").write_text("{")
+    with pytest.raises(ArtifactError, match="manifest is damaged"):
+        store.find("count", artifact.key)
+
+
+def test_missing_input_names_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="does not exist"):
+        ArtifactStore(tmp_path).run("count", 1, count, CountConfig(), {"episodes": tmp_path / "none"})
+
+
+def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (tmp_path / "secret").write_text("s")
+    (folder / "link").symlink_to(tmp_path / "secret")
+    with pytest.raises(ArtifactError, match="leads out of the folder"):
+        digest_folder(folder)
+
+
+def test_atomic_write_leaves_nothing_behind_on_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no"), atomic_path(tmp_path / "x.txt") as temporary:
+        temporary.write_text("half")
+        raise ConfigError("no")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_is_canonical(tmp_path: Path) -> None:
+    write_json_atomic(tmp_path / "a.json", {"b": 1, "a": [2.5, None]})
+    write_json_atomic(tmp_path / "b.json", {"a": [2.5, None], "b": 1})
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    assert digest_value({"b": 1, "a": 2}) == digest_value({"a": 2, "b": 1})
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json_atomic(tmp_path / "c.json", {"a": float("nan")})

@@ -1,0 +1,83 @@
+"""Prefect's cache and the artifact store agree: cached, rebuilt after deletion, rerun after a change."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect import flow
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import TaskRunFilter
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
+from prefect.testing.utilities import prefect_test_harness
+
+from tasks.artifact_task import ArtifactReference, artifact_task
+from worldline_core.config import StrictModel
+from worldline_core.pipeline import steps
+from worldline_core.pipeline.steps import Step
+
+
+class WriteConfig(StrictModel):
+    text: str = "a"
+
+
+def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    before = "".join((folder / "text").read_text() for folder in inputs.values())
+    (output / "text").write_text(before + config.text)
+    return {}
+
+
+class WriteStep(Step):
+    def load_function(self) -> Any:
+        return write
+
+    def load_config(self) -> type[StrictModel]:
+        return WriteConfig
+
+
+@pytest.fixture(scope="module")
+def prefect_server() -> Iterator[None]:
+    with prefect_test_harness(server_startup_timeout=90):
+        yield
+
+
+def _run(root: Path, first: str, second: str) -> tuple[ArtifactReference, ArtifactReference]:
+    @flow
+    def two_steps() -> tuple[ArtifactReference, ArtifactReference]:
+        one = artifact_task("write_one")(WriteConfig(text=first), {}, store_root=root, name="one")
+        two = artifact_task("write_two")(WriteConfig(text=second), {"before": one}, store_root=root, name="two")
+        return one, two
+
+    return two_steps()
+
+
+def _last_states() -> dict[str, str]:
+    with get_client(sync_client=True) as client:
+        runs = client.read_task_runs(task_run_filter=TaskRunFilter(), sort="EXPECTED_START_TIME_ASC")  # type: ignore[arg-type]
+    return {run.name: run.state.name for run in runs if run.state is not None}
+
+
+def test_prefect_shows_what_the_store_has(
+    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
+        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        one, two = _run(tmp_path, "a", "b")
+        assert (two.path / "text").read_text() == "ab"
+        assert _last_states() == {"one": "Completed", "two": "Completed"}
+
+        assert _run(tmp_path, "a", "b") == (one, two)
+        assert _last_states() == {"one": "Cached", "two": "Cached"}
+
+        changed_one, changed_two = _run(tmp_path, "a", "c")
+        assert (changed_one, (changed_two.path / "text").read_text()) == (one, "ac")
+        assert _last_states() == {"one": "Cached", "two": "Completed"}
+
+        shutil.rmtree(one.path)
+        assert _run(tmp_path, "a", "b") == (one, two)
+        assert (one.path / "text").read_text() == "a"
+        assert _last_states() == {"one": "Completed", "two": "Cached"}

@@ -1,0 +1,1 @@
+"""WorldLine: from robot recordings to an action-driven visual simulator."""

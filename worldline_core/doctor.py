@@ -1,0 +1,168 @@
+"""What this machine can do: cores, memory, accelerators, codecs, GL, weights, Prefect."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.util
+import os
+import platform
+import shutil
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+
+def examine_machine(project: Path) -> list[dict[str, Any]]:
+    """One finding a line: name, status ("ok", "missing", "optional"), what was found, and what to do."""
+    return [
+        _system(),
+        _memory(),
+        _disk(project),
+        _accelerator(),
+        _bfloat16(),
+        _codec(),
+        *_packages(),
+        _software_gl(),
+        *_weights(project),
+        _prefect_api(),
+    ]
+
+
+def format_findings(findings: list[dict[str, Any]]) -> str:
+    """A table for people."""
+    marks = {"ok": "ok      ", "missing": "MISSING ", "optional": "optional"}
+    width = max(len(finding["name"]) for finding in findings)
+    lines = [f"{marks[finding['status']]} {finding['name']:<{width}}  {finding['found']}" for finding in findings]
+    advice = [f"  {finding['name']}: {finding['next_step']}" for finding in findings if finding["next_step"]]
+    return "\n".join(lines + (["", "What you can do:"] + advice if advice else []))
+
+
+def _finding(name: str, status: str, found: str, next_step: str = "") -> dict[str, Any]:
+    return {"name": name, "status": status, "found": found, "next_step": next_step}
+
+
+def _system() -> dict[str, Any]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return _finding(
+        "system", "ok", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores"
+    )
+
+
+def _memory() -> dict[str, Any]:
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    advice = "" if total >= 6 else "the tiny preset needs about 6 GiB; lower batch sizes with --set"
+    return _finding("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
+
+
+def _disk(project: Path) -> dict[str, Any]:
+    free = shutil.disk_usage(project).free / 2**30
+    return _finding(
+        "disk", "ok" if free >= 10 else "missing", f"{free:.0f} GiB free", "" if free >= 10 else "free some space"
+    )
+
+
+def _accelerator() -> dict[str, Any]:
+    import torch
+
+    if torch.cuda.is_available():
+        properties = torch.cuda.get_device_properties(0)
+        return _finding(
+            "accelerator",
+            "ok",
+            f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}",
+        )
+    return _finding(
+        "accelerator", "optional", f"none; torch {torch.__version__} on the CPU",
+        "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more",
+    )  # fmt: skip
+
+
+def _bfloat16() -> dict[str, Any]:
+    import torch
+
+    fast = (
+        bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
+        and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    )
+    return _finding("CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower")
+
+
+def _codec() -> dict[str, Any]:
+    import av
+
+    missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
+    if missing:
+        return _finding(
+            "video codecs", "missing", f"PyAV {av.__version__} without {', '.join(missing)}", "reinstall av from PyPI"
+        )
+    return _finding("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
+
+
+def _packages() -> list[dict[str, Any]]:
+    extras = {"mujoco": "sim (worldline record)"}
+    findings = []
+    for package, purpose in extras.items():
+        present = importlib.util.find_spec(package) is not None
+        advice = "" if present else f"uv sync --extra {purpose.split()[0]}"
+        findings.append(
+            _finding(f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice)
+        )
+    return findings
+
+
+def _software_gl() -> dict[str, Any]:
+    libraries = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
+    if libraries:
+        return _finding("headless GL", "ok", ", ".join(libraries))
+    return _finding(
+        "headless GL",
+        "optional",
+        "none",
+        "only `worldline record` needs it: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri",
+    )
+
+
+def _weights(project: Path) -> list[dict[str, Any]]:
+    findings = []
+    for name in ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter"):
+        folder = project / "artifacts" / "shipped" / "models" / name
+        present = any(folder.glob("*.safetensors"))
+        findings.append(
+            _finding(
+                f"weights {name}",
+                "ok" if present else "missing",
+                str(folder.relative_to(project)) if present else "absent",
+            )
+        )
+    hub = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")) / "hub"
+    for repository in (
+        "nvidia/Cosmos3-Nano",
+        "facebook/vjepa2-vitg-fpc64-384",
+        "facebook/sam3",
+        "Qwen/Qwen3-VL-8B-Instruct",
+    ):
+        present = (hub / f"models--{repository.replace('/', '--')}").is_dir()
+        findings.append(
+            _finding(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
+                     "" if present else "only the full-size preset needs it; download it where a hub is reachable")
+        )  # fmt: skip
+    return findings
+
+
+def _prefect_api() -> dict[str, Any]:
+    url = os.environ.get("PREFECT_API_URL")
+    if not url:
+        return _finding("Prefect API", "ok", "none set: flows start a temporary server")
+    if not url.startswith(("http://", "https://")):
+        return _finding("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
+    try:
+        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=3) as answer:  # noqa: S310 - scheme checked above
+            return _finding("Prefect API", "ok", f"{url} answers {answer.status}")
+    except (urllib.error.URLError, TimeoutError) as error:
+        return _finding(
+            "Prefect API",
+            "missing",
+            f"{url}: {error}",
+            "start it with `prefect server start`, or unset PREFECT_API_URL",
+        )

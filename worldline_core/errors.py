@@ -1,0 +1,70 @@
+"""Errors that a user can act on: what happened, where, what was expected, what was found, what to do next."""
+
+from __future__ import annotations
+
+
+class WorldLineError(Exception):
+    """Base of every error raised on purpose.
+
+    Args:
+        what: one sentence saying what is wrong.
+        where: the episode, file, key or field concerned.
+        expected: what would have been right.
+        got: what was found instead.
+        next_step: what the reader can do about it.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: object | None = None,
+        expected: object | None = None,
+        got: object | None = None,
+        next_step: str | None = None,
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.expected = expected
+        self.got = got
+        self.next_step = next_step
+        details = (("where", where), ("expected", expected), ("got", got), ("next step", next_step))
+        super().__init__("\n".join([what, *(f"  {name}: {value}" for name, value in details if value is not None)]))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only fields are lost by the default reduction, and errors cross process boundaries.
+        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.next_step)
+
+
+def _rebuild(
+    kind: type[WorldLineError], what: str, where: object, expected: object, got: object, next_step: str | None
+) -> WorldLineError:
+    return kind(what, where=where, expected=expected, got=got, next_step=next_step)
+
+
+class ConfigError(WorldLineError):
+    """A configuration value, file, preset or override is not usable."""
+
+
+class DataError(WorldLineError):
+    """A recording, or something read from one, is not usable."""
+
+
+class CalibrationError(DataError):
+    """Camera or kinematic calibration is invalid."""
+
+
+class ArtifactError(WorldLineError):
+    """A stored artifact is missing, damaged, or of another kind."""
+
+
+class CheckpointError(ArtifactError):
+    """A model checkpoint does not fit what was asked of it."""
+
+
+class TrainingError(WorldLineError):
+    """Training cannot go on (for example, a loss that is not finite)."""
+
+
+class UnavailableError(WorldLineError):
+    """Something optional (weights, an extra, a device, a server) is needed but not there."""

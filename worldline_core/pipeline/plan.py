@@ -1,0 +1,182 @@
+"""What flows where, as data: the nodes of a run and the artifacts that feed each of them.
+
+The flow runs the nodes as Prefect tasks, a standalone task finds its inputs here; both therefore meet in the store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from worldline_core.config.base import StrictModel
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.pipeline.config import PipelineConfig, RolloutRun
+from worldline_core.pipeline.sources import source_inputs
+from worldline_core.pipeline.steps import get_step, run_step
+from worldline_core.store.store import Artifact, ArtifactStore
+
+
+@dataclass(frozen=True)
+class Node:
+    """One step of a run. ``inputs`` maps the step's input names to other nodes (str) or to folders (Path)."""
+
+    name: str
+    step: str
+    config: StrictModel
+    inputs: Mapping[str, str | Path]
+
+
+def plan(config: PipelineConfig, project: Path) -> list[Node]:
+    """The nodes of a run, each after those it needs. Relative folders are taken from ``project``."""
+    return list(_nodes(config, project))
+
+
+def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
+    models = {name: project / path for name, path in config.models.model_dump().items() if path is not None}
+    yield Node("curate", "curate", config.curate, source_inputs(config.curate, project))
+    yield Node("filter", "filter", config.filter, {"episodes": "curate"})
+    yield Node("render_actions", "render_actions", config.render_actions, {"episodes": "filter"})
+    yield Node(
+        "encode_latents",
+        "encode_latents",
+        config.encode_latents,
+        {"episodes": "filter", "tokenizer": models["tokenizer"]},
+    )
+    data: dict[str, str | Path] = {"latents": "encode_latents", "episodes": "filter"}
+    base: dict[str, str | Path] = {"base": models["base"]} if "base" in models else {}
+    yield Node("train_stage1", "train_stage1", config.train_stage1, {**data, **base})
+    teacher: dict[str, str | Path] = {"teacher": models["teacher"]} if "teacher" in models else {}
+    yield Node(
+        "train_stage2",
+        "train_stage2",
+        config.train_stage2,
+        {**data, "tracks": "render_actions", "stage1": "train_stage1", **teacher},
+    )
+    yield Node(
+        "distill",
+        "distill",
+        config.distill,
+        {**data, "tracks": "render_actions", "stage2": "train_stage2", "tokenizer": models["tokenizer"]},
+    )
+    if config.curate_banks is not None:
+        yield Node("curate.banks", "curate", config.curate_banks, source_inputs(config.curate_banks, project))
+        yield Node("render_actions.banks", "render_actions", config.render_actions, {"episodes": "curate.banks"})
+    for name, run in config.rollouts.items():
+        yield _rollout_node(name, run, models)
+    yield from _evaluation_nodes(config, models)
+
+
+def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path]) -> Node:
+    banks = run.episodes == "banks"
+    checkpoints: dict[str, str | Path] = {
+        "stage2": "train_stage2",
+        "causal": "distill",
+        **{f"shipped_{kind}": models[kind] for kind in ("stage2", "causal") if kind in models},
+    }
+    inputs: dict[str, str | Path] = {
+        "episodes": "curate.banks" if banks else "filter",
+        "tracks": "render_actions.banks" if banks else "render_actions",
+        "tokenizer": models["tokenizer"],
+    }
+    if run.checkpoint is not None:
+        inputs["checkpoint"] = checkpoints[run.checkpoint]
+    return Node(f"rollout.{name}", "rollout", run.config, inputs)
+
+
+def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path]) -> Iterator[Node]:
+    segmenter: dict[str, str | Path] = {"segmenter": models["segmenter"]} if "segmenter" in models else {}
+
+    def rollouts(episodes: str) -> dict[str, str | Path]:
+        return {
+            f"rollouts.{name}": f"rollout.{name}" for name, run in config.rollouts.items() if run.episodes == episodes
+        }
+
+    recordings = rollouts("recordings")
+    scores: dict[str, str | Path] = {}
+    if recordings:
+        shared: dict[str, str | Path] = {"episodes": "filter", "tracks": "render_actions", **segmenter}
+        yield Node("evaluate_video", "evaluate_video", config.evaluate_video, {**shared, **recordings})
+        yield Node("evaluate_policy", "evaluate_policy", config.evaluate_policy, {**shared, **recordings})
+        scores |= {"evaluate_video": "evaluate_video", "evaluate_policy": "evaluate_policy"}
+    if config.evaluate_planning is not None and (banks := rollouts("banks")):
+        inputs: dict[str, str | Path] = {
+            "banks": "curate.banks",
+            "tracks": "render_actions.banks",
+            **segmenter,
+            **banks,
+        }
+        yield Node("evaluate_planning", "evaluate_planning", config.evaluate_planning, inputs)
+        scores["evaluate_planning"] = "evaluate_planning"
+    trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")
+    report: dict[str, str | Path] = {name: name for name in trained}
+    report |= {f"rollout.{name}": f"rollout.{name}" for name in config.rollouts}
+    report |= {f"models.{name}": path for name, path in models.items()}
+    yield Node("report", "report", config.report, {**report, **scores})
+
+
+def find_artifacts(nodes: list[Node], store: ArtifactStore) -> dict[str, Artifact]:
+    """The finished artifacts among ``nodes`` (a node whose inputs are unfinished cannot be found)."""
+    found: dict[str, Artifact] = {}
+    for node in nodes:
+        inputs = _resolve(node, found)
+        if inputs is None:
+            continue
+        digests = {name: store.input_digest(path) for name, path in sorted(inputs.items())}
+        step = get_step(node.step)
+        artifact = store.find(step.name, store.key(step.name, step.version, node.config, digests))
+        if artifact is not None:
+            found[node.name] = artifact
+    return found
+
+
+def run_node(name: str, nodes: list[Node], store: ArtifactStore) -> Artifact:
+    """Run one node on the finished artifacts of those before it.
+
+    Raises:
+        ConfigError: there is no such node.
+        ArtifactError: an artifact that it needs is not finished; the message names the step to run first.
+    """
+    by_name = {node.name: node for node in nodes}
+    if name not in by_name:
+        raise ConfigError("Unknown node", expected=f"one of {', '.join(by_name)}", got=name)
+    node = by_name[name]
+    found = find_artifacts(nodes[: nodes.index(node)], store)
+    inputs = _resolve(node, found)
+    if inputs is None:
+        missing = [source for source in node.inputs.values() if isinstance(source, str) and source not in found]
+        raise ArtifactError(
+            f"{name} needs artifacts that are not finished",
+            where=store.root,
+            got=f"missing: {', '.join(missing)}",
+            next_step=f"run `worldline task {missing[0]}` with the same preset first, or `worldline pipeline`",
+        )
+    return run_step(store, node.step, node.config, inputs)
+
+
+def _resolve(node: Node, found: Mapping[str, Artifact]) -> dict[str, Path] | None:
+    inputs: dict[str, Path] = {}
+    for name, source in node.inputs.items():
+        if isinstance(source, Path):
+            inputs[name] = source
+        elif source in found:
+            inputs[name] = found[source].path
+        else:
+            return None
+    return inputs
+
+
+def without_training(nodes: list[Node]) -> list[Node]:
+    """The nodes that evaluate existing checkpoints: whatever depends on a training step is left out."""
+    dropped = {
+        node.name for node in nodes if node.step in ("encode_latents", "train_stage1", "train_stage2", "distill")
+    }
+    kept: list[Node] = []
+    for node in nodes:
+        needed = {name: source for name, source in node.inputs.items() if source not in dropped}
+        collects = node.step in ("report", "evaluate_video", "evaluate_policy", "evaluate_planning")
+        if node.name in dropped or (len(needed) < len(node.inputs) and not collects):
+            dropped.add(node.name)
+            continue
+        kept.append(Node(node.name, node.step, node.config, needed))
+    return kept

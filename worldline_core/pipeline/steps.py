@@ -1,0 +1,220 @@
+"""The verbs: each step's version, core function, configuration and inputs.
+
+Functions and configs are named, not imported: listing the steps costs nothing, and running one imports only that one.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from worldline_core.config.base import StrictModel
+from worldline_core.errors import ConfigError
+from worldline_core.store.store import Artifact, ArtifactStore, StepFunction
+
+
+@dataclass(frozen=True)
+class Step:
+    """One verb of the pipeline.
+
+    ``version`` is raised whenever the step's code changes what it produces: it is part of the cache key.
+    ``inputs`` are the names it needs; a name ending in ``.*`` stands for any number of inputs (``rollouts.stage2``).
+    """
+
+    name: str
+    version: int
+    module: str
+    function: str
+    config: str
+    inputs: tuple[str, ...]
+    optional_inputs: tuple[str, ...] = ()
+    summary: str = ""
+
+    def load_function(self) -> StepFunction:
+        return getattr(importlib.import_module(self.module), self.function)
+
+    def load_config(self) -> type[StrictModel]:
+        return getattr(importlib.import_module(self.module), self.config)
+
+    def check_inputs(self, names: Mapping[str, Any]) -> None:
+        """Raises ConfigError for a missing or an unknown input."""
+        allowed = self.inputs + self.optional_inputs
+        unknown = [name for name in names if not any(_matches(name, pattern) for pattern in allowed)]
+        missing = [pattern for pattern in self.inputs if not any(_matches(name, pattern) for name in names)]
+        if unknown or missing:
+            raise ConfigError(
+                f"The inputs of {self.name} do not fit",
+                expected=f"{', '.join(self.inputs) or 'none'}"
+                + (f"; optional: {', '.join(self.optional_inputs)}" if self.optional_inputs else ""),
+                got=f"missing {missing}, unknown {unknown}",
+                next_step=f"give each as --input NAME=FOLDER, or run the steps before {self.name} with the same preset",
+            )
+
+
+def _matches(name: str, pattern: str) -> bool:
+    return pattern == "*" or (name.startswith(pattern[:-1]) if pattern.endswith(".*") else name == pattern)
+
+
+_STEPS = (
+    Step(
+        "curate",
+        1,
+        "worldline_core.data.curate",
+        "curate",
+        "CurateConfig",
+        (),
+        ("source.*",),
+        summary="read recordings of any source into one EpisodeSet",
+    ),
+    Step(
+        "filter",
+        1,
+        "worldline_core.filters.filter",
+        "filter_episodes",
+        "FilterConfig",
+        ("episodes",),
+        summary="drop static, reset, corrupted, moving-base, misaligned and badly calibrated segments",
+    ),
+    Step(
+        "render_actions",
+        1,
+        "worldline_core.actions.render_actions",
+        "render_actions",
+        "RenderActionsConfig",
+        ("episodes",),
+        summary="project the controls into every view: action tracks and overlay previews",
+    ),
+    Step(
+        "encode_latents",
+        1,
+        "worldline_core.training.encode_latents",
+        "encode_latents",
+        "EncodeLatentsConfig",
+        ("episodes", "tokenizer"),
+        summary="cache the video tokenizer's latents",
+    ),
+    Step(
+        "train_tokenizer",
+        1,
+        "worldline_core.model.tokenizer.train",
+        "train_tokenizer",
+        "TokenizerConfig",
+        ("episodes",),
+        summary="fit the small video tokenizer of the embedded default",
+    ),
+    Step(
+        "train_teacher",
+        1,
+        "worldline_core.training.teacher",
+        "train_teacher",
+        "TeacherConfig",
+        ("episodes",),
+        summary="train the small relational teacher of the embedded default",
+    ),
+    Step(
+        "train_segmenter",
+        1,
+        "worldline_core.evaluation.segmenters.train",
+        "train_segmenter",
+        "SegmenterConfig",
+        ("episodes",),
+        summary="train the small robot segmenter of the embedded default",
+    ),
+    Step(
+        "train_stage1",
+        1,
+        "worldline_core.training.stage1",
+        "train_stage1",
+        "Stage1Config",
+        ("latents", "episodes"),
+        ("base",),
+        summary="Stage I: action-free, text-conditioned video prediction",
+    ),
+    Step(
+        "train_stage2",
+        1,
+        "worldline_core.training.stage2",
+        "train_stage2",
+        "Stage2Config",
+        ("latents", "tracks", "episodes", "stage1"),
+        ("teacher",),
+        summary="Stage II: action-driven three-view prediction on successes and failures",
+    ),
+    Step(
+        "distill",
+        1,
+        "worldline_core.distillation.distill",
+        "distill",
+        "DistillConfig",
+        ("latents", "tracks", "episodes", "stage2", "tokenizer"),
+        summary="Stage III: teacher forcing, trajectory regression, distribution matching",
+    ),
+    Step(
+        "rollout",
+        1,
+        "worldline_core.rollout.rollout",
+        "rollout",
+        "RolloutConfig",
+        ("episodes", "tracks", "tokenizer"),
+        ("checkpoint",),
+        summary="predict videos from a first observation and controls",
+    ),
+    Step(
+        "evaluate_video",
+        1,
+        "worldline_core.evaluation.video.evaluate_video",
+        "evaluate_video",
+        "VideoEvaluationConfig",
+        ("episodes", "tracks", "rollouts.*"),
+        ("segmenter",),
+        summary="PSNR, SSIM, LPIPS and robot-mask IoU",
+    ),
+    Step(
+        "evaluate_policy",
+        1,
+        "worldline_core.evaluation.policy.evaluate_policy",
+        "evaluate_policy",
+        "PolicyEvaluationConfig",
+        ("episodes", "rollouts.*"),
+        ("tracks", "segmenter"),
+        summary="evidence, rules, accuracy against the recorded outcome",
+    ),
+    Step(
+        "evaluate_planning",
+        1,
+        "worldline_core.evaluation.planning.evaluate_planning",
+        "evaluate_planning",
+        "PlanningConfig",
+        ("banks", "rollouts.*"),
+        ("tracks", "segmenter"),
+        summary="bracket selection among candidate controls, success of the choice",
+    ),
+    Step(
+        "report",
+        1,
+        "worldline_core.report.report",
+        "report",
+        "ReportConfig",
+        (),
+        ("*",),
+        summary="one static page with tables, plots and videos",
+    ),
+)
+STEPS: dict[str, Step] = {step.name: step for step in _STEPS}
+
+
+def get_step(name: str) -> Step:
+    """Raises ConfigError, listing the steps, for an unknown name."""
+    if name not in STEPS:
+        raise ConfigError("Unknown step", expected=f"one of {', '.join(STEPS)}", got=name)
+    return STEPS[name]
+
+
+def run_step(store: ArtifactStore, name: str, config: StrictModel, inputs: Mapping[str, Path]) -> Artifact:
+    """Run one step on the store (or find its finished artifact)."""
+    step = get_step(name)
+    step.check_inputs(inputs)
+    return store.run(step.name, step.version, lambda c, i, o: step.load_function()(c, i, o), config, inputs)

@@ -1,0 +1,1 @@
+"""The content-keyed artifact store."""

@@ -1,0 +1,226 @@
+"""Where artifacts live, and the one place that makes a step cached and resumable.
+
+``artifacts/<step>/<key>/`` holds a finished artifact; its ``manifest.json`` is written last. The key is a digest of
+the step's name and version, its config, and the digests of its inputs: nothing else decides whether work is done
+again. Unfinished work lives in ``<key>.partial/`` and is continued by the next call.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from worldline_core.config.base import StrictModel
+from worldline_core.errors import ArtifactError
+from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
+from worldline_core.store.lock import exclusive_lock
+
+logger = logging.getLogger(__name__)
+
+KEY_LENGTH = 16
+_VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")
+
+StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A finished artifact: its folder and the digest of its content."""
+
+    step: str
+    path: Path
+    digest: str
+    cached: bool
+
+    @property
+    def key(self) -> str:
+        return self.path.name
+
+
+class ArtifactStore:
+    """The artifacts below one root folder (``artifacts/`` unless told otherwise)."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+
+    def key(self, step: str, version: int, config: StrictModel, inputs: Mapping[str, str]) -> str:
+        """Content key of a step. ``inputs`` maps an input's name to the digest of its content."""
+        identity = {"step": step, "version": version, "config": config.model_dump(mode="json"), "inputs": dict(inputs)}
+        return digest_value(identity)[:KEY_LENGTH]
+
+    def find(self, step: str, key: str) -> Artifact | None:
+        """The finished artifact of a key, or None."""
+        folder = self.root / step / key
+        manifest = folder / MANIFEST_NAME
+        if not manifest.is_file():
+            return None
+        return Artifact(step, folder, _manifest_digest(manifest), cached=True)
+
+    def input_digest(self, path: Path) -> str:
+        """Digest of an input: read from the manifest of an artifact, computed for any other folder.
+
+        Raises:
+            ArtifactError: the folder does not exist.
+        """
+        if not path.is_dir():
+            raise ArtifactError("An input folder does not exist", where=path, next_step="run the step that makes it")
+        manifest = path / MANIFEST_NAME
+        if manifest.is_file() and "digest" in (content := _read_manifest(manifest)):
+            return str(content["digest"])
+        return digest_folder(path)
+
+    def run(
+        self,
+        step: str,
+        version: int,
+        function: StepFunction,
+        config: StrictModel,
+        inputs: Mapping[str, Path],
+        *,
+        seeds: Mapping[str, int] | None = None,
+    ) -> Artifact:
+        """Return the artifact of a step, working only for what is not there yet.
+
+        Raises:
+            WorldLineError: whatever the step raises; its unfinished work stays in ``<key>.partial/``.
+        """
+        digests = {name: self.input_digest(path) for name, path in sorted(inputs.items())}
+        key = self.key(step, version, config, digests)
+        if (found := self.find(step, key)) is not None:
+            logger.info("%s %s: cached", step, key)
+            return found
+        folder = self.root / step / key
+        partial = folder.with_name(f"{key}.partial")
+        with exclusive_lock(self.root / step / f".{key}.lock"):
+            if (found := self.find(step, key)) is not None:
+                return found
+            if folder.exists():
+                # A folder without a manifest is not an artifact: someone deleted the manifest, or copied half of it.
+                shutil.rmtree(folder)
+            resumed = partial.exists()
+            partial.mkdir(parents=True, exist_ok=True)
+            logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
+            started = time.time()
+            metrics = function(config, {name: path.resolve() for name, path in inputs.items()}, partial)
+            digest = digest_folder(partial)
+            manifest = {
+                "step": step,
+                "version": version,
+                "key": key,
+                "digest": digest,
+                "config": config.model_dump(mode="json"),
+                "inputs": {
+                    name: {"path": _portable(path, self.root), "digest": digests[name]} for name, path in inputs.items()
+                },
+                "seeds": dict(seeds) if seeds is not None else _seeds(config.model_dump(mode="json")),
+                "metrics": metrics,
+                "environment": describe_environment(),
+                "resumed": resumed,
+                "wall_seconds": round(time.time() - started, 3),
+                "finished_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            }
+            write_json_atomic(partial / MANIFEST_NAME, manifest)
+            partial.replace(folder)
+        return Artifact(step, folder, digest, cached=False)
+
+    def verify(self, artifact: Artifact) -> None:
+        """Check an artifact's bytes against its manifest.
+
+        Raises:
+            ArtifactError: the content was changed after it was finished.
+        """
+        actual = digest_folder(artifact.path)
+        if actual != artifact.digest:
+            raise ArtifactError(
+                "An artifact was changed after it was finished",
+                where=artifact.path,
+                expected=artifact.digest,
+                got=actual,
+                next_step="delete the folder; the next run rebuilds it",
+            )
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ArtifactError(
+            "A manifest is damaged", where=path, got=str(error), next_step="delete the folder"
+        ) from error
+    if not isinstance(content, dict):
+        raise ArtifactError(
+            "A manifest is damaged", where=path, got=type(content).__name__, next_step="delete the folder"
+        )
+    return content
+
+
+def _manifest_digest(path: Path) -> str:
+    content = _read_manifest(path)
+    if "digest" not in content:
+        raise ArtifactError("A manifest has no digest", where=path, next_step="delete the folder; the step rebuilds it")
+    return str(content["digest"])
+
+
+def _portable(path: Path, root: Path) -> str:
+    """Paths in manifests are relative to the artifacts' root, so that a checkout can be moved."""
+    return os.path.relpath(path.resolve(), root)
+
+
+def _seeds(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    seeds: dict[str, Any] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            seeds.update(_seeds(value, f"{prefix}{name}."))
+        elif name in ("seed", "seeds"):
+            seeds[f"{prefix}{name}"] = value
+    return seeds
+
+
+def describe_environment() -> dict[str, Any]:
+    """Versions, device and commit: what a result depends on besides its config and inputs."""
+    versions = {}
+    for package in _VERSIONED_PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+        "packages": versions,
+        "git_commit": _git_commit(),
+    }
+
+
+def _git_commit() -> str | None:
+    try:
+        result = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],  # noqa: S607
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() or None
+
+
+def partial_run_folder(output: Path) -> Path:
+    """``output/run``: where a step keeps resume state, logs and timings (outside the digest)."""
+    folder = output / VOLATILE_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
