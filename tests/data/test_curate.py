@@ -1,0 +1,299 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from worldline_core.data.curate import CurateConfig, curate, resize_masks
+from worldline_core.data.episode_index import read_index, write_index
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.video import encode_video
+from worldline_core.errors import DataError
+
+Make = Callable[..., tuple]
+
+
+def record(root: Path, samples: list[tuple]) -> Path:
+    with EpisodeSetWriter(root, video_crf=8) as writer:
+        for episode, frames, masks in samples:
+            writer.add(episode, frames, masks)
+    return root
+
+
+def config(*sources: Path, **changes: Any) -> CurateConfig:
+    listed = [{"kind": "episode_set", "path": str(path)} for path in sources]
+    return CurateConfig.model_validate({"sources": listed, "image_size": (16, 24), "fps": 8, **changes})
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    return {
+        str(p.relative_to(root)): p.read_bytes()
+        for p in sorted(root.rglob("*"))
+        if p.is_file() and p.relative_to(root).parts[0] != "run"
+    }
+
+
+def reasons_of(root: Path) -> dict[str, str]:
+    return {row.episode_id: row.reason for row in EpisodeSet.open(root).quarantine()}
+
+
+def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(2)]
+    counts = curate(config(record(tmp_path / "raw", samples)), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["quarantined"], counts["reasons"]) == (2, 2, 0, {})
+    curated = EpisodeSet.open(tmp_path / "out")
+    episode = curated.episode(0)
+    assert curated.frames(0, "left_wrist").shape == (9, 16, 24, 3)
+    expected = samples[0][0].cameras["left_wrist"].resized(24, 16)
+    assert np.allclose(episode.cameras["left_wrist"].K, expected.K)
+    assert np.array_equal(episode.cameras["left_wrist"].T_base_camera, expected.T_base_camera)
+    mask = curated.robot_masks(0, "head")
+    assert mask is not None
+    assert np.array_equal(mask, resize_masks(samples[0][2]["head"], (16, 24)))
+    assert str(tmp_path) not in json.dumps([row.__dict__ for row in curated.rows])
+
+
+def test_inputs_override_configured_paths(tmp_path: Path, sample: Make) -> None:
+    raw = record(tmp_path / "raw", [sample(0)])
+    assert curate(config(tmp_path / "elsewhere"), {"source.0": raw}, tmp_path / "out")["kept"] == 1
+    with pytest.raises(DataError, match="Source folder is missing"):
+        curate(config(tmp_path / "elsewhere"), {}, tmp_path / "out2")
+
+
+def test_bad_values_are_quarantined_and_the_rest_goes_on(tmp_path: Path, sample: Make) -> None:
+    nan = sample(1)
+    nan[0].state[4, 2] = np.nan
+    far = sample(2)
+    far[0].state[3, 1] = 9.0
+    degrees = sample(3)
+    degrees[0].state[:, :6] *= 200
+    K = np.array([[40.0, 0, 20], [0, 0, 10], [0, 0, 1]])
+    base = sample(4)
+    singular = (
+        replace(base[0], cameras={**base[0].cameras, "head": replace(base[0].cameras["head"], K=K)}),
+        *base[1:],
+    )
+    base = sample(5)
+    sheared = base[0].cameras["head"].T_base_camera.copy()
+    sheared[0, 0, 1] = 0.3
+    skewed = (
+        replace(base[0], cameras={**base[0].cameras, "head": replace(base[0].cameras["head"], T_base_camera=sheared)}),
+        *base[1:],
+    )
+    slow = sample(6, fps=5.0)
+    gripper = sample(7)
+    gripper[0].state[:, 6] = 60.0 / 10
+    raw = record(tmp_path / "raw", [sample(0), nan, far, degrees, singular, skewed, slow, gripper, sample(8)])
+    counts = curate(config(raw), {}, tmp_path / "out")
+    assert counts["found"] == 9
+    assert counts["kept"] == 2
+    assert counts["kept"] + counts["quarantined"] == counts["found"]
+    assert reasons_of(tmp_path / "out") == {
+        "episode-001": "nan_state",
+        "episode-002": "joint_out_of_range",
+        "episode-003": "joint_out_of_range",
+        "episode-004": "singular_intrinsics",
+        "episode-005": "invalid_extrinsics",
+        "episode-006": "wrong_fps",
+        "episode-007": "invalid_gripper",
+    }
+    rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "out").quarantine()}
+    assert rows["episode-001"].numbers == {"track": "state", "first_frame": 4, "values": 1}
+    assert rows["episode-002"].numbers["position_rad"] == pytest.approx(9.0)
+    assert rows["episode-006"].numbers == {"wanted_fps": 8.0, "recorded_fps": 5.0}
+
+
+def test_a_truncated_video_costs_only_its_own_episodes(tmp_path: Path, sample: Make) -> None:
+    raw = record(tmp_path / "raw", [sample(number, num_frames=40) for number in range(4)])
+    video = raw / "datasets/ur5e_pair/videos/observation.images.head/chunk-000/file-000.mp4"
+    content = video.read_bytes()
+    video.write_bytes(content[: int(len(content) * 0.7)])
+    counts = curate(config(raw), {}, tmp_path / "out")
+    assert counts["reasons"] == {"truncated_video": counts["quarantined"]}
+    assert 1 <= counts["kept"] <= 2
+    assert counts["kept"] + counts["quarantined"] == counts["found"] == 4
+    (row, *_) = EpisodeSet.open(tmp_path / "out").quarantine()
+    assert "file-000.mp4" in row.detail
+    assert str(tmp_path) not in row.detail
+    assert row.numbers["expected_frames"] == 40
+    assert row.numbers["decoded_frames"] < 40
+
+
+def test_a_missing_column_and_a_missing_file(tmp_path: Path, sample: Make) -> None:
+    samples = [
+        sample(0),
+        sample(
+            1,
+            embodiment="xarm7_pair",
+            state=np.zeros((9, 16), np.float32),
+            action=np.zeros((9, 16), np.float32),
+            state_names=None,
+        ),
+        sample(2, embodiment="other"),
+    ]
+    raw = record(tmp_path / "raw", samples)
+    data = raw / "datasets/xarm7_pair/data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(data).drop_columns(["action"]), data)
+    (raw / "datasets/other/videos/observation.images.left_wrist/chunk-000/file-000.mp4").unlink()
+    counts = curate(config(raw), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (3, 1)
+    assert reasons_of(tmp_path / "out") == {"episode-001": "missing_column", "episode-002": "missing_file"}
+    detail = EpisodeSet.open(tmp_path / "out").quarantine()[0].detail
+    assert "action" in detail
+
+
+def test_an_escaping_path_in_the_metadata_is_refused(tmp_path: Path, sample: Make) -> None:
+    raw = record(tmp_path / "raw", [sample(0), sample(1, embodiment="other")])
+    path = raw / "datasets/other/meta/info.json"
+    info = json.loads(path.read_text())
+    info["video_path"] = "../../../{video_key}/file-{file_index:03d}.mp4"
+    path.write_text(json.dumps(info))
+    curate(config(raw), {}, tmp_path / "out")
+    assert reasons_of(tmp_path / "out") == {"episode-001": "path_traversal"}
+    rows = read_index(raw)
+    write_index(raw, [replace(rows[0], dataset="../../elsewhere"), rows[1]])
+    info["video_path"] = "{video_key.__class__}/x.mp4"
+    path.write_text(json.dumps(info))
+    with pytest.raises(DataError, match="No episode was kept"):
+        curate(config(raw), {}, tmp_path / "out2")
+
+
+def test_equal_content_is_kept_once(tmp_path: Path, sample: Make) -> None:
+    copy = sample(0)
+    raw = record(tmp_path / "raw", [sample(0), (replace(copy[0], episode_id="again"), *copy[1:]), sample(1)])
+    other = record(tmp_path / "other", [sample(1)])
+    counts = curate(config(raw, other), {}, tmp_path / "out")
+    assert counts["found"] == 4
+    assert counts["kept"] + counts["quarantined"] == 4
+    reasons = reasons_of(tmp_path / "out")
+    assert reasons == {"episode-000": "duplicate", "episode-001#source.1": "duplicate_id"}
+    assert counts["reasons"] == {"duplicate": 1, "duplicate_id": 1}
+
+
+def test_a_scene_in_training_and_in_test_is_an_error(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(0, scene="kitchen"), sample(1, scene="kitchen", split="test")]
+    raw = record(tmp_path / "raw", samples)
+    with pytest.raises(DataError, match=r"(?s)both in train and in test.*kitchen"):
+        curate(config(raw), {}, tmp_path / "out")
+    counts = curate(config(raw, splits={"kit*": "test"}), {}, tmp_path / "out2")
+    assert counts["splits"] == {"test": 2}
+
+
+def test_a_multiple_of_the_rate_is_thinned(tmp_path: Path, sample: Make) -> None:
+    episode, frames, masks = sample(0)
+    doubled = replace(episode, fps=16.0, timestamps=episode.timestamps / 2)
+    raw = record(tmp_path / "raw", [(doubled, frames, masks)])
+    curate(config(raw), {}, tmp_path / "out")
+    read = EpisodeSet.open(tmp_path / "out").episode(0)
+    assert read.fps == 8.0
+    assert np.array_equal(read.state, episode.state[::2])
+    wrist = episode.cameras["left_wrist"].T_base_camera
+    assert np.array_equal(read.cameras["left_wrist"].T_base_camera, wrist[::2])
+    assert EpisodeSet.open(tmp_path / "out").frames(0, "head").shape[0] == 5
+
+
+def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> None:
+    one_view = sample(1, views=("head",))
+    bare = sample(2)
+    uncalibrated = (replace(bare[0], cameras={"head": bare[0].cameras["head"]}), *bare[1:])
+    raw = record(tmp_path / "raw", [sample(0), one_view, uncalibrated])
+    curate(config(raw, views=("head", "left_wrist"), require_calibration=True), {}, tmp_path / "out")
+    assert reasons_of(tmp_path / "out") == {"episode-001": "missing_view", "episode-002": "missing_calibration"}
+    assert EpisodeSet.open(tmp_path / "out").rows[0].views == ("head", "left_wrist")
+    curate(config(raw), {}, tmp_path / "all")
+    rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "all").rows}
+    assert rows["episode-000"].stage2_ok
+    assert rows["episode-001"].stage2_reason == "missing_view"
+    assert rows["episode-002"].stage2_reason == "missing_calibration"
+
+
+def test_unsteady_frame_times_are_a_wrong_rate(tmp_path: Path, sample: Make) -> None:
+    from worldline_core.data.mcap_io import write_episode_mcap
+
+    folder = tmp_path / "raw"
+    for number in range(2):
+        episode, frames, _ = sample(number)
+        if number == 1:
+            episode = replace(episode, timestamps=episode.timestamps * 1.25)
+        write_episode_mcap(folder / f"{number}.mcap", episode, frames)
+    source = {"kind": "mcap", "path": str(folder)}
+    curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
+    assert reasons_of(tmp_path / "out") == {"episode-001": "wrong_fps"}
+    (row,) = EpisodeSet.open(tmp_path / "out").quarantine()
+    assert row.numbers["measured_fps"] == pytest.approx(6.4)
+
+
+def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
+    """DROID-style annotations: the second episode has one state fewer than frames."""
+    rng = np.random.default_rng(0)
+    for number, states in (("0", 6), ("1", 5)):
+        record_path = tmp_path / "droid/annotation/val" / f"{number}.json"
+        record_path.parent.mkdir(parents=True, exist_ok=True)
+        videos = []
+        for view in range(3):
+            path = tmp_path / "droid/videos/val" / number / f"{view}.mp4"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            encode_video(path, rng.integers(0, 255, (6, 16, 24, 3), dtype=np.uint8), 5)
+            videos.append({"video_path": str(path.relative_to(tmp_path / "droid"))})
+        gripper = np.linspace(0, 1.02, states)[:, None]
+        pose = np.concatenate([rng.normal(size=(states, 6)), gripper], axis=1)
+        joints = np.concatenate([rng.normal(size=(states, 7)) * 0.3, gripper], axis=1)
+        described = {
+            "texts": ["pick"],
+            "success": 1,
+            "videos": videos,
+            "states": pose.tolist(),
+            "joints": joints.tolist(),
+        }
+        record_path.write_text(json.dumps(described))
+    source = {"kind": "droid_annotation", "path": str(tmp_path / "droid"), "fps": 5}
+    counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (2, 1, {"length_mismatch": 1})
+    curated = EpisodeSet.open(tmp_path / "out")
+    assert curated.quarantine()[0].numbers == {"states": 5, "frames": 6}
+    episode = curated.episode(0)
+    assert episode.state[0, 7] == 1.0  # 0 open in the source is 1 open here
+    assert episode.state[-1, 7] == 0.0
+    assert episode.conventions["gripper_overshoot"] == 1
+    assert curated.rows[0].stage2_reason == "missing_calibration"
+
+
+def test_a_killed_curation_continues_to_the_same_bytes(tmp_path: Path, sample: Make) -> None:
+    bad = sample(3)
+    bad[0].state[0, 0] = np.inf
+    copy = sample(0)
+    samples = [sample(n, num_frames=33, height=96, width=144) for n in range(4, 16)]
+    samples += [bad, sample(0), (replace(copy[0], episode_id="copy"), *copy[1:])]
+    raw = record(tmp_path / "raw", samples)
+    settings = config(raw)
+    curate(settings, {}, tmp_path / "undisturbed")
+    script = (
+        "import sys; from pathlib import Path; from worldline_core.data.curate import CurateConfig, curate;"
+        "curate(CurateConfig.model_validate_json(sys.argv[1]), {}, Path(sys.argv[2]))"
+    )
+    killed = tmp_path / "killed"
+    process = subprocess.Popen([sys.executable, "-c", script, settings.model_dump_json(), str(killed)])
+    parts = killed / "run" / "episodes" / "parts"
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        if parts.is_dir() and sum(not p.name.startswith(".") for p in parts.iterdir()) >= 3:
+            os.kill(process.pid, signal.SIGKILL)
+            break
+        time.sleep(0.002)
+    process.wait()
+    assert process.returncode == -signal.SIGKILL
+    counts = curate(settings, {}, killed)
+    assert files_of(killed) == files_of(tmp_path / "undisturbed")
+    assert counts == curate(settings, {}, killed)  # finished work is recognised
+    assert counts["reasons"] == {"duplicate": 1, "nan_state": 1}

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episode_index import read_index, write_index
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.errors import DataError
+
+Make = Callable[..., tuple]
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    return {
+        str(p.relative_to(root)): p.read_bytes()
+        for p in sorted(root.rglob("*"))
+        if p.is_file() and "run" not in p.relative_to(root).parts
+    }
+
+
+def write(root: Path, samples: list[tuple]) -> EpisodeSet:
+    with EpisodeSetWriter(root, fps=8, image_size=(32, 48), video_crf=10) as writer:
+        for episode, frames, masks in samples:
+            writer.add(episode, frames, masks)
+        writer.quarantine("broken", "synthetic", "nan_state", "state is not finite", {"frame": 3})
+    return EpisodeSet.open(root)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(3)]
+    stored = write(tmp_path / "set", samples)
+    assert len(stored) == 3
+    for i, (episode, frames, masks) in enumerate(samples):
+        read = stored.episode(i)
+        assert np.array_equal(read.state, episode.state)
+        assert np.array_equal(read.action, episode.action)
+        assert np.abs(read.timestamps - episode.timestamps).max() < 1e-12
+        for name in ("episode_id", "source", "embodiment", "scene", "task_family", "instruction", "outcome", "split"):
+            assert getattr(read, name) == getattr(episode, name)
+        assert read.state_names == episode.state_names
+        for view, camera in episode.cameras.items():
+            assert np.array_equal(read.cameras[view].K, camera.K)
+            assert np.array_equal(read.cameras[view].T_base_camera, camera.T_base_camera)
+            assert np.abs(stored.frames(i, view).astype(int) - frames[view]).mean() < 6
+            mask = stored.robot_masks(i, view)
+            assert mask is not None
+            assert np.array_equal(mask, masks[view])
+    assert np.array_equal(stored.frames(1, "head", [7, 0]), stored.frames(1, "head")[[7, 0]])
+    (rejected,) = stored.quarantine()
+    assert (rejected.episode_id, rejected.reason, rejected.numbers) == ("broken", "nan_state", {"frame": 3})
+
+
+def test_bytes_depend_on_the_episodes_alone(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(3)]
+    write(tmp_path / "a", samples)
+    write(tmp_path / "b", samples[::-1])
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+    write(tmp_path / "c", [sample(0), sample(1), sample(7)])
+    assert files_of(tmp_path / "a") != files_of(tmp_path / "c")
+
+
+def test_a_killed_writer_continues_to_the_same_bytes(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(3)]
+    write(tmp_path / "undisturbed", samples)
+    killed = EpisodeSetWriter(tmp_path / "killed", fps=8, image_size=(32, 48), video_crf=10)
+    killed.add(*samples[1])
+    half_written = tmp_path / "killed" / "run" / "episodes" / "parts" / ".abc.1"
+    half_written.mkdir()
+    (half_written / "head.mp4").write_bytes(b"half")
+    again = EpisodeSetWriter(tmp_path / "killed", fps=8, image_size=(32, 48), video_crf=10)
+    assert again.has("episode-001")
+    assert not again.has("episode-000")
+    write(tmp_path / "killed", [samples[0], samples[2]])
+    assert files_of(tmp_path / "killed") == files_of(tmp_path / "undisturbed")
+    with pytest.raises(DataError, match="already holds a finished EpisodeSet"):
+        EpisodeSetWriter(tmp_path / "killed", fps=8)
+
+
+def test_segments_cut_every_array(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(2)]
+    stored = write(tmp_path / "curated", samples)
+    other = tmp_path / "filtered"
+    rows = read_index(tmp_path / "curated")
+    cut = replace(rows[1], start=2, stop=7, num_frames=5, video_frames=5, dataset="../curated/datasets/ur5e_pair")
+    write_index(other, [cut])
+    segment = EpisodeSet.open(other)
+    episode = segment.episode(0)
+    assert episode.num_frames == 5
+    assert np.array_equal(episode.state, samples[1][0].state[2:7])
+    assert episode.timestamps[0] == 0
+    wrist = samples[1][0].cameras["left_wrist"].T_base_camera
+    assert np.array_equal(episode.cameras["left_wrist"].T_base_camera, wrist[2:7])
+    assert np.array_equal(segment.frames(0, "head"), stored.frames(1, "head")[2:7])
+    assert np.array_equal(segment.frames(0, "head", [4]), stored.frames(1, "head")[6:7])
+    mask = segment.robot_masks(0, "head")
+    assert mask is not None
+    assert np.array_equal(mask, samples[1][2]["head"][2:7])
+    with pytest.raises(DataError, match="outside of the episode"):
+        segment.frames(0, "head", [5])
+
+
+def test_a_set_moves_together_with_what_it_links_to(tmp_path: Path, sample: Make) -> None:
+    write(tmp_path / "a" / "curated", [sample(0)])
+    rows = read_index(tmp_path / "a" / "curated")
+    write_index(tmp_path / "a" / "filtered", [replace(rows[0], dataset="../curated/datasets/ur5e_pair")])
+    shutil.move(tmp_path / "a", tmp_path / "b")
+    assert EpisodeSet.open(tmp_path / "b" / "filtered").frames(0, "head").shape == (9, 32, 48, 3)
+
+
+def test_foreign_index_rows_cannot_leave_the_folder(tmp_path: Path, sample: Make) -> None:
+    write(tmp_path / "set", [sample(0)])
+    rows = read_index(tmp_path / "set")
+    for path, message in (("../../etc", "outside of the dataset folder"), (os.fspath(tmp_path), "absolute path")):
+        write_index(tmp_path / "set", [replace(rows[0], dataset=path)])
+        with pytest.raises(DataError, match=message):
+            EpisodeSet.open(tmp_path / "set", allow_linked=False).episode(0)
+
+
+def test_states_without_images_are_kept_and_lerobot_rows_stay_true(tmp_path: Path, sample: Make) -> None:
+    poses = np.tile(np.eye(4), (9, 2, 1, 1))
+    poses[:, :, 0, 3] = np.arange(18).reshape(9, 2) / 7
+    gripper = np.linspace(0, 1, 18).reshape(9, 2)
+    episode, frames, _ = sample(0, T_base_ee=poses, gripper=gripper, video_frames=4)
+    with EpisodeSetWriter(tmp_path / "set", video_crf=10) as writer:
+        writer.add(episode, {view: images[:4] for view, images in frames.items()})
+    stored = EpisodeSet.open(tmp_path / "set")
+    read = stored.episode(0)
+    assert (read.num_frames, read.video_frames, stored.rows[0].video_frames) == (9, 4, 4)
+    assert np.array_equal(read.state, episode.state)
+    assert read.T_base_ee is not None
+    assert read.gripper is not None
+    assert np.array_equal(read.T_base_ee, poses)
+    assert np.array_equal(read.gripper, gripper)
+    assert stored.frames(0, "head").shape[0] == 4
+    with pytest.raises(DataError, match="0 <= index < 4"):
+        stored.frames(0, "head", [4])
+
+
+def test_different_robots_get_datasets_of_their_own(tmp_path: Path, sample: Make) -> None:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
+        writer.add(*sample(0))
+        writer.add(*sample(1, embodiment="xarm7_pair"))
+        writer.add(*sample(2, views=("head", "right_wrist")))
+    stored = EpisodeSet.open(tmp_path / "set")
+    assert [row.dataset for row in stored.rows] == ["datasets/ur5e_pair", "datasets/xarm7_pair", "datasets/ur5e_pair_2"]
+    assert stored.rows[2].views == ("head", "right_wrist")
+    assert stored.select(embodiment="xarm7_pair") == [1]
+    assert stored.select(split=["train", "test"]) == [0, 1, 2]
+    assert stored.select(split="test") == []
+    with pytest.raises(DataError, match=r"(?s)no such view.*head, right_wrist.*left_wrist"):
+        stored.frames(2, "left_wrist")
+    with pytest.raises(DataError, match="No such episode"):
+        stored.position("absent")
+
+
+def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) -> None:
+    writer = EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(32, 48))
+    episode, frames, masks = sample(0)
+    with pytest.raises(DataError, match=r"(?s)Images and states differ.*expected: 9.*got: 8"):
+        writer.add(episode, {**frames, "head": frames["head"][:8]})
+    with pytest.raises(DataError, match="another frame rate"):
+        writer.add(replace(episode, fps=5.0), frames)
+    with pytest.raises(DataError, match="wrong size"):
+        writer.add(episode, {view: images[:, :16] for view, images in frames.items()})
+    with pytest.raises(DataError, match="Robot masks do not match"):
+        writer.add(episode, frames, {"head": masks["head"][:4]})
+    camera = episode.cameras["head"].resized(96, 64)
+    with pytest.raises(DataError, match="another image size"):
+        writer.add(replace(episode, cameras={**episode.cameras, "head": camera}), frames)
+    with pytest.raises(DataError, match="Action and state differ"):
+        replace(episode, action=episode.action[:4])
+    with pytest.raises(DataError, match="Unknown outcome"):
+        replace(episode, outcome="maybe")
+    with pytest.raises(DataError, match="No episode was kept"):
+        writer.close()
+
+
+def test_intrinsics_follow_a_resize() -> None:
+    rng = np.random.default_rng(0)
+    camera = CameraTrack(
+        "head", np.array([[50.0, 1.0, 30.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]), np.eye(4)[None], 64, 48
+    )
+    small = camera.resized(16, 24)
+    points = rng.uniform(0.5, 2.0, (20, 3))
+
+    def pixels(K: np.ndarray) -> np.ndarray:
+        homogeneous = points @ K.T
+        return homogeneous[:, :2] / homogeneous[:, 2:]
+
+    # The corner of the image, half a pixel outside of the first centre, stays the corner.
+    expected = (pixels(camera.K) + 0.5) * [16 / 64, 24 / 48] - 0.5
+    assert np.abs(pixels(small.K) - expected).max() < 1e-9
+    assert (small.width, small.height) == (16, 24)

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.mcap_io import write_episode_mcap, write_rollout_mcap
+from worldline_core.data.mcap_reader import read_episode_mcap
+from worldline_core.errors import DataError
+
+Make = Callable[..., tuple]
+
+
+def tools() -> np.ndarray:
+    """(9, 2, 4, 4) poses with rotations all over SO(3), half turns among them."""
+    rng = np.random.default_rng(3)
+    q, _ = np.linalg.qr(rng.normal(size=(18, 3, 3)))
+    q[:, :, 0] *= np.linalg.det(q)[:, None]
+    poses = np.tile(np.eye(4), (18, 1, 1))
+    poses[:, :3, :3] = q
+    poses[0, :3, :3] = np.diag([1.0, -1.0, -1.0])
+    poses[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])
+    poses[:, :3, 3] = rng.normal(size=(18, 3))
+    return poses.reshape(9, 2, 4, 4)
+
+
+def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make) -> None:
+    gripper = np.linspace(0, 1, 18).reshape(9, 2)
+    episode, frames, masks = sample(0, T_base_ee=tools(), gripper=gripper, conventions={"layout": "x", "n": 3})
+    for name in ("a.mcap", "b.mcap"):
+        write_episode_mcap(tmp_path / name, episode, frames, robot_masks=masks)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    read = read_episode_mcap(tmp_path / "a.mcap")
+    for view, images in frames.items():
+        assert np.array_equal(read.frames[view], images)  # png is exact
+        assert np.array_equal(read.robot_masks[view], masks[view])
+        assert np.abs(read.episode.cameras[view].K - episode.cameras[view].K).max() < 1e-9
+        assert read.episode.cameras[view].moving == episode.cameras[view].moving
+        assert np.abs(read.episode.cameras[view].T_base_camera - episode.cameras[view].T_base_camera).max() < 1e-9
+    assert np.abs(read.episode.timestamps - episode.timestamps).max() <= 1e-9
+    assert np.array_equal(read.episode.state, episode.state)
+    assert np.array_equal(read.episode.action, episode.action)
+    assert read.episode.T_base_ee is not None
+    assert np.abs(read.episode.T_base_ee - episode.T_base_ee).max() < 1e-9
+    assert np.array_equal(read.episode.gripper, gripper)
+    for name in ("episode_id", "scene", "instruction", "outcome", "split", "fps", "state_names", "conventions", "bank"):
+        assert getattr(read.episode, name) == getattr(episode, name)
+
+
+def test_jpeg_stays_within_its_stated_tolerance(tmp_path: Path, sample: Make) -> None:
+    episode, frames, _ = sample(0)
+    write_episode_mcap(tmp_path / "a.mcap", episode, frames, image_format="jpeg")
+    read = read_episode_mcap(tmp_path / "a.mcap").frames
+    smooth = np.abs(read["head"].astype(int) - frames["head"]).mean()
+    assert 0 < smooth < 4
+
+
+def test_messages_follow_foxglove_schemas(tmp_path: Path, sample: Make) -> None:
+    episode, frames, _ = sample(0)
+    write_episode_mcap(tmp_path / "a.mcap", episode, frames)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        schemas = {channel.topic: schema.name for schema, channel, _ in reader.iter_messages() if schema is not None}
+    assert schemas == {
+        "/head/image": "foxglove.CompressedImage",
+        "/left_wrist/image": "foxglove.CompressedImage",
+        "/right_wrist/image": "foxglove.CompressedImage",
+        "/head/calibration": "foxglove.CameraCalibration",
+        "/left_wrist/calibration": "foxglove.CameraCalibration",
+        "/right_wrist/calibration": "foxglove.CameraCalibration",
+        "/tf": "foxglove.FrameTransform",
+        "/joint_states": "worldline.JointStates",
+        "/joint_commands": "worldline.JointStates",
+    }
+
+
+def test_curation_makes_the_same_row_from_mcap_and_from_the_recording(tmp_path: Path, sample: Make) -> None:
+    samples = [sample(number) for number in range(2)]
+    with EpisodeSetWriter(tmp_path / "raw", video_crf=0, pixel_format="yuv444p") as writer:
+        for episode, frames, masks in samples:
+            writer.add(episode, frames, masks)
+            write_episode_mcap(tmp_path / "mcap" / f"{episode.episode_id}.mcap", episode, frames, robot_masks=masks)
+    sets = []
+    for kind, folder in (("episode_set", "raw"), ("mcap", "mcap")):
+        source = {"kind": kind, "path": str(tmp_path / folder)}
+        curate(CurateConfig.model_validate({"sources": [source], "fps": 8}), {}, tmp_path / f"out_{kind}")
+        sets.append(EpisodeSet.open(tmp_path / f"out_{kind}"))
+    recorded, exported = sets
+    assert recorded.rows == exported.rows
+    for i in range(2):
+        a, b = recorded.episode(i), exported.episode(i)
+        assert np.array_equal(a.state, b.state)
+        assert np.abs(a.timestamps - b.timestamps).max() < 1e-9
+        for view in a.cameras:
+            assert np.abs(a.cameras[view].K - b.cameras[view].K).max() < 1e-9
+            assert np.abs(a.cameras[view].T_base_camera - b.cameras[view].T_base_camera).max() < 1e-9
+            difference = np.abs(recorded.frames(i, view).astype(int) - exported.frames(i, view))
+            assert difference.mean() < 1.5  # the recording's own video coding
+            assert np.array_equal(recorded.robot_masks(i, view), exported.robot_masks(i, view))
+
+
+def test_damaged_files_are_quarantined(tmp_path: Path, sample: Make) -> None:
+    for number in range(2):
+        episode, frames, _ = sample(number)
+        write_episode_mcap(tmp_path / "mcap" / f"{number}.mcap", episode, frames)
+    content = (tmp_path / "mcap" / "1.mcap").read_bytes()
+    (tmp_path / "mcap" / "1.mcap").write_bytes(content[: len(content) // 2])
+    (tmp_path / "mcap" / "2.mcap").write_bytes(b"no mcap at all")
+    write_rollout_mcap(tmp_path / "mcap" / "3.mcap", {"head": sample(0)[1]["head"]}, 8.0)
+    source = {"kind": "mcap", "path": str(tmp_path / "mcap")}
+    counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (4, 1, {"unreadable": 3})
+    with pytest.raises(DataError, match=r"(?s)damaged.*1\.mcap"):
+        read_episode_mcap(tmp_path / "mcap" / "1.mcap")
+    with pytest.raises(DataError, match="no episode of a known layout"):
+        read_episode_mcap(tmp_path / "mcap" / "3.mcap")
+
+
+def test_a_rollout_is_exported(tmp_path: Path, sample: Make) -> None:
+    episode, frames, _ = sample(0)
+    for name in ("a.mcap", "b.mcap"):
+        write_rollout_mcap(
+            tmp_path / name,
+            frames,
+            8.0,
+            metadata={"method": "stage2", "seed": "42"},
+            cameras=episode.cameras,
+            T_base_ee=tools(),
+            image_format="png",
+        )
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        counts: dict[str, int] = {}
+        for _, channel, _ in reader.iter_messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+    assert counts["/head/image"] == 9
+    assert counts["/tf"] == 9 * 2 + 1 + 2 * 9  # tools, the fixed head camera, two moving wrist cameras
+    with pytest.raises(DataError, match="differ in length"):
+        write_rollout_mcap(tmp_path / "c.mcap", {"head": frames["head"], "left_wrist": frames["left_wrist"][:3]}, 8.0)

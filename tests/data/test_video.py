@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.data.video import concatenate_videos, decode_segment, decode_video, encode_video, video_size
+from worldline_core.errors import DataError
+
+
+def picture(number: int, count: int = 12) -> np.ndarray:
+    rows, columns = np.mgrid[:32, :48]
+    value = (columns[None] * 2 + rows[None] + 5 * np.arange(count)[:, None, None] + 30 * number) % 180
+    return np.stack([value, 200 - value, np.full_like(value, 100)], axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
+def test_a_video_keeps_its_pictures_and_its_bytes(tmp_path: Path, pixel_format: str) -> None:
+    frames = picture(0)
+    for name in ("a.mp4", "b.mp4"):
+        encode_video(tmp_path / name, frames, 8, crf=8, pixel_format=pixel_format)  # type: ignore[arg-type]
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    decoded = decode_video(tmp_path / "a.mp4", len(frames))
+    assert decoded.shape == frames.shape
+    assert np.abs(decoded.astype(int) - frames).mean() < 4
+    assert video_size(tmp_path / "a.mp4") == (32, 48, 8.0)
+
+
+@pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (200, 100, 50), (0, 0, 0), (255, 255, 255)])
+def test_colours_are_not_shifted(tmp_path: Path, colour: tuple[int, int, int]) -> None:
+    encode_video(tmp_path / "c.mp4", np.tile(np.array(colour, np.uint8), (4, 32, 48, 1)), 8, crf=5)
+    assert np.abs(decode_video(tmp_path / "c.mp4")[2].astype(int) - colour).max() <= 3
+
+
+@pytest.mark.parametrize("fps", [8.0, 29.97, 30.0])
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p"])
+def test_frames_of_a_joined_video_are_found_exactly(tmp_path: Path, fps: float, pixel_format: str) -> None:
+    parts, single = [], []
+    for number, count in enumerate((12, 7, 9)):
+        path = tmp_path / f"{number}.mp4"
+        encode_video(path, picture(number, count), fps, pixel_format=pixel_format)  # type: ignore[arg-type]
+        parts.append((path, count))
+        single.append(decode_video(path, count))
+    joined = tmp_path / "joined.mp4"
+    concatenate_videos(joined, parts, fps)
+    assert np.array_equal(decode_video(joined, 28), np.concatenate(single))
+    first = 0
+    for (_, count), expected in zip(parts, single, strict=True):
+        assert np.array_equal(decode_segment(joined, first / fps, count, fps), expected)
+        wanted = [count - 1, 0, 3, 3]
+        assert np.array_equal(decode_segment(joined, first / fps, count, fps, wanted), expected[wanted])
+        first += count
+
+
+def test_a_truncated_video_names_file_and_frame_counts(tmp_path: Path) -> None:
+    path = tmp_path / "cut.mp4"
+    noise = np.random.default_rng(0).integers(0, 255, (24, 32, 48, 3), dtype=np.uint8)
+    encode_video(path, noise, 8)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match=r"(?s)truncated.*cut\.mp4.*24 frames.*got: \d+ frames"):
+        decode_video(path, 24)
+    with pytest.raises(DataError, match=r"(?s)truncated.*cut\.mp4"):
+        decode_segment(path, 0.0, 24, 8.0)
+    assert len(decode_segment(path, 0.0, 24, 8.0, [0, 1, 2])) == 3  # what is left is still readable
+
+
+def test_a_file_that_is_no_video_and_one_that_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("not a video")
+    with pytest.raises(DataError, match=r"(?s)truncated or undecodable.*text\.mp4"):
+        decode_video(tmp_path / "text.mp4", 3)
+    with pytest.raises(DataError, match="Video file is missing"):
+        decode_video(tmp_path / "absent.mp4", 3)
+
+
+def test_a_video_of_another_length_is_refused(tmp_path: Path) -> None:
+    encode_video(tmp_path / "v.mp4", picture(0), 8)
+    with pytest.raises(DataError, match=r"(?s)too many frames.*expected: 5 frames.*got: 12 frames"):
+        decode_video(tmp_path / "v.mp4", 5)
+    with pytest.raises(DataError, match="outside of the clip"):
+        decode_segment(tmp_path / "v.mp4", 0.0, 12, 8.0, [12])
+
+
+def test_what_cannot_be_encoded_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="even image sides"):
+        encode_video(tmp_path / "v.mp4", np.zeros((2, 31, 48, 3), np.uint8), 8)
+    with pytest.raises(DataError, match="Cannot encode"):
+        encode_video(tmp_path / "v.mp4", np.zeros((2, 32, 48, 3), np.float32), 8)
+    with pytest.raises(DataError, match="positive number"):
+        encode_video(tmp_path / "v.mp4", np.zeros((2, 32, 48, 3), np.uint8), 0)

@@ -1,0 +1,221 @@
+"""The whole step on a synthetic robot whose tool poses are recorded, with one defect an episode."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy.spatial.transform import Rotation
+
+from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.errors import DataError
+from worldline_core.filters.calibration import rigid_inverse
+from worldline_core.filters.filter import FilterConfig, filter_episodes
+
+HEIGHT, WIDTH, FRAMES, FPS = 64, 96, 33, 8.0
+K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1.0]])
+HEAD = np.eye(4)
+HEAD[:3, :3], HEAD[:3, 3] = np.diag([1.0, -1.0, -1.0]), [0.4, 0.0, 1.2]
+MOUNT = np.eye(4)
+MOUNT[:3, 3] = [0.05, 0.0, -0.1]
+
+
+def tool_track(number: int) -> np.ndarray:
+    time = np.arange(FRAMES) / FPS
+    rng = np.random.default_rng(number)
+    poses = np.tile(np.eye(4), (FRAMES, 2, 1, 1))
+    for arm, side in ((0, 0.15), (1, -0.15)):
+        a, b, c = rng.uniform(0.8, 1.8, 3)
+        poses[:, arm, :3, 3] = np.stack(
+            [0.35 + 0.2 * np.sin(a * time), side + 0.12 * np.sin(b * time + 1), 0.3 + 0.05 * np.cos(c * time)], 1
+        )
+        poses[:, arm, :3, :3] = Rotation.from_euler(
+            "xyz", np.stack([0.3 * np.sin(a * time), 0.2 * np.sin(b * time), 0 * time], 1)
+        ).as_matrix()
+    return poses
+
+
+def render(poses: np.ndarray) -> np.ndarray:
+    """uint8 (n, H, W, 3) of a textured table with a disc at each point."""
+    rng = np.random.default_rng(1)
+    table = cv2.resize(
+        rng.uniform(60, 170, (8, 12, 3)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST
+    )
+    frames = []
+    for pose in poses:
+        picture = table.copy()
+        for arm, colour in ((0, (250, 40, 40)), (1, (40, 40, 250))):
+            in_camera = np.linalg.inv(HEAD) @ np.append(pose[arm, :3, 3], 1)
+            u, v = (K @ (in_camera[:3] / in_camera[2]))[:2]
+            cv2.circle(picture, (round(float(u)), round(float(v))), 6, colour, -1)
+        frames.append(picture)
+    return np.stack(frames).astype(np.uint8)
+
+
+def wrist_images(poses: np.ndarray, arm: int) -> np.ndarray:
+    """A texture that shifts with the arm."""
+    rng = np.random.default_rng(2)
+    table = cv2.resize(
+        rng.uniform(40, 200, (16, 24, 3)).astype(np.float32), (3 * WIDTH, 3 * HEIGHT), interpolation=cv2.INTER_LINEAR
+    )
+    frames = []
+    for pose in poses:
+        x, y = (float(np.clip(90 + 200 * value, 0, 160)) for value in (pose[arm, 0, 3] - 0.35, pose[arm, 1, 3]))
+        shift = np.array([[1, 0, -x], [0, 1, -min(y, 120)]], dtype=np.float32)
+        frames.append(cv2.warpAffine(table, shift, (WIDTH, HEIGHT)))
+    return np.stack(frames).astype(np.uint8)
+
+
+def record(number: int, **changes: Any) -> tuple[Episode, dict[str, np.ndarray]]:
+    tools = tool_track(number)
+    frames = {"head": render(tools), "left_wrist": wrist_images(tools, 0), "right_wrist": wrist_images(tools, 1)}
+    gripper = np.full((FRAMES, 2), 0.5)
+    state = np.concatenate([np.concatenate([tools[:, a, :3, 3], gripper[:, a : a + 1]], 1) for a in (0, 1)], 1)
+    poses = {"head": HEAD[None], "left_wrist": tools[:, 0] @ MOUNT, "right_wrist": tools[:, 1] @ MOUNT}
+    values: dict[str, Any] = {
+        "episode_id": f"e{number:02d}",
+        "source": "synthetic",
+        "embodiment": "points",
+        "scene": f"s{number}",
+        "task_family": "unknown",
+        "instruction": "",
+        "outcome": "unknown",
+        "split": "train",
+        "fps": FPS,
+        "state": state.astype(np.float32),
+        "action": state.astype(np.float32),
+        "timestamps": np.arange(FRAMES) / FPS,
+        "cameras": {view: CameraTrack(view, K, pose, WIDTH, HEIGHT) for view, pose in poses.items()},
+        "T_base_ee": tools,
+        "gripper": gripper,
+        "state_kind": "ee_pose",
+        "state_names": tuple(f"{a}/{n}" for a in ("left", "right") for n in ("x", "y", "z", "gripper")),
+    }
+    return Episode(**(values | changes)), frames
+
+
+def spoil(number: int) -> tuple[Episode, dict[str, np.ndarray]]:
+    episode, frames = record(number)
+    cameras = dict(episode.cameras)
+    if number == 1:  # frozen
+        frames["head"][6:] = frames["head"][6]
+    elif number == 2:  # a few black frames at the end
+        frames["head"][28:31] = 0
+    elif number == 3:
+        cameras["left_wrist"] = replace(
+            cameras["left_wrist"], T_base_camera=rigid_inverse(cameras["left_wrist"].T_base_camera)
+        )
+    elif number == 4:  # states four frames late
+        late = np.maximum(np.arange(FRAMES) - 4, 0)
+        episode = replace(episode, T_base_ee=episode.T_base_ee[late], state=episode.state[late])  # type: ignore[index]
+    elif number == 5:
+        cameras["head"] = replace(
+            cameras["head"],
+            T_base_camera=HEAD[None] @ np.array([[1, 0, 0, 0.3], [0, 1, 0, 0.25], [0, 0, 1, 0], [0, 0, 0, 1.0]]),
+        )
+    elif number == 6:
+        del frames["right_wrist"], cameras["right_wrist"]
+    elif number == 7:  # nothing happens
+        frames = {view: np.repeat(images[:1], FRAMES, 0) for view, images in frames.items()}
+        episode = replace(
+            episode,
+            state=np.repeat(episode.state[:1], FRAMES, 0),
+            T_base_ee=np.repeat(episode.T_base_ee[:1], FRAMES, 0),
+        )  # type: ignore[index]
+        cameras = {
+            v: replace(c, T_base_camera=np.repeat(c.T_base_camera[:1], len(c.T_base_camera), 0))
+            for v, c in cameras.items()
+        }
+    elif number == 8:  # the base drives
+        wide = cv2.resize(
+            np.random.default_rng(3).uniform(40, 220, (8, 40, 3)).astype(np.float32),
+            (400, HEIGHT),
+            interpolation=cv2.INTER_NEAREST,
+        )
+        frames["head"] = np.stack([wide[:, 3 * i : 3 * i + WIDTH] for i in range(FRAMES)]).astype(np.uint8)
+    return replace(episode, cameras=cameras), frames
+
+
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, dict[str, Any]]:
+    root = tmp_path_factory.mktemp("filter")
+    with EpisodeSetWriter(root / "curated", video_crf=6, pixel_format="yuv444p") as writer:
+        for number in range(10):
+            writer.add(*spoil(number))
+    counts = filter_episodes(FilterConfig(), {"episodes": root / "curated"}, root / "filtered")
+    return root / "curated", root / "filtered", counts
+
+
+def test_every_defect_is_found_and_healthy_episodes_pass(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
+    _, output, counts = filtered
+    passed = EpisodeSet.open(output)
+    assert {row.episode_id: row.reason for row in passed.quarantine()} == {
+        "e01": "corrupted",
+        "e07": "static",
+        "e08": "base_motion",
+    }
+    assert {row.episode_id: row.stage2_reason for row in passed.rows} == {
+        "e00": None,
+        "e02": None,
+        "e03": "calibration",
+        "e04": "time_alignment",
+        "e05": "projection",
+        "e06": "missing_view",
+        "e09": None,
+    }
+    assert all(row.stage2_ok == (row.stage2_reason is None) for row in passed.rows)
+    assert all(row.stage1_ok for row in passed.rows)
+    assert counts["found"] == counts["kept"] + counts["quarantined"] == 10
+    assert counts["reasons"] == {"base_motion": 1, "corrupted": 1, "static": 1}
+    assert counts["stage2_reasons"] == {"calibration": 1, "missing_view": 1, "projection": 1, "time_alignment": 1}
+    evidence = next(row for row in passed.quarantine() if row.episode_id == "e01").numbers
+    assert evidence["frozen_frames"] >= 20
+    assert passed.select(stage2_ok=True) == [0, 1, 6]
+
+
+def test_kept_rows_point_into_the_curated_set(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
+    curated_path, output, counts = filtered
+    curated, passed = EpisodeSet.open(curated_path), EpisodeSet.open(output)
+    row = passed.rows[1]
+    assert (row.episode_id, row.start, row.stop, row.num_frames) == ("e02", 0, 28, 28)
+    assert row.dataset == "../curated/datasets/points"
+    assert np.array_equal(passed.frames(1, "head"), curated.frames(2, "head")[:28])
+    assert counts["cut_frames"] == 5
+    assert not list(output.rglob("*.mp4"))
+    findings = pq.read_table(output / "findings.parquet").to_pylist()
+    cut = {(f["episode_id"], f["detector"]): f["cut_frames"] for f in findings if f["cut_frames"]}
+    assert cut[("e02", "corrupted")] == 3
+    numbers = json.loads(
+        next(f["numbers"] for f in findings if f["episode_id"] == "e04" and f["detector"] == "pose_lag")
+    )
+    assert abs(abs(numbers["pose_lag_s"]) - 0.5) < 1e-9
+
+
+def test_a_restart_gives_the_same_bytes(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:
+    curated, output, counts = filtered
+    again = output.parent / "again"
+    verdicts = again / "run" / "verdicts"
+    verdicts.mkdir(parents=True)
+    for path in sorted((output / "run" / "verdicts").iterdir())[:4]:
+        (verdicts / path.name).write_bytes(path.read_bytes())
+    assert filter_episodes(FilterConfig(), {"episodes": curated}, again) == counts
+    for name in ("index.parquet", "quarantine.parquet", "findings.parquet"):
+        assert (again / name).read_bytes() == (output / name).read_bytes()
+
+
+def test_nothing_left_is_an_error(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:
+    curated, _, _ = filtered
+    with pytest.raises(DataError, match=r"(?s)No episode passed.*too_short"):
+        filter_episodes(FilterConfig(min_segment_frames=200), {"episodes": curated}, tmp_path / "out")
+
+
+def test_views_that_have_no_frames_are_known(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
+    passed = EpisodeSet.open(filtered[1])
+    assert passed.rows[passed.position("e06")].views == VIEWS[:2]

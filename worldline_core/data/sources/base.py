@@ -1,0 +1,75 @@
+"""What every episode source offers, and what their configurations share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from pydantic import Field
+
+from worldline_core.config.base import StrictModel
+from worldline_core.data.episode import Episode, Outcome, Split, TaskFamily
+
+
+@dataclass(frozen=True)
+class LoadedEpisode:
+    """An episode at the source's own rate and image size.
+
+    Attributes:
+        views: views that have images.
+        frames: view -> uint8 (episode.num_video_frames, H, W, 3); decodes when called.
+        robot_masks: view -> bool (N, H, W), or None where the source has none.
+    """
+
+    episode: Episode
+    views: tuple[str, ...]
+    frames: Callable[[str], np.ndarray]
+    robot_masks: Callable[[str], np.ndarray | None]
+
+
+class EpisodeSource(Protocol):
+    """A collection of recordings. `load` raises a DataError for a bad episode; the others are not touched by it."""
+
+    def episode_ids(self) -> list[str]: ...
+
+    def load(self, episode_id: str) -> LoadedEpisode: ...
+
+
+class SourceConfigBase(StrictModel):
+    """Fields of every source."""
+
+    path: Path = Field(description="folder of the recordings")
+    name: str | None = Field(None, description="name of the source in the index; default: the folder's name")
+
+    @property
+    def label(self) -> str:
+        return self.name or self.path.name
+
+
+class ForeignSourceConfig(SourceConfigBase):
+    """What foreign recordings do not say about themselves and the user therefore declares."""
+
+    split: Split = Field("test", description="never train without saying so")
+    scene: str | None = Field(None, description="scene of all episodes; default: one scene an episode folder")
+    task_family: TaskFamily = "unknown"
+    outcome: Outcome = "unknown"
+
+
+class GripperRange(StrictModel):
+    """Raw gripper readings at the two ends."""
+
+    closed: float
+    open: float
+
+    def opening(self, raw: np.ndarray) -> tuple[np.ndarray, int]:
+        """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside."""
+        value = (np.asarray(raw, dtype=np.float64) - self.closed) / (self.open - self.closed)
+        return np.clip(value, 0.0, 1.0), int(np.count_nonzero((value < 0.0) | (value > 1.0)))
+
+
+def no_masks(view: str) -> None:
+    """Robot masks of a source that has none."""
+    del view

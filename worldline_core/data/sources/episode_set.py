@@ -1,0 +1,42 @@
+"""This project's own recordings: LeRobot v3 datasets with the sidecar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
+
+
+class EpisodeSetSourceConfig(SourceConfigBase):
+    """An EpisodeSet, for example one that the recorder wrote."""
+
+    kind: Literal["episode_set"] = "episode_set"
+
+
+class EpisodeSetSource:
+    """Reads an EpisodeSet; its datasets must lie inside its folder.
+
+    Raises: DataError when the set has no readable index.
+    """
+
+    def __init__(self, config: EpisodeSetSourceConfig, root: Path) -> None:
+        self._name = config.name
+        self._set = EpisodeSet.open(root, allow_linked=False)
+
+    def episode_ids(self) -> list[str]:
+        return [row.episode_id for row in self._set.rows]
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        position = self._set.position(episode_id)
+        episode = self._set.episode(position)
+        if self._name is not None:
+            episode = replace(episode, source=self._name)
+        return LoadedEpisode(
+            episode,
+            self._set.rows[position].views,
+            lambda view: self._set.frames(position, view),
+            lambda view: self._set.robot_masks(position, view),
+        )

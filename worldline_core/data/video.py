@@ -1,0 +1,312 @@
+"""Reading and writing video with PyAV, reproducibly and frame by frame.
+
+Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
+
+PyAV carries its own FFmpeg, so a machine without system codecs still decodes. Encoding is single-threaded
+libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key frame, and
+presentation order equals file order: clips can be joined without encoding again and found by frame number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import av
+import av.error
+import cv2
+import numpy as np
+from av.bitstream import BitStreamFilterContext
+
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.errors import DataError
+
+PixelFormat = Literal["yuv420p", "yuv444p"]
+
+# BT.601, limited range: what FFmpeg assumes for untagged video of standard definition, hence what every reader
+# of these files will invert. Rows give Y, U, V of an RGB value in 0..255.
+_RGB_TO_YUV = np.array(
+    [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]], dtype=np.float32
+) / np.float32(255.0)
+_YUV_OFFSET = (16.0, 128.0, 128.0)
+_KEY_FRAME_INTERVAL = 250
+
+
+def frame_rate(fps: float) -> Fraction:
+    """Frames per second as an exact fraction (29.97 becomes 30000/1001).
+
+    Raises: DataError when fps is not a positive number.
+    """
+    if not np.isfinite(fps) or fps <= 0:
+        raise DataError("Frame rate must be a positive number", expected="fps > 0", got=str(fps))
+    return Fraction(fps).limit_denominator(1001)
+
+
+def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
+    """One RGB frame (H, W, 3) as the stacked planes that `VideoFrame.from_ndarray` expects."""
+    rgb = frame.astype(np.float32)
+    luma = rgb @ _RGB_TO_YUV[0] + _YUV_OFFSET[0]
+    height, width = frame.shape[:2]
+    if pixel_format == "yuv420p":
+        # Chroma from the mean of each 2x2 block, not from one of its pixels: small coloured objects keep their hue.
+        rgb = cv2.resize(rgb, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    planes = [luma, rgb @ _RGB_TO_YUV[1] + _YUV_OFFSET[1], rgb @ _RGB_TO_YUV[2] + _YUV_OFFSET[2]]
+    quantised = [np.clip(np.rint(plane), 0, 255).astype(np.uint8) for plane in planes]
+    if pixel_format == "yuv444p":
+        return np.stack(quantised)
+    flat = np.concatenate([plane.reshape(-1) for plane in quantised])
+    return flat.reshape(height * 3 // 2, width)
+
+
+def encode_video(
+    path: Path,
+    frames: np.ndarray,
+    fps: float,
+    *,
+    crf: int = 18,
+    preset: str = "slow",
+    pixel_format: PixelFormat = "yuv420p",
+) -> None:
+    """Write frames as an H.264 mp4 whose bytes depend on the arguments alone.
+
+    Args:
+        frames: uint8 (N, H, W, 3) RGB; H and W even for yuv420p.
+        crf: quality, 0 (exact up to the colour conversion) .. 51.
+
+    Raises: DataError for empty, wrongly shaped or wrongly typed frames.
+    """
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or frames.shape[0] == 0:
+        raise DataError(
+            "Cannot encode these frames as video",
+            where=str(path),
+            expected="uint8 (N > 0, H, W, 3)",
+            got=f"{frames.dtype} {frames.shape}",
+        )
+    height, width = frames.shape[1:3]
+    if pixel_format == "yuv420p" and (height % 2 or width % 2):
+        raise DataError(
+            "yuv420p needs even image sides",
+            where=str(path),
+            expected="even height and width",
+            got=f"{height}x{width}",
+            next_step="choose another image size, or pixel_format yuv444p",
+        )
+    rate = frame_rate(fps)
+    with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact", "movflags": "+faststart"}) as out:
+        stream = out.add_stream("libx264", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
+        context = stream.codec_context
+        context.thread_count = 1
+        context.time_base = 1 / rate
+        context.flags |= int(av.codec.context.Flags.bitexact)
+        stream.options = {
+            "crf": str(crf),
+            "preset": preset,
+            "bf": "0",
+            "g": str(_KEY_FRAME_INTERVAL),
+            "threads": "1",
+            "colorspace": "smpte170m",
+            "color_range": "tv",
+        }
+        for index, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(_planar(frame, pixel_format), format=pixel_format)
+            picture.pts = index
+            picture.time_base = 1 / rate
+            out.mux(stream.encode(picture))
+        out.mux(stream.encode(None))
+
+
+def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float) -> None:
+    """Join clips of one encoder setting into one mp4 without encoding again.
+
+    Args:
+        parts: (clip written by `encode_video`, its frame count), in order.
+
+    Raises: DataError when a part holds another number of frames than stated.
+    """
+    rate = frame_rate(fps)
+    with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact", "movflags": "+faststart"}) as out:
+        stream = None
+        first_frame = 0
+        for part, expected in parts:
+            with av.open(str(part)) as source:
+                template = source.streams.video[0]
+                if stream is None:
+                    stream = out.add_stream_from_template(template)
+                    stream.time_base = template.time_base
+                ticks = 1 / (rate * (template.time_base or 1 / rate))
+                # The encoder's own message (a kilobyte of settings) would otherwise repeat for each clip.
+                without_message = BitStreamFilterContext("filter_units=remove_types=6", template)
+                count = 0
+                for packet in _filtered(source.demux(template), without_message):
+                    packet.pts = packet.dts = round((first_frame + count) * ticks)
+                    packet.stream = stream
+                    out.mux(packet)
+                    count += 1
+            if count != expected:
+                raise DataError(
+                    "Video part has another length than its episode",
+                    where=str(part),
+                    expected=f"{expected} frames",
+                    got=f"{count} frames",
+                )
+            first_frame += count
+
+
+def _filtered(packets: Iterator[av.Packet], context: BitStreamFilterContext) -> Iterator[av.Packet]:
+    for packet in packets:
+        if packet.size:  # the demuxer ends with an empty flushing packet
+            yield from context.filter(packet)
+    yield from context.filter(None)
+
+
+def iterate_frames(path: Path, start_time: float = 0.0) -> Iterator[tuple[float, np.ndarray]]:
+    """Yield (presentation time in seconds, uint8 (H, W, 3) RGB) from the key frame at or before start_time.
+
+    Raises: DataError when the file is missing or has no readable video; a stream that breaks in the middle ends early.
+    """
+    if not path.is_file():
+        raise RejectedInputError(
+            "missing_file",
+            "Video file is missing",
+            where=str(path),
+            next_step="restore the file or drop the episode",
+        )
+    try:
+        container = av.open(str(path))
+    except av.error.FFmpegError as error:
+        raise _undecodable(path, error) from error
+    with container:
+        if not container.streams.video:
+            raise RejectedInputError(
+                "unreadable",
+                "File holds no video stream",
+                where=str(path),
+                expected="one video stream",
+                got="none",
+            )
+        stream = container.streams.video[0]
+        time_base = stream.time_base or Fraction(1, 1000)
+        stream.thread_type = "NONE"  # small pictures decode faster than threads start
+        try:
+            if start_time > 0:
+                container.seek(max(round(start_time / time_base), 0), stream=stream, backward=True, any_frame=False)
+            for frame in container.decode(stream):
+                if frame.pts is not None:
+                    yield float(frame.pts * time_base), frame.to_ndarray(format="rgb24")
+        except av.error.FFmpegError as error:
+            raise _undecodable(path, error) from error
+
+
+def _undecodable(path: Path, error: Exception) -> RejectedInputError:
+    return RejectedInputError(
+        "truncated_video",
+        "Video cannot be decoded",
+        where=str(path),
+        expected="a complete video file",
+        got=str(error),
+        next_step="copy the file again; it may be truncated",
+    )
+
+
+def decode_video(path: Path, expected_frames: int | None = None) -> np.ndarray:
+    """All frames of a video, uint8 (N, H, W, 3).
+
+    Raises: DataError naming the file and the frame counts when it is truncated, undecodable or of another length.
+    """
+    frames: list[np.ndarray] = []
+    try:
+        frames.extend(image for _, image in iterate_frames(path))
+    except RejectedInputError as error:
+        if error.reason == "missing_file":
+            raise
+        raise _wrong_count(path, expected_frames, len(frames), str(error.got)) from error
+    if not frames or (expected_frames is not None and len(frames) != expected_frames):
+        raise _wrong_count(path, expected_frames, len(frames), None)
+    return np.stack(frames)
+
+
+def decode_segment(
+    path: Path, from_time: float, count: int, fps: float, indices: Sequence[int] | None = None
+) -> np.ndarray:
+    """Exact frames of one clip inside a joined video, uint8 (len, H, W, 3).
+
+    Args:
+        from_time: presentation time [s] of the clip's frame 0.
+        count: number of frames of the clip.
+        indices: frame numbers inside the clip, each 0 <= i < count, any order; None for all.
+
+    Raises: DataError when a wanted frame cannot be decoded or an index lies outside the clip.
+    """
+    wanted = list(range(count)) if indices is None else [int(i) for i in indices]
+    if any(i < 0 or i >= count for i in wanted):
+        raise DataError(
+            "Frame index outside of the clip",
+            where=str(path),
+            expected=f"0 <= index < {count}",
+            got=str(wanted),
+        )
+    if not wanted:
+        raise DataError("No frames were asked for", where=str(path), expected="at least one index", got="none")
+    needed, last = set(wanted), max(wanted)
+    found: dict[int, np.ndarray] = {}
+    broken: str | None = None
+    try:
+        for time, image in iterate_frames(path, start_time=from_time + min(wanted) / fps):
+            number = (time - from_time) * fps
+            index = round(number)
+            if index in needed and abs(number - index) < 0.25:
+                found[index] = image
+            if index >= last:
+                break
+    except RejectedInputError as error:
+        if error.reason == "missing_file":
+            raise
+        broken = str(error.got)
+    if len(found) != len(needed):
+        raise _wrong_count(path, len(needed), len(found), broken)
+    return np.stack([found[i] for i in wanted])
+
+
+def video_size(path: Path) -> tuple[int, int, float]:
+    """(height, width, frames per second) from the container, without decoding.
+
+    Raises: DataError when the file is missing or not a video.
+    """
+    if not path.is_file():
+        raise RejectedInputError(
+            "missing_file",
+            "Video file is missing",
+            where=str(path),
+            next_step="restore the file or drop the episode",
+        )
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise RejectedInputError(
+                    "unreadable",
+                    "File holds no video stream",
+                    where=str(path),
+                    expected="one video stream",
+                    got="none",
+                )
+            stream = container.streams.video[0]
+            rate = stream.average_rate or stream.base_rate or Fraction(0)
+            return stream.height, stream.width, float(rate)
+    except av.error.FFmpegError as error:
+        raise _undecodable(path, error) from error
+
+
+def _wrong_count(path: Path, expected: int | None, got: int, cause: str | None) -> RejectedInputError:
+    too_few = cause is not None or (expected or 1) > got
+    return RejectedInputError(
+        "truncated_video" if too_few else "length_mismatch",
+        "Video is truncated or undecodable" if too_few else "Video has too many frames",
+        where=str(path),
+        expected="at least 1 frame" if expected is None else f"{expected} frames",
+        got=f"{got} frames" + (f" ({cause})" if cause else ""),
+        next_step="copy the file again, or leave the episode in quarantine",
+        evidence={"expected_frames": expected, "decoded_frames": got},
+    )

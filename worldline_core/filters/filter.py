@@ -1,0 +1,212 @@
+"""Filtering: which curated episodes, and which of their frames, enter training. No data is copied: the new index points
+into the curated set, row by row, with start and stop.
+
+Stage I (action-free, one view) drops static, reset, corrupted and base-motion frames. Stage II (three views, actions)
+needs in addition every required view, valid calibration, aligned clocks and a projection that agrees with the images.
+An episode that only Stage II cannot use stays, with stage2_ok false and the reason.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+from tqdm import tqdm
+
+from worldline_core.config.base import StrictModel
+from worldline_core.data.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
+from worldline_core.data.episode_parts import part_name
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.lerobot_v3 import write_table
+from worldline_core.errors import DataError
+from worldline_core.filters.base_motion import BaseMotionConfig
+from worldline_core.filters.calibration import CalibrationConfig
+from worldline_core.filters.corrupted import CorruptedConfig
+from worldline_core.filters.inspect_episode import Finding, inspect
+from worldline_core.filters.projection import ProjectionConfig
+from worldline_core.filters.reset import ResetConfig
+from worldline_core.filters.signals import measure
+from worldline_core.filters.static import StaticConfig
+from worldline_core.filters.time_alignment import TimeAlignmentConfig
+from worldline_core.filters.verdict import runs
+from worldline_core.store.atomic import write_json_atomic
+
+
+class FilterConfig(StrictModel):
+    """Thresholds of all detectors."""
+
+    required_views: tuple[str, ...] | None = Field(
+        None, description="views that Stage II needs; null: head and one wrist view for each arm"
+    )
+    min_segment_frames: int = Field(17, ge=2, description="shorter stretches are dropped")
+    static: StaticConfig = StaticConfig()
+    reset: ResetConfig = ResetConfig()
+    corrupted: CorruptedConfig = CorruptedConfig()
+    base_motion: BaseMotionConfig = BaseMotionConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+    time_alignment: TimeAlignmentConfig = TimeAlignmentConfig()
+    projection: ProjectionConfig = ProjectionConfig()
+
+
+FINDINGS_FILE = "findings.parquet"
+_FINDINGS = pa.schema(
+    [
+        ("episode_id", pa.string()),
+        ("detector", pa.string()),
+        ("view", pa.string()),
+        ("stage", pa.int64()),
+        ("passed", pa.bool_()),
+        ("cut_frames", pa.int64()),
+        ("numbers", pa.string()),
+    ]
+)
+
+
+def filter_episodes(config: FilterConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """Index the fit episodes and segments of inputs["episodes"] at `output`.
+
+    Also writes quarantine.parquet (one row an episode that is dropped whole) and findings.parquet (every detector's
+    numbers for every episode).
+
+    Returns:
+        {"found", "kept", "quarantined", "reasons", "segments", "cut_frames", "stage1_ok", "stage2_ok",
+        "stage2_reasons"}; kept + quarantined = found, in episodes.
+
+    Raises: DataError when the input set is unreadable or nothing is left.
+    """
+    episodes = EpisodeSet.open(inputs["episodes"])
+    verdicts = output / "run" / "verdicts"
+    rows: list[EpisodeRow] = []
+    rejected: list[QuarantineRow] = []
+    findings: list[dict[str, Any]] = []
+    kept = cut_frames = 0
+    for i, row in enumerate(tqdm(episodes.rows, desc="filter", unit="episode", disable=None)):
+        path = verdicts / f"{part_name(row.episode_id)}.json"
+        if not path.is_file():
+            write_json_atomic(path, _examine(config, episodes, i))
+        result = json.loads(path.read_text())
+        findings += result["findings"]
+        if result["reason"] is not None:
+            evidence = json.dumps(result["evidence"], sort_keys=True)
+            rejected.append(QuarantineRow(row.episode_id, row.source, result["reason"], result["detail"], evidence))
+            continue
+        kept += 1
+        cut_frames += row.num_frames - sum(stop - start for start, stop in result["segments"])
+        dataset = os.path.relpath(episodes.dataset_path(i), output)
+        rows += _segment_rows(row, Path(dataset).as_posix(), result)
+    if kept + len(rejected) != len(episodes):
+        raise DataError("Episodes were lost", expected=len(episodes), got=f"{kept} + {len(rejected)}")
+    if not rows:
+        raise DataError(
+            "No episode passed the filters",
+            where=str(inputs["episodes"]),
+            got=", ".join(sorted({r.reason for r in rejected})),
+            next_step="look at the numbers in quarantine.parquet and at the thresholds in filter",
+        )
+    write_table(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=_FINDINGS))
+    write_quarantine(output, rejected)
+    write_index(output, rows)
+    return {
+        "found": len(episodes),
+        "kept": kept,
+        "quarantined": len(rejected),
+        "reasons": _count(r.reason for r in rejected),
+        "segments": len(rows),
+        "cut_frames": cut_frames,
+        "stage1_ok": sum(row.stage1_ok for row in rows),
+        "stage2_ok": sum(row.stage2_ok for row in rows),
+        "stage2_reasons": _count(row.stage2_reason for row in rows if row.stage2_reason is not None),
+    }
+
+
+def _count(reasons: Any) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for reason in reasons:
+        counts[reason] = counts.get(reason, 0) + 1
+    return dict(sorted(counts.items()))
+
+
+def _examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any]:
+    """Everything the detectors say about one episode, as JSON."""
+    row = episodes.rows[i]
+    try:
+        episode = episodes.episode(i)
+        frames = {view: episodes.frames(i, view) for view in row.views}
+    except DataError as error:
+        return _rejected("unreadable", str(error).replace(str(episodes.root), ""), {}, [])
+    if row.video_frames < config.min_segment_frames:
+        evidence = {"video_frames": row.video_frames, "threshold_frames": config.min_segment_frames}
+        return _rejected("too_short", "Fewer images than the shortest clip", evidence, [])
+    findings = inspect(config, measure(episode, frames))
+    listed = [_finding_row(row.episode_id, finding) for finding in findings]
+    whole = [f for f in findings if f.stage == 1 and not f.verdict.passed]
+    if whole:
+        return _rejected(whole[0].verdict.reason, _detail(whole[0]), dict(whole[0].verdict.numbers), listed)
+    bad = np.zeros(row.video_frames, dtype=bool)
+    for finding in findings:
+        if finding.verdict.bad_frames is not None:
+            bad |= finding.verdict.bad_frames
+    segments = [(a, b) for a, b in runs(~bad) if b - a >= config.min_segment_frames]
+    if not segments:
+        blame = max(findings, key=lambda f: 0 if f.verdict.bad_frames is None else int(f.verdict.bad_frames.sum()))
+        return _rejected(blame.verdict.reason, _detail(blame), dict(blame.verdict.numbers), listed)
+    stage2 = next((f.verdict.reason for f in findings if f.stage == 2 and not f.verdict.passed), None)
+    return {
+        "reason": None,
+        "segments": segments,
+        "stage1_ok": row.primary_view in row.views,
+        "stage2_reason": stage2,
+        "findings": listed,
+    }
+
+
+def _rejected(reason: str, detail: str, evidence: dict[str, Any], findings: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"reason": reason, "detail": detail, "evidence": evidence, "findings": findings}
+
+
+def _detail(finding: Finding) -> str:
+    where = f" in view {finding.view}" if finding.view else ""
+    return f"Detector {finding.detector}{where}"
+
+
+def _finding_row(episode_id: str, finding: Finding) -> dict[str, Any]:
+    verdict = finding.verdict
+    return {
+        "episode_id": episode_id,
+        "detector": finding.detector,
+        "view": finding.view,
+        "stage": finding.stage,
+        "passed": bool(verdict.passed),
+        "cut_frames": 0 if verdict.bad_frames is None else int(verdict.bad_frames.sum()),
+        "numbers": json.dumps(dict(verdict.numbers), sort_keys=True),
+    }
+
+
+def _segment_rows(row: EpisodeRow, dataset: str, result: dict[str, Any]) -> list[EpisodeRow]:
+    """One row a segment; a single segment keeps the episode's id."""
+    segments = result["segments"]
+    untouched = segments == [[0, row.video_frames]] and row.video_frames == row.num_frames
+    rows = []
+    for start, stop in segments:
+        rows.append(
+            replace(
+                row,
+                episode_id=row.episode_id if len(segments) == 1 else f"{row.episode_id}@{start:05d}",
+                dataset=dataset,
+                start=row.start + (0 if untouched else start),
+                stop=row.start + (row.num_frames if untouched else stop),
+                num_frames=stop - start,
+                video_frames=stop - start,
+                stage1_ok=bool(result["stage1_ok"]),
+                stage2_ok=result["stage2_reason"] is None,
+                stage2_reason=result["stage2_reason"],
+            )
+        )
+    return rows

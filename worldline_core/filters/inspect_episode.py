@@ -1,0 +1,167 @@
+"""Apply every detector to one episode's signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from worldline_core.data.episode import CameraTrack
+from worldline_core.filters.base_motion import background_flow, detect_base_motion
+from worldline_core.filters.calibration import (
+    detect_camera,
+    detect_fixed_camera,
+    detect_hand_eye,
+    rigid_inverse,
+    rotation_angle_deg,
+)
+from worldline_core.filters.corrupted import detect_corrupted
+from worldline_core.filters.projection import detect_projection, inside_image, project_points
+from worldline_core.filters.reset import detect_reset
+from worldline_core.filters.signals import Signals
+from worldline_core.filters.static import detect_static
+from worldline_core.filters.time_alignment import detect_image_lag, detect_pose_lag
+from worldline_core.filters.verdict import Verdict
+
+if TYPE_CHECKING:
+    from worldline_core.filters.filter import FilterConfig
+
+# A wrist camera swings: turning by one radian shows about as much change as travelling this far.
+_METRES_PER_RADIAN = 0.15
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A detector's verdict. `stage`: 1 when a failure drops the episode, 2 when it only excludes it from Stage II."""
+
+    detector: str
+    view: str | None
+    stage: int
+    verdict: Verdict
+
+
+def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
+    """All findings about an episode, Stage I detectors first."""
+    findings = _stage1(config, signals)
+    findings += _required(config, signals)
+    if signals.T_base_tool is not None and signals.episode.cameras:
+        # Clocks first: a lag also disturbs the hand-eye check, and is the better explanation.
+        findings += _time_alignment(config, signals, signals.T_base_tool)
+        findings += _calibration(config, signals, signals.T_base_tool)
+        findings += _projection(config, signals, signals.T_base_tool)
+    return findings
+
+
+def _arms_of(signals: Signals, view: str) -> tuple[int, ...]:
+    """Arms whose motion a view must show: its own for a wrist view, all for any other."""
+    own = tuple(i for i, arm in enumerate(signals.arms) if arm.wrist_view == view)
+    return own or tuple(range(len(signals.arms)))
+
+
+def _stage1(config: FilterConfig, signals: Signals) -> list[Finding]:
+    episode = signals.episode
+    primary = episode.primary_view if episode.primary_view in signals.gray else next(iter(signals.gray))
+    findings = []
+    if signals.joints is not None:
+        findings.append(Finding("reset", None, 1, detect_reset(signals.joints, config.reset)))
+    for view in [primary, *(v for v in signals.gray if v != primary)]:
+        verdict = detect_corrupted(
+            signals.gray[view],
+            signals.change[view],
+            signals.travel(_arms_of(signals, view)),
+            config.corrupted,
+            wrist=view.endswith("wrist"),
+        )
+        findings.append(Finding("corrupted", view, 1 if view == primary else 2, verdict))
+    static = detect_static(
+        signals.joint_speed, signals.gripper_speed, signals.change[primary], episode.fps, config.static
+    )
+    findings.append(Finding("static", primary, 1, static))
+    camera = episode.cameras.get(primary)
+    if camera is None or not camera.moving:
+        settings = config.base_motion
+        step = max(1, round(settings.step_s * episode.fps))
+        flow = background_flow(signals.gray[primary], settings.quantile, settings.min_gradient, step)
+        verdict = detect_base_motion(flow, config.base_motion)
+        findings.append(Finding("base_motion", primary, 1, verdict))
+    return findings
+
+
+def _required(config: FilterConfig, signals: Signals) -> list[Finding]:
+    """Required views, their calibration, and known tool poses."""
+    arms = [arm.wrist_view for arm in signals.arms] or ["right_wrist"]
+    required = config.required_views or ("head", *arms)
+    findings = []
+    for view in required:
+        reason = "missing_view" if view not in signals.gray else "missing_calibration"
+        passed = view in signals.gray and view in signals.episode.cameras
+        findings.append(Finding("required_views", view, 2, Verdict(reason, passed)))
+    if signals.T_base_tool is None:
+        findings.append(Finding("required_views", None, 2, Verdict("missing_kinematics", False)))
+    return findings
+
+
+def _wrist_cameras(signals: Signals) -> list[tuple[int, CameraTrack]]:
+    cameras = signals.episode.cameras
+    return [(i, cameras[arm.wrist_view]) for i, arm in enumerate(signals.arms) if arm.wrist_view in cameras]
+
+
+def _calibration(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
+    findings = []
+    num_frames = len(T_base_tool)
+    for view, camera in signals.episode.cameras.items():
+        verdict = detect_camera(camera.K, camera.T_base_camera, camera.width, camera.height, config.calibration)
+        findings.append(Finding("camera", view, 2, verdict))
+    for i, camera in _wrist_cameras(signals):
+        poses = camera.poses(np.arange(num_frames))
+        if not camera.moving or not np.isfinite(poses).all():
+            continue
+        verdict = detect_hand_eye(T_base_tool[:, i], poses, signals.arms[i].T_tool_mount, config.calibration)
+        findings.append(Finding("hand_eye", camera.view, 2, verdict))
+    wrists = {arm.wrist_view for arm in signals.arms}
+    for view, camera in signals.episode.cameras.items():
+        if view not in wrists and camera.moving and np.isfinite(camera.T_base_camera).all():
+            verdict = detect_fixed_camera(camera.T_base_camera[:num_frames], config.calibration)
+            findings.append(Finding("fixed_camera", view, 2, verdict))
+    return findings
+
+
+def _time_alignment(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
+    fps = signals.episode.fps
+    relative = rigid_inverse(T_base_tool[:-1]) @ T_base_tool[1:]
+    motion = np.linalg.norm(relative[..., :3, 3], axis=-1)
+    motion = motion + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
+    streams, changes = [], []
+    for view, change in signals.change.items():
+        arms = _arms_of(signals, view)
+        if arms:
+            streams.append(motion[:, list(arms)].max(axis=1))
+            changes.append(change[1:])
+    findings = []
+    if streams:
+        verdict = detect_image_lag(np.stack(streams, axis=1), np.stack(changes, axis=1), fps, config.time_alignment)
+        findings.append(Finding("image_lag", None, 2, verdict))
+    for i, camera in _wrist_cameras(signals):
+        if camera.moving and np.isfinite(camera.T_base_camera).all():
+            poses = camera.poses(np.arange(len(T_base_tool)))
+            verdict = detect_pose_lag(T_base_tool[:, i], poses, fps, config.time_alignment)
+            findings.append(Finding("pose_lag", camera.view, 2, verdict))
+    return findings
+
+
+def _projection(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
+    view = signals.episode.primary_view
+    camera = signals.episode.cameras.get(view)
+    if camera is None or view not in signals.gray or not np.isfinite(camera.K).all():
+        return []
+    gray = signals.gray[view]
+    camera = camera.resized(gray.shape[2], gray.shape[1])
+    poses = camera.poses(np.arange(len(gray)))
+    uvs, insides = [], []
+    for arm in range(T_base_tool.shape[1]):
+        uv, depth = project_points(T_base_tool[:, arm, :3, 3], camera.K, poses)
+        uvs.append(uv)
+        insides.append(inside_image(uv, depth, camera.width, camera.height))
+    verdict = detect_projection(gray, np.stack(uvs, axis=1), np.stack(insides, axis=1), config.projection)
+    return [Finding("projection", view, 2, verdict)]

@@ -1,0 +1,116 @@
+"""Time alignment: do images, camera poses and states show the same instant?
+
+Two independent measurements. Images: the lag at which tool speed and image change correlate best. Camera poses: the shift
+at which a wrist camera is most rigidly fixed to its tool (exact where poses are recorded, even below one frame).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from worldline_core.config.base import StrictModel
+from worldline_core.filters.calibration import hand_eye_residual
+from worldline_core.filters.verdict import Verdict
+
+
+class TimeAlignmentConfig(StrictModel):
+    """Lags in seconds; positive means that the images come after the states."""
+
+    max_lag_s: float = Field(0.19, gt=0, description="a larger lag condemns")
+    search_s: float = Field(0.8, gt=0)
+    min_correlation: float = Field(0.75, gt=0, lt=1, description="at the best lag; less proves nothing")
+    min_gain: float = Field(0.12, ge=0, description="of the correlation at the best lag over that at lag 0")
+    max_pose_lag_s: float = Field(0.1, gt=0, description="larger shift between camera poses and states condemns")
+    min_pose_gain_m: float = Field(0.004, ge=0, description="smaller gains of the hand-eye residual prove no shift")
+    max_rigid_residual_m: float = Field(0.012, gt=0, description="hand-eye residual at the best shift, to trust it")
+
+
+def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> tuple[float, float, float]:
+    """Lag of `change` after `motion` with the best normalised correlation.
+
+    Args:
+        motion, change: (n, s) non-negative signals of s streams, entry i for the step from frame i to i + 1.
+        max_lag: frames searched to either side.
+
+    Returns: (lag in frames, refined below a frame by a parabola; correlation there; correlation at lag 0).
+    """
+    best, scores = 0, np.full(2 * max_lag + 1, -1.0)
+    for index, lag in enumerate(range(-max_lag, max_lag + 1)):
+        a = motion[max(0, -lag) : len(motion) - max(0, lag)]
+        b = change[max(0, lag) : len(change) - max(0, -lag)]
+        values = [_correlation(a[:, s], b[:, s]) for s in range(motion.shape[1])]
+        known = [value for value in values if value is not None]
+        if known:
+            scores[index] = float(np.mean(known))
+    best = int(scores.argmax())
+    refined = float(best - max_lag)
+    if 0 < best < len(scores) - 1:
+        left, middle, right = scores[best - 1 : best + 2]
+        curvature = left - 2 * middle + right
+        if curvature < -1e-9:
+            refined += 0.5 * (left - right) / curvature
+    return refined, float(scores[best]), float(scores[max_lag])
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    if len(a) < 8 or a.std() < 1e-9 or b.std() < 1e-9:
+        return None
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config: TimeAlignmentConfig) -> Verdict:
+    """Whether images lag or lead the states.
+
+    Args:
+        motion: (n, s) speed of what moves view s's image, entry i for the step to frame i + 1.
+        change: (n, s) mean absolute image change of view s.
+    """
+    max_lag = max(1, min(round(config.search_s * fps), len(motion) // 3))
+    lag, best, at_zero = lag_by_correlation(motion, change, max_lag)
+    significant = best >= config.min_correlation and best - at_zero >= config.min_gain
+    return Verdict(
+        "time_alignment",
+        not (significant and abs(lag) / fps > config.max_lag_s),
+        {
+            "image_lag_s": lag / fps,
+            "correlation": best,
+            "correlation_at_zero": at_zero,
+            "threshold_lag_s": config.max_lag_s,
+        },
+    )
+
+
+def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -> tuple[int, float, float]:
+    """Shift of a wrist camera's poses after its tool's that makes the pair most rigid.
+
+    Returns: (lag in frames, hand-eye residual [m] there, residual at 0), residuals as root mean squares.
+    """
+    residuals = {}
+    for lag in range(-max_lag, max_lag + 1):
+        tool = T_base_tool[max(0, -lag) : len(T_base_tool) - max(0, lag)]
+        camera = T_base_camera[max(0, lag) : len(T_base_camera) - max(0, -lag)]
+        _, metres, _ = hand_eye_residual(tool, camera)
+        residuals[lag] = float(np.sqrt((metres**2).mean()))
+    best = min(residuals, key=lambda lag: (residuals[lag], abs(lag)))
+    return best, residuals[best], residuals[0]
+
+
+def detect_pose_lag(
+    T_base_tool: np.ndarray, T_base_camera: np.ndarray, fps: float, config: TimeAlignmentConfig
+) -> Verdict:
+    """Whether recorded camera poses lag or lead the states."""
+    max_lag = max(1, min(round(config.search_s * fps), len(T_base_tool) // 3))
+    lag, best, at_zero = pose_lag(T_base_tool, T_base_camera, max_lag)
+    # Where no shift makes the pair rigid, the calibration is wrong and says nothing about clocks.
+    significant = at_zero - best >= config.min_pose_gain_m and best <= config.max_rigid_residual_m
+    return Verdict(
+        "time_alignment",
+        not (significant and abs(lag) / fps > config.max_pose_lag_s),
+        {
+            "pose_lag_s": lag / fps,
+            "residual_m": best,
+            "residual_at_zero_m": at_zero,
+            "threshold_lag_s": config.max_pose_lag_s,
+        },
+    )
