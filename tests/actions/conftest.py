@@ -1,0 +1,85 @@
+"""A small two-armed robot and episodes of it, for the tests of action rendering."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+
+K = np.array([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1.0]])
+# Looks from x = -1 along +x: camera x is -y of the base, camera y is -z.
+T_BASE_HEAD = np.array([[0.0, 0, 1, -1], [-1, 0, 0, 0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
+# Behind and above the tool, looking along the hand's +z.
+MOUNT = np.array([[1.0, 0, 0, 0], [0, 1, 0, -0.05], [0, 0, 1, -0.1], [0, 0, 0, 1]])
+
+ARM_XML = """
+<body name="{n}/base" pos="0 {y} 0.2">
+  <joint name="{n}/pan" axis="0 0 1"/>
+  <body name="{n}/upper" pos="0 0 0.1"><joint name="{n}/lift" axis="0 1 0"/>
+    <body name="{n}/hand" pos="0.3 0 0" euler="0 90 0">
+      <joint name="{n}/roll" axis="0 0 1"/>
+      <body name="{n}/finger" pos="0 0.02 0.08"/>
+    </body>
+  </body>
+</body>
+"""
+
+
+@pytest.fixture(scope="session")
+def kinematics(tmp_path_factory) -> ArmKinematics:
+    folder: Path = tmp_path_factory.mktemp("pair")
+    arms = "".join(ARM_XML.format(n=name, y=y) for name, y in (("left", 0.2), ("right", -0.2)))
+    (folder / "pair.xml").write_text(f"<mujoco><worldbody>{arms}</worldbody></mujoco>")
+    values = {
+        "name": "pair",
+        "description": {"format": "mjcf", "file": "pair.xml"},
+        "base_link": "world",
+        "arms": [
+            {
+                "name": name,
+                "joints": [f"{name}/{joint}" for joint in ("pan", "lift", "roll")],
+                "limits": [[-1.0, 1.0]] * 3,
+                "end_effector_link": f"{name}/hand",
+                "T_link_tool": {"translation": [0.0, 0.0, 0.1]},
+                "gripper": {"closed": 0.0, "open": 1.0},
+                "wrist_camera": {"link": f"{name}/hand", "T_link_camera": MOUNT.tolist()},
+            }
+            for name in ("left", "right")
+        ],
+    }
+    (folder / "pair.yaml").write_text(yaml.safe_dump(values))
+    return ArmKinematics(load_embodiment(folder / "pair.yaml"))
+
+
+@pytest.fixture
+def episode(kinematics) -> Episode:
+    return make_episode(kinematics)
+
+
+def make_episode(kinematics: ArmKinematics, num_frames: int = 9, episode_id: str = "pair-0") -> Episode:
+    time = np.linspace(0, 1, num_frames)
+    action = np.stack([0.5 * time, -0.2 * time, time, time, -0.4 * time, 0.3 * time, -time, 1.3 - 1.6 * time], axis=1)
+    cameras = {"head": CameraTrack("head", K, T_BASE_HEAD[None], 96, 64)}
+    for view, poses in kinematics.wrist_camera_poses(action - 0.01).items():
+        cameras[view] = CameraTrack(view, K, poses.numpy(), 96, 64)
+    return Episode(
+        episode_id=episode_id,
+        source="test",
+        embodiment="pair",
+        scene="s",
+        task_family="lift",
+        instruction="lift",
+        outcome="unknown",
+        split="train",
+        fps=8.0,
+        state=(action - 0.01).astype(np.float32),
+        action=action.astype(np.float32),
+        timestamps=np.arange(num_frames) / 8.0,
+        cameras=cameras,
+    )

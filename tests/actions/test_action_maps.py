@@ -1,0 +1,176 @@
+"""Nine-channel maps against a plain float64 transcription of the equation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.actions.action_maps import NUM_CHANNELS, grid_sigma, latent_frame_indices, render_action_maps
+from worldline_core.actions.episode_tracks import TrackBatch
+from worldline_core.errors import ConfigError
+
+
+def batch(seed=0, b=2, t=3, v=3, a=2, size=(480, 640)) -> TrackBatch:
+    g = torch.Generator().manual_seed(seed)
+    uv = torch.rand(b, t, v, a, 2, generator=g) * torch.tensor([size[1], size[0]]).float() - 0.5
+    return TrackBatch(
+        uv=uv,
+        depth=torch.rand(b, t, v, a, generator=g) + 0.2,
+        rot6d=torch.rand(b, t, v, a, 6, generator=g) * 2 - 1,
+        gripper=torch.rand(b, t, v, a, generator=g),
+        valid=torch.rand(b, t, v, a, generator=g) > 0.3,
+    )
+
+
+def reference(tracks: TrackBatch, image, grid, sigma_ref=10.0, ref=(384, 512)) -> np.ndarray:
+    """The equation, cell by cell in float64: no shared code with the renderer."""
+    b, t, v, a = tracks.depth.shape
+    out = np.zeros((b, v, 9, t, *grid))
+    for i, j, k, m in np.ndindex(b, t, v, a):
+        if not tracks.valid[i, j, k, m]:
+            continue
+        u = (float(tracks.uv[i, j, k, m, 0]) + 0.5) * grid[1] / image[1] - 0.5
+        w = (float(tracks.uv[i, j, k, m, 1]) + 0.5) * grid[0] / image[0] - 0.5
+        values = [
+            1.0,
+            float(tracks.depth[i, j, k, m]),
+            *tracks.rot6d[i, j, k, m].tolist(),
+            float(tracks.gripper[i, j, k, m]),
+        ]
+        for y, x in np.ndindex(*grid):
+            su, sv = sigma_ref * grid[1] / ref[1], sigma_ref * grid[0] / ref[0]
+            h = math.exp(-((x - u) ** 2) / (2 * su * su) - (y - w) ** 2 / (2 * sv * sv))
+            out[i, k, :, j, y, x] += h * np.array(values)
+    return out
+
+
+@pytest.mark.parametrize(("image", "grid", "sigma"), [((480, 640), (30, 40), 10.0), ((64, 96), (8, 12), 36.0)])
+def test_maps_equal_the_equation_to_1e_6(image, grid, sigma):
+    tracks = batch(size=image)
+    maps = render_action_maps(tracks, image, grid, sigma_px_ref=sigma)
+    assert maps.shape == (2, 3, NUM_CHANNELS, 3, *grid)
+    assert maps.dtype == torch.float32
+    np.testing.assert_allclose(maps.numpy(), reference(tracks, image, grid, sigma), atol=1e-6, rtol=0)
+
+
+def test_sigma_of_the_paper_on_its_grid():
+    assert grid_sigma((30, 40)) == pytest.approx((0.78125, 0.78125))
+
+
+def test_sigma_scales_with_each_axis_by_itself():
+    assert grid_sigma((384, 256)) == pytest.approx((10.0, 5.0))
+
+
+def test_point_on_a_cell_centre_has_value_one_there():
+    tracks = batch(b=1, t=1, v=1, a=1)
+    # Cell (y=7, x=11) of a 30 x 40 grid over 480 x 640: its centre is pixel (11.5 * 16 - 0.5, 7.5 * 16 - 0.5).
+    tracks.uv[:] = torch.tensor([11.5 * 16 - 0.5, 7.5 * 16 - 0.5])
+    tracks.valid[:] = True
+    maps = render_action_maps(tracks, (480, 640), (30, 40))[0, 0, :, 0]
+    assert float(maps[0, 7, 11]) == pytest.approx(1.0, abs=1e-7)
+    assert int(maps[0].argmax()) == 7 * 40 + 11
+    expected = torch.cat([torch.ones(1), tracks.depth.flatten(), tracks.rot6d.flatten(), tracks.gripper.flatten()])
+    torch.testing.assert_close(maps[:, 7, 11], expected)
+
+
+def test_resized_tracks_give_the_same_maps():
+    tracks = batch()
+    scale = torch.tensor([96 / 640, 64 / 480])
+    resized = TrackBatch((tracks.uv + 0.5) * scale - 0.5, tracks.depth, tracks.rot6d, tracks.gripper, tracks.valid)
+    torch.testing.assert_close(
+        render_action_maps(resized, (64, 96), (30, 40)),
+        render_action_maps(tracks, (480, 640), (30, 40)),
+        atol=3e-6,
+        rtol=0,
+    )
+
+
+def test_arms_are_added():
+    tracks = batch(a=2)
+    tracks.uv[..., 1, :] = tracks.uv[..., 0, :] + 3.0
+    tracks.valid[:] = True
+    parts = []
+    for arm in (0, 1):
+        only = torch.zeros_like(tracks.valid)
+        only[..., arm] = True
+        parts.append(
+            render_action_maps(
+                TrackBatch(tracks.uv, tracks.depth, tracks.rot6d, tracks.gripper, only), (480, 640), (30, 40)
+            )
+        )
+    both = render_action_maps(tracks, (480, 640), (30, 40))
+    torch.testing.assert_close(both, parts[0] + parts[1])
+    assert float(both[:, :, 0].max()) > 1.5  # overlapping Gaussians are summed, not clipped
+
+
+def test_invalid_samples_are_zero_even_when_they_hold_nan():
+    tracks = batch()
+    tracks.valid[:, :, 1] = False
+    for values in (tracks.uv, tracks.depth, tracks.rot6d, tracks.gripper):
+        values[:, :, 1] = math.nan
+    maps = render_action_maps(tracks, (480, 640), (30, 40))
+    assert torch.isfinite(maps).all()
+    assert (maps[:, 1] == 0).all()
+    assert (maps[:, 0] != 0).any()
+
+
+def test_gradients_through_invalid_nan_samples_are_zero():
+    tracks = batch(b=1, t=1, v=1)
+    tracks.valid[..., 0], tracks.valid[..., 1] = True, False
+    tracks.uv[..., 1, :] = math.nan
+    uv = tracks.uv.clone().requires_grad_()
+    render_action_maps(
+        TrackBatch(uv, tracks.depth, tracks.rot6d, tracks.gripper, tracks.valid), (480, 640), (30, 40)
+    ).sum().backward()
+    assert uv.grad is not None
+    assert (uv.grad[..., 1, :] == 0).all()
+    assert torch.isfinite(uv.grad).all()
+
+
+def test_gradcheck():
+    tracks = batch(b=1, t=1, v=1, size=(64, 96))
+    valid = torch.tensor([True, False]).expand(1, 1, 1, 2)
+    inputs = [x.double().requires_grad_() for x in (tracks.uv, tracks.depth, tracks.rot6d, tracks.gripper)]
+
+    def render(uv, depth, rot6d, gripper):
+        return render_action_maps(
+            TrackBatch(uv, depth, rot6d, gripper, valid), (64, 96), (4, 6), 60.0, dtype=torch.float64
+        )
+
+    assert torch.autograd.gradcheck(render, inputs)
+
+
+def test_point_on_the_border_keeps_the_inner_half_of_its_gaussian():
+    tracks = batch(b=1, t=1, v=1, a=1)
+    tracks.valid[:] = True
+    tracks.uv[:] = torch.tensor([-0.5, 14.5 * 16 - 0.5])
+    maps = render_action_maps(tracks, (480, 640), (30, 40))[0, 0, 0, 0]
+    # The border lies half a cell before the centre of column 0.
+    assert float(maps[:, 0].max()) == pytest.approx(math.exp(-0.5 * (0.5 / 0.78125) ** 2), abs=1e-4)
+
+
+def test_latent_frames_take_every_fourth_frame():
+    assert latent_frame_indices(33) == [0, 4, 8, 12, 16, 20, 24, 28, 32]
+    assert latent_frame_indices(1) == [0]
+    assert len(latent_frame_indices(129)) == 33
+
+
+@pytest.mark.parametrize("num_frames", [0, 16, 34])
+def test_clip_that_does_not_fit_is_refused(num_frames):
+    with pytest.raises(ConfigError, match="does not fit the tokenizer"):
+        latent_frame_indices(num_frames)
+
+
+def test_nonsense_sizes_are_refused():
+    with pytest.raises(ConfigError, match="Cannot render action maps"):
+        render_action_maps(batch(), (480, 640), (0, 40))
+
+
+@pytest.mark.gpu
+def test_gpu_equals_cpu():
+    tracks = batch()
+    there = render_action_maps(tracks.to("cuda"), (480, 640), (30, 40))
+    torch.testing.assert_close(there.cpu(), render_action_maps(tracks, (480, 640), (30, 40)), atol=1e-6, rtol=0)

@@ -1,0 +1,122 @@
+"""The end-effectors of the AgiBot samples land where hand-computed numbers, and their overlays, put them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.overlay import contact_sheet, overlay_frames
+from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.tracks import ActionTracks
+from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.episode import VIEWS
+from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+
+# Tool centres at frame 0, read off overlay_sample_0.png, overlay_sample_1.png and overlay_demo_000.png (circles; in
+# pixels of the recorded frames, sheet scale undone): view, arm, (u, v). To within the reading of a drawn circle.
+READ_OFF = {
+    "sample_0": [
+        ("head", 0, 167, 264),
+        ("head", 1, 434, 139),
+        ("left_wrist", 0, 333, 190),
+        ("right_wrist", 1, 340, 196),
+    ],
+    "sample_1": [
+        ("head", 0, 118, 180),
+        ("head", 1, 295, 135),
+        ("left_wrist", 1, 288, 137),
+        ("right_wrist", 1, 324, 178),
+    ],
+    "demo_000": [
+        ("head", 0, 95, 262),
+        ("head", 1, 392, 245),
+        ("left_wrist", 0, 268, 253),
+        ("right_wrist", 1, 264, 208),
+    ],
+}
+
+
+def load(shared_data: Path, name: str):
+    folder = shared_data / ("agibot_gesim" if name.startswith("sample") else "agibot_gesim_v2")
+    if not folder.is_dir():
+        pytest.skip(f"the AgiBot sample {name} is not here")
+    config = AgibotGesimSourceConfig(path=str(folder), fps=30.0, task_family="lift", outcome="unknown", split="test")
+    source = AgibotGesimSource(config, folder)
+    (episode_id,) = [i for i in source.episode_ids() if i.endswith(name)]
+    return source.load(episode_id)
+
+
+def independent_pixel(folder: Path, name: str, view: str, arm: int) -> np.ndarray:
+    """Straight from the arrays by quaternion or Euler algebra: shares no code with the project."""
+    v = VIEWS.index(view)
+    if name.startswith("sample"):
+        row = np.load(folder / name / "actions.npy")[0].astype(np.float64)[8 * arm : 8 * arm + 8]
+        x, y, z, w = row[3:7]
+        z_axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        point = row[:3] + 0.23 * z_axis
+        file = ("head", "hand_left", "hand_right")[v]
+        K, T = np.load(folder / name / f"intrinsic_{file}.npy"), np.load(folder / name / f"extrinsic_{file}.npy")[0]
+    else:
+        assets = folder / "assets" / name
+        row = np.load(assets / "state_eef_poses_0.npy")[0].astype(np.float64)[7 * arm : 7 * arm + 6]
+        (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in row[3:6])
+        point = row[:3] + 0.15 * np.array([cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr])
+        K, T = np.load(assets / "intrinsic.npy")[v], np.load(assets / "extrinsic_alignstate_0.npy")[v, 0]
+    in_camera = T[:3, :3].T.astype(np.float64) @ (point - T[:3, 3])
+    return (K.astype(np.float64) @ (in_camera / in_camera[2]))[:2]
+
+
+@pytest.mark.parametrize("name", sorted(READ_OFF))
+def test_tool_centres_land_where_the_reference_puts_them(shared_data, name):
+    loaded = load(shared_data, name)
+    tracks, counts = compute_tracks(loaded.episode, None)
+    assert counts["valid"] > 0
+    assert tracks.camera_motion == ("static", "recorded", "recorded")
+    folder = shared_data / ("agibot_gesim" if name.startswith("sample") else "agibot_gesim_v2")
+    for view, arm, u, v in READ_OFF[name]:
+        seen = tracks.uv[0, VIEWS.index(view), arm]
+        assert tracks.valid[0, VIEWS.index(view), arm]
+        np.testing.assert_allclose(seen, independent_pixel(folder, name, view, arm), atol=0.02)
+        np.testing.assert_allclose(seen, (u, v), atol=4.0)
+
+
+def test_overlay_marks_the_tool_centre(shared_data):
+    loaded = load(shared_data, "sample_0")
+    tracks, _ = compute_tracks(loaded.episode, None)
+    frames = {view: loaded.frames(view) for view in VIEWS}
+    overlay = overlay_frames(frames, tracks, scale=1)
+    assert overlay.shape == (4, 480, 3 * 640, 3)
+    # The ring of the left arm is yellow in the head view; nothing yellow was there before.
+    u, v = np.rint(tracks.uv[0, 0, 0]).astype(int)
+    around = (slice(v - 9, v + 10), slice(u - 9, u + 10))
+    yellow = lambda x: ((x[..., 0] > 200) & (x[..., 1] > 150) & (x[..., 2] < 80)).sum()  # noqa: E731
+    assert yellow(overlay[0][around].astype(int)) > 20
+    assert yellow(frames["head"][0][around].astype(int)) == 0
+    assert contact_sheet(overlay, [0, 3], "sample").shape == (22 + 2 * 480, 3 * 640, 3)
+
+
+def test_curated_and_resized_samples_keep_their_projections(shared_data, tmp_path):
+    """The whole way: reader, resize, EpisodeSet on disk, `render_actions`."""
+    folder = shared_data / "agibot_gesim"
+    if not folder.is_dir():
+        pytest.skip("the AgiBot samples are not here")
+    source = {"kind": "agibot_gesim", "path": str(folder), "fps": 30.0}
+    episodes, output = tmp_path / "episodes", tmp_path / "tracks"
+    for path in (episodes, output):
+        path.mkdir()
+    curate(CurateConfig.model_validate({"sources": [source], "image_size": [96, 160]}), {}, episodes)
+    summary = render_actions(RenderActionsConfig(previews=0), {"episodes": episodes}, output)
+    assert (summary["found"], summary["kept"]) == (2, 2)
+    assert summary["camera_motion"]["left_wrist"] == {"recorded": 2}
+    tracks = ActionTracks.open(output)
+    for name in ("sample_0", "sample_1"):
+        (episode_id,) = [i for i in tracks.episode_ids if i.endswith(name)]
+        small = tracks.tracks(episode_id)
+        assert small.image_size == (96, 160)
+        for view, arm, _, _ in READ_OFF[name]:
+            pixel = independent_pixel(folder, name, view, arm)
+            expected = (pixel + 0.5) * np.array([160 / 640, 96 / 480]) - 0.5
+            np.testing.assert_allclose(small.uv[0, VIEWS.index(view), arm], expected, atol=0.01)

@@ -1,0 +1,153 @@
+"""The step: an EpisodeSet in, tracks, counts, quarantine and previews out."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.tracks import ActionTracks
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episode_index import read_quarantine
+from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+
+N = 5
+
+
+def episode_of(embodiment: str, number: int) -> Episode:
+    kinematics = ArmKinematics(load_embodiment(embodiment))
+    size = kinematics.embodiment.state_size
+    action = np.linspace(0, 0.3, N)[:, None] * np.ones(size) * (1 + 0.1 * number)
+    K = np.array([[60.0, 0, 47.5], [0, 60.0, 31.5], [0, 0, 1]])
+    head = np.array([[0.0, 0, -1, 2.5], [1, 0, 0, 0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
+    cameras = {"head": CameraTrack("head", K, head[None], 96, 64)}
+    for view, poses in kinematics.wrist_camera_poses(action).items():
+        cameras[view] = CameraTrack(view, K, poses.numpy(), 96, 64)
+    return Episode(
+        episode_id=f"{embodiment}-{number}",
+        source="test",
+        embodiment=embodiment,
+        scene="s",
+        task_family="lift",
+        instruction="lift the cube",
+        outcome="unknown",
+        split="train",
+        fps=8.0,
+        state=action.astype(np.float32),
+        action=action.astype(np.float32),
+        timestamps=np.arange(N) / 8.0,
+        cameras=cameras,
+    )
+
+
+@pytest.fixture(scope="module")
+def episode_set(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("episodes")
+    good = [episode_of("ur5e_pair", 0), episode_of("ur5e_pair", 1), episode_of("so101", 0)]
+    unknown = replace(good[0], episode_id="alien-0", embodiment="alien")
+    with EpisodeSetWriter(root, fps=8, image_size=(64, 96)) as writer:
+        for episode in [*good, unknown]:
+            frames = {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras}
+            writer.add(episode, frames)
+    return root
+
+
+CONFIG = RenderActionsConfig(previews=2, preview_scale=2, preview_rows=2, episodes_per_shard=2)
+
+
+def digests(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and "run" not in path.relative_to(root).parts
+    }
+
+
+@pytest.fixture(scope="module")
+def rendered(episode_set, tmp_path_factory) -> tuple[Path, dict]:
+    output = tmp_path_factory.mktemp("tracks")
+    return output, render_actions(CONFIG, {"episodes": episode_set}, output)
+
+
+def test_every_episode_is_kept_or_quarantined(rendered):
+    output, summary = rendered
+    assert (summary["found"], summary["kept"], summary["quarantined"]) == (4, 3, 1)
+    assert ActionTracks.open(output).episode_ids == ["so101-0", "ur5e_pair-0", "ur5e_pair-1"]
+    (row,) = read_quarantine(output)
+    assert (row.episode_id, row.reason) == ("alien-0", "unknown_embodiment")
+    samples = summary["samples"]
+    causes = ("valid", "behind_camera", "outside_image", "invalid_calibration")
+    assert sum(samples[cause] for cause in causes) == samples["samples"] == N * (2 * 6 + 2)
+    assert samples["valid"] > 0
+    assert summary["camera_motion"] == {
+        "head": {"static": 3},
+        "left_wrist": {"absent": 1, "kinematics": 2},
+        "right_wrist": {"kinematics": 3},
+    }
+
+
+def test_stored_tracks_are_those_computed(rendered):
+    output, _ = rendered
+    tracks = ActionTracks.open(output).tracks("ur5e_pair-1")
+    kinematics = ArmKinematics(load_embodiment("ur5e_pair"))
+    episode = episode_of("ur5e_pair", 1)
+    np.testing.assert_allclose(
+        tracks.T_base_tool, kinematics.tool_poses(episode.action.astype(np.float64)).numpy(), atol=1e-6
+    )
+    assert tracks.image_size == (64, 96)
+    assert tracks.arms == ("left", "right")
+    assert tracks.valid.dtype == bool
+    assert tracks.capsules.shape[0] == N
+
+
+def test_previews_show_each_embodiment_first(rendered):
+    output, _ = rendered
+    names = sorted(path.name for path in (output / "previews").iterdir())
+    assert names == ["so101-0.mp4", "so101-0.png", "ur5e_pair-0.mp4", "ur5e_pair-0.png"]
+
+
+def test_interrupted_work_continues_to_the_same_bytes(rendered, episode_set, tmp_path):
+    output, summary = rendered
+    again = tmp_path / "again"
+    again.mkdir()
+    render_actions(CONFIG, {"episodes": episode_set}, again)
+    (again / "index.parquet").unlink()
+    (again / "tracks-00001.safetensors").unlink()
+    (again / "run" / "shard-00001.json").unlink()
+    (again / "previews" / "so101-0.mp4").unlink()
+    (again / "previews" / "so101-0.png").write_bytes((output / "previews" / "so101-0.png").read_bytes())
+    untouched = (again / "tracks-00000.safetensors").stat().st_mtime_ns
+    assert render_actions(CONFIG, {"episodes": episode_set}, again) == summary
+    assert (again / "tracks-00000.safetensors").stat().st_mtime_ns == untouched
+    assert digests(again) == digests(output)
+
+
+def test_unknown_episode_is_named(rendered):
+    with pytest.raises(DataError, match=r"No action tracks of this episode[\s\S]*nobody"):
+        ActionTracks.open(rendered[0]).tracks("nobody")
+
+
+def test_another_folder_is_no_action_tracks(tmp_path):
+    with pytest.raises(ArtifactError, match="Not an ActionTracks artifact"):
+        ActionTracks.open(tmp_path)
+
+
+def test_damaged_shard_is_named(rendered, tmp_path):
+    for path in rendered[0].glob("*.*"):
+        if path.is_file():
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "tracks-00000.safetensors").write_bytes(b"broken")
+    with pytest.raises(ArtifactError, match=r"cannot be read[\s\S]*tracks-00000|tracks-00000[\s\S]*cannot be read"):
+        list(ActionTracks.open(tmp_path))
+
+
+def test_input_is_needed(tmp_path):
+    with pytest.raises(ConfigError, match="needs an EpisodeSet"):
+        render_actions(CONFIG, {}, tmp_path)

@@ -1,0 +1,132 @@
+"""Kinematic robot masks: capsules against a ray-traced reference, windows and dilation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.actions.robot_masks import (
+    TOUCH_MARGIN_CELLS,
+    kinematic_robot_masks,
+    project_capsules,
+    robot_capsules,
+    tool_capsules,
+)
+from worldline_core.errors import ConfigError
+
+K = torch.tensor([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1.0]], dtype=torch.float64)
+EYE = torch.eye(4, dtype=torch.float64)
+SIZE = (64, 96)
+
+
+def draw(start, end, radius, intrinsics=K, grid=SIZE):
+    capsule = torch.tensor([start, end], dtype=torch.float64)[None, None, None]
+    radii = torch.tensor([[radius]], dtype=torch.float64)
+    return project_capsules(capsule, radii, intrinsics[None, None], EYE[None, None, None], SIZE, grid)[0, 0, 0].numpy()
+
+
+def traced(start, end, radius, intrinsics=K):
+    """Pixels whose ray passes the segment nearer than the radius: by minimising over points of the segment."""
+    start, end = np.array(start), np.array(end)
+    v, u = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsics.numpy()).T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    best = np.full(SIZE, np.inf)
+    for s in np.linspace(0, 1, 201):
+        point = start + s * (end - start)
+        along = np.clip(rays @ point, 0, None)
+        best = np.minimum(best, np.linalg.norm(point - along[..., None] * rays, axis=-1))
+    return best <= radius
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "radius"),
+    [
+        ((-0.2, -0.1, 1.0), (0.3, 0.15, 1.0), 0.06),
+        ((-0.2, -0.1, 0.6), (0.3, 0.15, 1.6), 0.06),
+        ((0.1, 0.05, 0.9), (0.1, 0.05, 0.9), 0.1),
+    ],
+)
+def test_capsule_equals_the_ray_traced_one(start, end, radius):
+    drawn, expected = draw(start, end, radius), traced(start, end, radius)
+    assert expected.sum() > 100
+    overlap = (drawn & expected).sum() / (drawn | expected).sum()
+    assert overlap > 0.93
+
+
+def test_pixels_that_are_not_square_stretch_the_disc():
+    squeezed = K.clone()
+    squeezed[0, 0] = 60.0
+    drawn = draw((0, 0, 1.0), (0, 0, 1.0), 0.2, squeezed)
+    rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    assert (len(rows), len(columns)) == (36, 24)
+
+
+def test_a_part_behind_the_camera_is_cut_away_and_one_wholly_behind_leaves_nothing():
+    assert draw((0, 0, -1.0), (0, 0.0, -0.5), 0.1).sum() == 0
+    half = draw((0.2, 0.3, -1.0), (0.1, 0.1, 1.0), 0.05)
+    assert 0 < half.sum() < half.size
+
+
+def test_radius_zero_leaves_a_capsule_out():
+    assert draw((0, 0, 1.0), (0, 0, 1.0), 0.0).sum() == 0
+
+
+def test_capsules_follow_the_links(kinematics):
+    state = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 8))
+    poses = kinematics.link_poses(state)
+    capsules, radii = robot_capsules(kinematics, poses)
+    # An arm: hand-upper, upper-base, hand-tool, hand-finger, finger-fingertip.
+    assert capsules.shape == (3, 10, 2, 3)
+    assert radii.tolist() == pytest.approx([0.05, 0.05, 0.04, 0.04, 0.04] * 2)
+    torch.testing.assert_close(capsules[:, 0, 0], poses["left/upper"][:, :3, 3])
+    torch.testing.assert_close(capsules[:, 0, 1], poses["left/hand"][:, :3, 3])
+    torch.testing.assert_close(capsules[:, 7, 1], kinematics.tool_poses(state)[:, 1, :3, 3])
+    torch.testing.assert_close(capsules[:, 8, 1], poses["right/finger"][:, :3, 3])
+    # The finger is 8 cm, the tool 10 cm along the hand's z.
+    torch.testing.assert_close(
+        capsules[:, 9, 1], (poses["right/finger"] @ torch.tensor([0, 0, 0.02, 1.0]).double())[:, :3]
+    )
+
+
+def test_tool_capsule_reaches_back_along_z():
+    capsules, radii = tool_capsules(EYE.expand(2, 1, 4, 4), length=0.2, radius=0.03)
+    assert capsules[0, 0].tolist() == [[0, 0, pytest.approx(-0.2)], [0, 0, 0]]
+    assert radii.tolist() == [0.03]
+
+
+def moving_ball(num_frames=9):
+    """A small ball that crosses the picture from left to right, one clip and view."""
+    x = torch.linspace(-0.45, 0.45, num_frames, dtype=torch.float64)
+    points = torch.stack([x, torch.full_like(x, 0.02), torch.ones_like(x)], dim=-1)
+    capsules = points[None, :, None, None].expand(1, num_frames, 1, 2, 3)
+    cameras = EYE.expand(1, num_frames, 1, 4, 4)
+    return capsules, torch.full((1, 1), 0.03, dtype=torch.float64), K[None, None], cameras
+
+
+def test_latent_masks_cover_their_frames_and_neighbours_and_are_dilated():
+    arguments = (*moving_ball(), SIZE, (8, 12))
+    tight = kinematic_robot_masks(*arguments, neighbour_frames=0, dilation=0)
+    assert tight.shape == (1, 1, 3, 8, 12)
+    assert set(tight.unique().tolist()) == {0.0, 1.0}
+    frames = project_capsules(*arguments[:4], SIZE, (64, 96))[0, 0]
+    touched = frames.reshape(9, 8, 8, 12, 8).any(dim=4).any(dim=2)
+    expected = project_capsules(*arguments, margin_cells=TOUCH_MARGIN_CELLS)[0, 0]
+    # The margin stands for testing every pixel of a cell: only a few barely touched corners may differ.
+    assert (touched & ~expected).sum() <= 0.15 * touched.sum()
+    assert (expected & ~touched).sum() <= 0.15 * touched.sum()
+    for t, window in enumerate(([0], [1, 2, 3, 4], [5, 6, 7, 8])):
+        assert (tight[0, 0, t].bool() == expected[window].any(dim=0)).all()
+    wide = kinematic_robot_masks(*arguments, neighbour_frames=2, dilation=0)
+    assert (wide[0, 0, 0].bool() == expected[[0, 1, 2]].any(dim=0)).all()
+    assert (wide[0, 0, 1].bool() == expected[[0, 1, 2, 3, 4, 5, 6]].any(dim=0)).all()
+    dilated = kinematic_robot_masks(*arguments, neighbour_frames=0, dilation=1)[0, 0, 1].bool()
+    for y, x in torch.nonzero(tight[0, 0, 1]).tolist():
+        assert dilated[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].all()
+    assert dilated.sum() > tight[0, 0, 1].sum()
+
+
+def test_frames_that_do_not_fit_the_tokenizer_are_refused():
+    with pytest.raises(ConfigError, match="Frames do not fit the tokenizer"):
+        kinematic_robot_masks(*moving_ball(8), SIZE, (8, 12))

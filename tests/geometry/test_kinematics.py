@@ -1,0 +1,235 @@
+"""Forward kinematics against MuJoCo, and on a recorded robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.mjcf import read_mjcf
+from worldline_core.geometry.se3 import is_rigid
+
+# Everything that decides a pose: each way to write an orientation, joints off the body's origin, two joints on a
+# body, a slide, defaults by class and childclass, a site, an unnormalised axis and quaternion.
+TOY = """
+<mujoco model="toy">
+  <!-- a comment -->
+  <compiler angle="degree" eulerseq="zyx"/>
+  <default>
+    <joint axis="0 1 0"/>
+    <default class="finger"><joint type="slide" axis="0 0 2" range="0 0.04"/></default>
+  </default>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body name="base" pos="0.1 -0.2 0.3" euler="10 20 30">
+      <geom size="0.05"/>
+      <body name="shoulder" pos="0 0 0.2" quat="2 0.4 0.1 -0.3">
+        <joint name="pan" axis="0 0 1"/>
+        <joint name="tilt" pos="0.02 0.03 -0.01"/>
+        <geom size="0.05"/>
+        <body name="elbow" pos="0.3 0 0" axisangle="1 1 0 40">
+          <joint name="elbow" axis="0.3 -0.5 0.7" pos="0 0 0.05"/>
+          <geom size="0.05"/>
+          <body name="hand" pos="0.25 0 0.02" xyaxes="0 1 0 -1 0 0.2" childclass="finger">
+            <joint name="roll" type="hinge" axis="1 0 0"/>
+            <geom size="0.05"/>
+            <site name="tip" pos="0 0 0.1" zaxis="0.2 0.1 0.9"/>
+            <body name="thumb" pos="0 0.02 0.05"><joint name="thumb"/><geom size="0.01"/></body>
+            <body name="index" pos="0 -0.02 0.05"><joint name="index" axis="0 -1 0"/><geom size="0.01"/></body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+TOY_YAML = {
+    "name": "toy",
+    "description": {"format": "mjcf", "file": "toy.xml"},
+    "base_link": "world",
+    "arms": [
+        {
+            "name": "right",
+            "joints": ["pan", "tilt", "elbow", "roll"],
+            "limits": [[-3.0, 3.0]] * 4,
+            "end_effector_link": "hand",
+            "T_link_tool": {"translation": [0.0, 0.0, 0.1], "rotation_wxyz": [1.0, 0.0, 0.0, 0.0]},
+            "gripper": {
+                "closed": 0.0,
+                "open": 1.0,
+                "finger_joints": [
+                    {"name": "thumb", "closed": 0.0, "open": 0.04},
+                    {"name": "index", "closed": 0.01, "open": 0.04},
+                ],
+            },
+            "wrist_camera": {
+                "link": "hand",
+                "T_link_camera": [[1.0, 0.0, 0.0, 0.02], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.03], [0, 0, 0, 1.0]],
+            },
+        }
+    ],
+}
+
+
+def toy(tmp_path: Path, **changes: object) -> ArmKinematics:
+    (tmp_path / "toy.yaml").write_text(yaml.safe_dump({**TOY_YAML, **changes}))
+    (tmp_path / "toy.xml").write_text(TOY)
+    return ArmKinematics(load_embodiment(tmp_path / "toy.yaml"))
+
+
+def assert_equals_mujoco(kinematics: ArmKinematics, xml: str, states: np.ndarray) -> None:
+    """Every body and site of the description, at every state, to 1e-9 m."""
+    mujoco = pytest.importorskip("mujoco", reason="the independent kinematics are those of MuJoCo")
+    embodiment = kinematics.embodiment
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    poses = kinematics.link_poses(states)
+    opening = kinematics.gripper(states).numpy()
+    compared = 0
+    for n, state in enumerate(states):
+        for a, arm in enumerate(embodiment.arms):
+            joints = state[embodiment.joint_columns(arm)]
+            values = dict(zip(arm.joints, joints, strict=True)) | {
+                f.name: f.closed + np.clip(opening[n, a], 0, 1) * (f.open - f.closed) for f in arm.gripper.finger_joints
+            }
+            for name, value in values.items():
+                data.joint(name).qpos[0] = value
+        mujoco.mj_kinematics(model, data)
+        base = data.body(embodiment.base_link)
+        for i in range(model.nbody):
+            body = data.body(i)
+            expected = base.xmat.reshape(3, 3).T @ (body.xpos - base.xpos)
+            np.testing.assert_allclose(poses[body.name][n, :3, 3].numpy(), expected, atol=1e-9)
+            turn = base.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3)
+            np.testing.assert_allclose(poses[body.name][n, :3, :3].numpy(), turn, atol=1e-9)
+            compared += 1
+        for i in range(model.nsite):
+            site = data.site(i)
+            if site.name in poses and site.name not in {data.body(b).name for b in range(model.nbody)}:
+                expected = base.xmat.reshape(3, 3).T @ (site.xpos - base.xpos)
+                np.testing.assert_allclose(poses[site.name][n, :3, 3].numpy(), expected, atol=1e-9)
+    assert compared == len(states) * model.nbody
+
+
+def test_hand_written_description_equals_mujoco(tmp_path):
+    states = np.random.default_rng(0).uniform(-1.5, 1.5, (7, 5))
+    states[:, 4] = np.linspace(-0.2, 1.2, 7)
+    assert_equals_mujoco(toy(tmp_path), TOY, states)
+
+
+@pytest.mark.parametrize("name", embodiment_names())
+def test_shipped_descriptions_equal_mujoco(name):
+    embodiment = load_embodiment(name)
+    if embodiment.description.format != "mjcf":
+        pytest.skip("a URDF of the user")
+    limits = np.concatenate([[*arm.limits, (0.0, 1.0)] for arm in embodiment.arms])
+    states = np.random.default_rng(1).uniform(limits[:, 0], limits[:, 1], (5, len(limits)))
+    assert_equals_mujoco(ArmKinematics(embodiment), embodiment.description_path.read_text(), states)
+
+
+def test_base_link_is_the_frame_of_everything(tmp_path):
+    state = np.array([[0.3, -0.4, 0.5, 0.6, 1.0]])
+    world = toy(tmp_path).link_poses(state)
+    other = toy(tmp_path, base_link="base").link_poses(state)
+    torch.testing.assert_close(torch.linalg.inv(world["base"]) @ world["tip"], other["tip"])
+
+
+def test_tool_and_wrist_camera_are_fixed_in_the_hand(tmp_path):
+    kinematics = toy(tmp_path)
+    states = np.random.default_rng(2).uniform(-1, 1, (4, 5))
+    hand = kinematics.link_poses(states)["hand"]
+    tool, camera = kinematics.tool_poses(states), kinematics.wrist_camera_poses(states)["right_wrist"]
+    torch.testing.assert_close(
+        (torch.linalg.inv(hand) @ tool[:, 0])[:, :3, 3], torch.tensor([[0, 0, 0.1]], dtype=torch.float64).expand(4, 3)
+    )
+    mount = torch.tensor(TOY_YAML["arms"][0]["wrist_camera"]["T_link_camera"], dtype=torch.float64)  # type: ignore[index]
+    torch.testing.assert_close(torch.linalg.inv(hand) @ camera, mount.expand(4, 4, 4))
+    assert bool(is_rigid(camera).all())
+
+
+def test_gripper_opening_is_linear_and_not_clipped(tmp_path):
+    arm = {**TOY_YAML["arms"][0], "gripper": {"closed": 119.0, "open": 0.2}}  # type: ignore[index]
+    state = np.zeros((3, 5))
+    state[:, 4] = [119.0, 0.2, -11.68]
+    np.testing.assert_allclose(toy(tmp_path, arms=[arm]).gripper(state).numpy()[:, 0], [0, 1, 1.1], atol=1e-9)
+
+
+def test_poses_are_differentiable_in_the_joints(tmp_path):
+    kinematics = toy(tmp_path)
+    state = torch.rand(1, 5, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(kinematics.tool_poses, state)
+
+
+def test_unknown_link_lists_the_links(tmp_path):
+    arm = {**TOY_YAML["arms"][0], "end_effector_link": "paw"}  # type: ignore[index]
+    with pytest.raises(ConfigError, match=r"no link of this name[\s\S]*elbow[\s\S]*paw"):
+        toy(tmp_path, arms=[arm])
+
+
+def test_unknown_joint_lists_the_joints(tmp_path):
+    with pytest.raises(ConfigError, match=r"no joint of this name[\s\S]*tilt[\s\S]*waist"):
+        toy(tmp_path, posture={"waist": 0.1})
+
+
+def test_wrong_number_of_joints_is_refused(tmp_path):
+    with pytest.raises(DataError, match="Joint vector has a wrong length"):
+        toy(tmp_path).tool_poses(np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("<body><freejoint/></body>", "free body"),
+        ("<body><joint type='ball' name='b'/></body>", "Joint is not supported"),
+        ("<body><joint ref='1'/></body>", "Joint is not supported"),
+        ("<include file='x.xml'/>", "<include> is not supported"),
+        ("<frame><body/></frame>", "<frame> is not supported"),
+    ],
+)
+def test_what_the_reader_does_not_know_is_refused(body, message):
+    with pytest.raises(DataError, match=message):
+        read_mjcf(f"<mujoco><worldbody>{body}</worldbody></mujoco>", "toy.xml")
+
+
+@pytest.mark.parametrize("text", ["<mujoco>", "<robot/>", "not xml"])
+def test_what_is_no_mjcf_is_refused(text):
+    with pytest.raises(DataError, match=r"not XML|Not an MJCF"):
+        read_mjcf(text, "toy.xml")
+
+
+def agibot(shared_data: Path) -> ArmKinematics:
+    urdf = shared_data / "agibot_g1_urdf" / "G1_omnipicker_calibrated.urdf"
+    if not urdf.is_file():
+        pytest.skip("the AgiBot G1 URDF is not here")
+    return ArmKinematics(load_embodiment("agibot_g1", urdf))
+
+
+@pytest.mark.parametrize("demo", ["demo_000", "demo_001"])
+@pytest.mark.parametrize("kind", ["state", "action"])
+def test_agibot_kinematics_reproduce_the_recorded_poses(shared_data, demo, kind):
+    folder = shared_data / "agibot_gesim_v2" / "assets" / demo
+    if not folder.is_dir():
+        pytest.skip("the GE-Sim V2 samples are not here")
+    kinematics = agibot(shared_data)
+    state = np.load(folder / "state_joints_0.npy").astype(np.float64)
+    if kind == "state":
+        joints = np.concatenate([state[:, :7], state[:, 14:15], state[:, 7:14], state[:, 15:16]], axis=1)
+        recorded = np.load(folder / "state_eef_poses_0.npy").astype(np.float64)
+    else:
+        joints = np.load(folder / "actions_0.npy").astype(np.float64)
+        recorded = np.load(folder / "eef_poses_0.npy").astype(np.float64)
+    names = ("idx03_head_yaw_joint", "idx04_head_pitch_joint", "idx02_waist_pitch_joint", "idx01_waist_lift_joint")
+    poses = kinematics.link_poses(joints, {name: state[:, 16 + i] for i, name in enumerate(names)})
+    for arm, link in enumerate(("arm_l_end_link", "arm_r_end_link")):
+        error = np.linalg.norm(poses[link][:, :3, 3].numpy() - recorded[:, 7 * arm : 7 * arm + 3], axis=1)
+        assert error.max() <= 1e-4, f"{link}: {error.max() * 1e3:.4f} mm"
+        # Roll, pitch, yaw about fixed axes: the first column of Rz Ry Rx is (cz cy, sz cy, -sy).
+        _, pitch, yaw = recorded[:, 7 * arm + 3 : 7 * arm + 6].T
+        x_axis = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)], axis=1)
+        np.testing.assert_allclose(poses[link][:, :3, 0].numpy(), x_axis, atol=1e-4)

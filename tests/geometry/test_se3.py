@@ -1,0 +1,94 @@
+"""Rigid transforms and Rot6D: properties that hold for every rotation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldline_core.errors import CalibrationError
+from worldline_core.geometry.rot6d import rot6d_from_rotation, rotation_from_rot6d
+from worldline_core.geometry.se3 import (
+    check_rigid,
+    invert,
+    is_rigid,
+    rotation_angle,
+    rotation_from_quaternion_wxyz,
+    transform_from,
+    transform_points,
+)
+
+unit = st.floats(-1.0, 1.0, allow_nan=False)
+quaternions = st.tuples(unit, unit, unit, unit).filter(lambda q: sum(x * x for x in q) > 0.01)
+points = st.tuples(*[st.floats(-3, 3, allow_nan=False)] * 3)
+
+
+def pose(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> torch.Tensor:
+    rotation = rotation_from_quaternion_wxyz(torch.tensor(quaternion, dtype=torch.float64))
+    return transform_from(rotation, torch.tensor(translation, dtype=torch.float64))
+
+
+@given(quaternions)
+def test_rot6d_round_trip_is_exact(quaternion):
+    rotation = pose(quaternion, (0, 0, 0))[:3, :3]
+    torch.testing.assert_close(rotation_from_rot6d(rot6d_from_rotation(rotation)), rotation, atol=1e-12, rtol=0)
+
+
+def test_rot6d_is_the_first_two_columns_one_after_the_other():
+    rotation = torch.arange(9.0).reshape(3, 3)
+    assert rot6d_from_rotation(rotation).tolist() == [0, 3, 6, 1, 4, 7]
+
+
+def test_rot6d_of_two_crooked_vectors_is_a_rotation_that_keeps_the_first_direction():
+    rotation = rotation_from_rot6d(torch.tensor([2.0, 0, 0, 0.3, 4.0, 0], dtype=torch.float64))
+    torch.testing.assert_close(rotation, torch.eye(3, dtype=torch.float64))
+
+
+@given(quaternions, points, points)
+def test_inverse_undoes_the_transform(quaternion, translation, point):
+    T = pose(quaternion, translation)
+    there = transform_points(T, torch.tensor(point, dtype=torch.float64))
+    torch.testing.assert_close(
+        transform_points(invert(T), there), torch.tensor(point, dtype=torch.float64), atol=1e-10, rtol=0
+    )
+
+
+@given(quaternions, points)
+def test_every_pose_is_rigid_and_its_scaled_copy_is_not(quaternion, translation):
+    T = pose(quaternion, translation)
+    assert bool(is_rigid(T))
+    scaled = T.clone()
+    scaled[:3, :3] *= 1.01
+    assert not bool(is_rigid(scaled))
+
+
+@settings(max_examples=30)
+@given(st.floats(0, math.pi))
+def test_rotation_angle_is_accurate_at_both_ends(angle):
+    q = torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0], dtype=torch.float64)
+    assert float(rotation_angle(rotation_from_quaternion_wxyz(q))) == pytest.approx(angle, abs=1e-12)
+
+
+def test_quaternion_agrees_with_an_independent_formula():
+    # 90 degrees about z turns x into y.
+    q = torch.tensor([math.sqrt(0.5), 0, 0, math.sqrt(0.5)], dtype=torch.float64)
+    np.testing.assert_allclose(rotation_from_quaternion_wxyz(q).numpy(), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "nan", "last_row", "sheared"])
+def test_what_is_no_rigid_transform_is_named(kind):
+    T = torch.eye(4, dtype=torch.float64)
+    if kind == "mirrored":
+        T[0, 0] = -1
+    elif kind == "nan":
+        T[1, 3] = math.nan
+    elif kind == "last_row":
+        T[3, 0] = 0.2
+    else:
+        T[0, 1] = 0.05
+    with pytest.raises(CalibrationError, match=r"Not a rigid transform[\s\S]*view head"):
+        check_rigid(T[None], "view head")

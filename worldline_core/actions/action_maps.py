@@ -1,0 +1,104 @@
+"""Nine-channel action maps, rendered straight at latent resolution (paper, "Cross-Embodiment Spatial Action Conditioning").
+
+    A = [h, d h, r1 h .. r6 h, g h],   h(u) = exp(-|u - u_t|^2 / (2 sigma^2))
+
+Axis legend: b clips, t frames, v views, a arms, h and w grid rows and columns.
+
+Pixel centres. Image pixels and grid cells both have their centres at whole numbers and cover half a unit to each
+side, so the image is -0.5 <= u < W - 0.5 and a point u of the image lies at (u + 0.5) w / W - 0.5 of a grid of w
+columns. Rendering on the grid of a resized image therefore equals rendering with the resized camera.
+
+Sigma is `sigma_px_ref` pixels on the reference canvas (384 x 512), scaled to the grid on each axis by itself, so the
+Gaussian covers the same part of the picture at every resolution. On a grid where sigma falls below about half a
+cell, a point between cells all but vanishes: choose a larger `sigma_px_ref` for coarse grids (0.78 cells is the
+paper's 30 x 40; a grid of 8 x 12 needs 33..37).
+"""
+
+from __future__ import annotations
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from worldline_core.actions.episode_tracks import TrackBatch
+from worldline_core.errors import ConfigError
+
+NUM_CHANNELS = 9
+CHANNELS = ("h", "d", "r1", "r2", "r3", "r4", "r5", "r6", "g")
+SIGMA_PX_REFERENCE = 10.0
+REFERENCE_CANVAS = (384, 512)
+TEMPORAL_FACTOR = 4
+
+
+def latent_frame_indices(num_frames: int, temporal_factor: int = TEMPORAL_FACTOR) -> list[int]:
+    """RGB frames whose controls the latent frames take: 0, 4, 8, ... (latent frame 0 is frame 0, j is frame 4j).
+
+    Raises: ConfigError when num_frames is not 1 + a multiple of the factor.
+    """
+    if num_frames < 1 or (num_frames - 1) % temporal_factor:
+        raise ConfigError(
+            "A clip does not fit the tokenizer",
+            expected=f"1 + a multiple of {temporal_factor} frames",
+            got=num_frames,
+            next_step=f"use {1 + max(0, num_frames - 1) // temporal_factor * temporal_factor} frames",
+        )
+    return list(range(0, num_frames, temporal_factor))
+
+
+def grid_sigma(
+    grid_size: tuple[int, int], sigma_px_ref: float = SIGMA_PX_REFERENCE, ref: tuple[int, int] = REFERENCE_CANVAS
+) -> tuple[float, float]:
+    """(sigma_rows, sigma_columns) in grid cells."""
+    return sigma_px_ref * grid_size[0] / ref[0], sigma_px_ref * grid_size[1] / ref[1]
+
+
+def render_action_maps(
+    tracks: TrackBatch,
+    image_size: tuple[int, int],
+    grid_size: tuple[int, int],
+    sigma_px_ref: float = SIGMA_PX_REFERENCE,
+    ref: tuple[int, int] = REFERENCE_CANVAS,
+    dtype: torch.dtype = torch.float32,
+) -> Float[Tensor, "b v 9 t h w"]:
+    """Render the maps of every frame of the batch; the arms are added.
+
+    The Gaussian is a product of a row and a column profile, so the cost is that of one small matrix product a frame
+    and view. Differentiable in uv, depth, rot6d and gripper; runs on the device of the tracks. The profiles are
+    computed in float64 (they are small), the products in `dtype`.
+
+    Args:
+        image_size: (height, width) to which uv belongs.
+        grid_size: (rows, columns) of the latent.
+
+    Raises: ConfigError for an empty grid or sigma that is not positive.
+    """
+    if min(*grid_size, *image_size, *ref) < 1 or sigma_px_ref <= 0:
+        raise ConfigError(
+            "Cannot render action maps",
+            expected="positive sizes and sigma",
+            got=f"image {image_size}, grid {grid_size}, reference {ref}, sigma {sigma_px_ref}",
+        )
+    sigma_rows, sigma_columns = grid_sigma(grid_size, sigma_px_ref, ref)
+    uv = torch.where(tracks.valid[..., None], tracks.uv, torch.zeros_like(tracks.uv)).double()
+    columns = _profile((uv[..., 0] + 0.5) * (grid_size[1] / image_size[1]) - 0.5, grid_size[1], sigma_columns)
+    rows = _profile((uv[..., 1] + 0.5) * (grid_size[0] / image_size[0]) - 0.5, grid_size[0], sigma_rows)
+    values = torch.cat(
+        [torch.ones_like(tracks.depth)[..., None], tracks.depth[..., None], tracks.rot6d, tracks.gripper[..., None]],
+        dim=-1,
+    )
+    # An invalid sample may hold anything, NaN included: where, not a product with zero.
+    values = torch.where(tracks.valid[..., None], values, torch.zeros_like(values)).to(dtype)
+    weighted_rows = torch.einsum("btvac,btvah->btvcha", values, rows.to(dtype))
+    clips, _, views, arms = tracks.depth.shape
+    maps = torch.bmm(
+        rearrange(weighted_rows, "b t v c h a -> (b t v) (c h) a", a=arms),
+        rearrange(columns.to(dtype), "b t v a w -> (b t v) a w"),
+    )
+    return rearrange(maps, "(b t v) (c h) w -> b v c t h w", b=clips, v=views, c=NUM_CHANNELS)
+
+
+def _profile(centre: Float[Tensor, "*b"], size: int, sigma: float) -> Float[Tensor, "*b size"]:
+    """exp(-(x - centre)^2 / (2 sigma^2)) at the cell centres x = 0 .. size - 1."""
+    cells = torch.arange(size, dtype=centre.dtype, device=centre.device)
+    return torch.exp(-0.5 * ((cells - centre[..., None]) / sigma) ** 2)

@@ -1,0 +1,211 @@
+"""Forward kinematics: from `observation.state` (or `action`) to tool, link and wrist camera poses, in batches.
+
+The chains are `pytorch_kinematics` chains in float64, built from URDF by its own parser and from MJCF by
+`worldline_core.geometry.mjcf`. Axis legend: n frames, a arms, j state columns.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+import pytorch_kinematics as pk
+import torch
+from jaxtyping import Float
+from pytorch_kinematics.chain import Chain
+from pytorch_kinematics.frame import Frame, Joint, Link
+from pytorch_kinematics.transforms import Transform3d
+from torch import Tensor
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import Embodiment, read_description
+from worldline_core.geometry.mjcf import TreeBody, parse_xml, read_mjcf
+from worldline_core.geometry.se3 import invert
+
+
+class ArmKinematics:
+    """Kinematics of all arms of an embodiment.
+
+    Raises:
+        UnavailableError: the kinematic description is not there.
+        ConfigError: the embodiment names a joint or link that the description does not have.
+    """
+
+    def __init__(self, embodiment: Embodiment) -> None:
+        self.embodiment = embodiment
+        text = read_description(embodiment)
+        if embodiment.description.format == "urdf":
+            chain = pk.build_chain_from_urdf(_kinematic_part(text, embodiment.description_path))
+        else:
+            chain = chain_from_tree(read_mjcf(text, embodiment.description_path))
+        self.chain: Chain = chain.to(dtype=torch.float64)
+        self.links: tuple[str, ...] = tuple(chain.get_frame_names(exclude_fixed=False))
+        self.joints: tuple[str, ...] = tuple(chain.get_joint_parameter_names())
+        self._check_names()
+
+    def _check_names(self) -> None:
+        embodiment = self.embodiment
+        wanted_links = [embodiment.base_link]
+        wanted_joints = list(embodiment.posture)
+        for arm in embodiment.arms:
+            wanted_links.append(arm.end_effector_link)
+            wanted_links += [arm.wrist_camera.link] if arm.wrist_camera is not None else []
+            wanted_joints += [*arm.joints, *(finger.name for finger in arm.gripper.finger_joints)]
+        for what, wanted, known in (("link", wanted_links, self.links), ("joint", wanted_joints, self.joints)):
+            unknown = sorted(set(wanted) - set(known))
+            if unknown:
+                raise ConfigError(
+                    f"The kinematic description has no {what} of this name",
+                    where=f"embodiment {embodiment.name}, {embodiment.description_path}",
+                    expected=f"one of {', '.join(known)}",
+                    got=", ".join(unknown),
+                )
+
+    def _joint_positions(self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None) -> Tensor:
+        """Positions of every joint of the chain (n, joints): state, posture, fingers; anything else at zero."""
+        embodiment = self.embodiment
+        values = torch.as_tensor(state, dtype=torch.float64)
+        embodiment.check_state(values.detach().cpu().numpy(), "state")
+        columns: dict[str, Tensor] = {
+            name: torch.full_like(values[:, 0], value) for name, value in embodiment.posture.items()
+        }
+        for name, track in (posture or {}).items():
+            if name not in self.joints:
+                raise DataError(
+                    "Unknown posture joint", where=embodiment.name, expected=", ".join(self.joints), got=name
+                )
+            columns[name] = torch.as_tensor(track, dtype=torch.float64).to(values.device).expand(len(values))
+        opening = self.gripper(values)
+        for index, arm in enumerate(embodiment.arms):
+            start = embodiment.joint_columns(arm).start
+            columns.update({name: values[:, start + i] for i, name in enumerate(arm.joints)})
+            for finger in arm.gripper.finger_joints:
+                columns[finger.name] = finger.closed + opening[:, index].clamp(0, 1) * (finger.open - finger.closed)
+        zero = torch.zeros_like(values[:, 0])
+        return torch.stack([columns.get(name, zero) for name in self.joints], dim=-1)
+
+    def _all_poses(
+        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None
+    ) -> Float[Tensor, "l n 4 4"]:
+        T_root_link = self.chain.forward_kinematics_tensor(self._joint_positions(state, posture))
+        base = T_root_link[self.chain.frame_to_idx[self.embodiment.base_link]]
+        return invert(base)[None] @ T_root_link
+
+    def link_poses(
+        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
+    ) -> dict[str, Float[Tensor, "n 4 4"]]:
+        """T_base_link of every link (body, site) by name.
+
+        Args:
+            state: (n, j) observation.state or action.
+            posture: positions [rad, m] of joints outside the state, (n,) or one number each; the embodiment's
+                own posture where not given.
+
+        Raises:
+            DataError: the joint vector has a wrong length or is not finite.
+        """
+        poses = self._all_poses(state, posture)
+        return {name: poses[self.chain.frame_to_idx[name]] for name in self.links}
+
+    def tool_poses(
+        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
+    ) -> Float[Tensor, "n a 4 4"]:
+        """T_base_tool: frame between the fingertips, +z out of the gripper."""
+        return self.tools_of(self.link_poses(state, posture))
+
+    def tools_of(self, links: Mapping[str, Tensor]) -> Float[Tensor, "n a 4 4"]:
+        """T_base_tool from what `link_poses` gave."""
+        tools = [
+            links[arm.end_effector_link] @ torch.from_numpy(arm.T_link_tool.matrix()).to(links[arm.end_effector_link])
+            for arm in self.embodiment.arms
+        ]
+        return torch.stack(tools, dim=1)
+
+    def wrist_camera_poses(
+        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
+    ) -> dict[str, Float[Tensor, "n 4 4"]]:
+        """T_base_camera by view, for the arms whose camera mount is known: from controls, never from a recording."""
+        return self.wrist_cameras_of(self.link_poses(state, posture))
+
+    def wrist_cameras_of(self, links: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n 4 4"]]:
+        """T_base_camera by view from what `link_poses` gave."""
+        return {
+            arm.camera_view: links[mount.link] @ torch.tensor(mount.T_link_camera).to(links[mount.link])
+            for arm in self.embodiment.arms
+            if (mount := arm.wrist_camera) is not None
+        }
+
+    def gripper(self, state: np.ndarray | Tensor) -> Float[Tensor, "n a"]:
+        """Gripper opening, 0 closed .. 1 open, not clipped."""
+        values = torch.as_tensor(state, dtype=torch.float64)
+        openings = []
+        for arm in self.embodiment.arms:
+            raw = values[:, self.embodiment.gripper_column(arm)]
+            openings.append((raw - arm.gripper.closed) / (arm.gripper.open - arm.gripper.closed))
+        return torch.stack(openings, dim=1)
+
+    @cached_property
+    def link_parents(self) -> dict[str, str]:
+        """Parent link of every link but the root."""
+        parents: dict[str, str] = {}
+        for name in self.links:
+            path = [self.chain.idx_to_frame[int(i)] for i in self.chain.parents_indices[self.chain.frame_to_idx[name]]]
+            if len(path) > 1:
+                parents[name] = path[-2]
+        return parents
+
+
+def _kinematic_part(urdf: str, where: object) -> bytes:
+    """The URDF with its links emptied and anything but links and joints left out.
+
+    Meshes and vendor tags decide no pose, and the parser prints a line for each tag that it does not know.
+    """
+    robot = parse_xml(urdf, where)
+    for element in list(robot):
+        if element.tag not in ("link", "joint"):
+            robot.remove(element)
+        elif element.tag == "link":
+            for child in list(element):
+                element.remove(child)
+    return ET.tostring(robot)
+
+
+def chain_from_tree(tree: TreeBody) -> Chain:
+    """A `pytorch_kinematics` chain whose frames are the bodies and sites of the tree.
+
+    MuJoCo turns a body about each of its joints in order, at the joint's position: T_body J1 J2 ..., with
+    J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame a joint, and a last
+    fixed one where a joint lies off the body's origin; the last frame bears the body's name.
+    """
+    return Chain(_frame(tree), dtype=torch.float64)
+
+
+def _frame(body: TreeBody) -> Frame:
+    steps: list[tuple[np.ndarray, Joint]] = []
+    offset = body.T_parent_body
+    for joint in body.joints:
+        before, after = np.eye(4), np.eye(4)
+        before[:3, 3], after[:3, 3] = joint.position, -joint.position
+        steps.append(
+            (offset @ before, Joint(joint.name, None, joint.kind, torch.from_numpy(joint.axis), torch.float64))
+        )
+        offset = after
+    if not steps or np.any(offset[:3, 3] != 0.0):
+        steps.append((offset, Joint(f"{body.name}_fixed", dtype=torch.float64)))
+    names = [f"{body.name}#{i}" for i in range(len(steps) - 1)] + [body.name]
+    first: Frame | None = None
+    last: Frame | None = None
+    for name, (T_offset, joint) in zip(names, steps, strict=True):
+        frame = Frame(
+            name, Link(name, Transform3d(matrix=torch.from_numpy(T_offset)[None], dtype=torch.float64)), joint, None
+        )
+        if last is not None:
+            last.add_child(frame)
+        first, last = first or frame, frame
+    if first is None or last is None:
+        raise DataError("A body without a frame", where=body.name)
+    for child in body.children:
+        last.add_child(_frame(child))
+    return first
