@@ -1,0 +1,198 @@
+"""Block-causal attention and the key/value cache: causality, equality with the full pass, constant cost."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.block_causal import (
+    TeacherForcingAttention,
+    block_bounds,
+    block_causal_mask,
+    teacher_forcing_mask,
+    visible_blocks,
+)
+from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.kv_cache import KVCache
+from worldline_core.model.layers import grouped_attention
+from worldline_core.model.rope import rotate, rotation
+from worldline_core.model.world_model import WorldModel
+
+BLOCK = 2
+FRAMES = 7
+
+
+@pytest.fixture(scope="module", params=["velocity", "first_frame_residual"])
+def model(request: pytest.FixtureRequest) -> WorldModel:
+    config = WorldModelConfig(
+        prediction=request.param,
+        latent_channels=4,
+        hidden_size=24,
+        num_layers=2,
+        num_heads=2,
+        num_kv_heads=1,
+        head_dim=12,
+        intermediate_size=32,
+        rope_sections=(2, 2, 2),
+        towers="generation",
+    )
+    generator = torch.Generator().manual_seed(0)
+    model = WorldModel(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
+    return model.eval().requires_grad_(False)
+
+
+def clip(frames: int = FRAMES, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    noisy, clean = torch.randn(2, batch, 3, 4, frames, 4, 4, generator=generator)
+    maps = torch.randn(batch, 3, 9, frames, 4, 4, generator=generator)
+    sigma = torch.rand(batch, (frames - 1) // BLOCK, generator=generator) * 0.8 + 0.1
+    return noisy, clean, maps, sigma
+
+
+def frames_of(values: torch.Tensor, start: int, stop: int) -> torch.Tensor:
+    return values[..., start:stop, :, :]
+
+
+def test_blocks_of_a_clip() -> None:
+    assert block_bounds(9, 4) == [(0, 1), (1, 5), (5, 9)]
+    with pytest.raises(DataError, match="does not divide into blocks"):
+        block_bounds(8, 4)
+
+
+def test_visible_blocks_with_and_without_a_window() -> None:
+    assert visible_blocks(3) == [0, 1, 2]
+    assert visible_blocks(7, sink_blocks=1, recent_blocks=3) == [0, 4, 5, 6]
+    assert visible_blocks(2, sink_blocks=1, recent_blocks=3) == [0, 1]
+
+
+def test_blockwise_attention_equals_the_dense_mask(model: WorldModel) -> None:
+    bounds = block_bounds(FRAMES, BLOCK)
+    length = (FRAMES - BLOCK + FRAMES - 1) * 3
+    generator = torch.Generator().manual_seed(2)
+    queries = torch.randn(2, 4, length, 12, generator=generator)
+    keys, values = torch.randn(2, 2, 2, length, 12, generator=generator)
+    by = rotation(model.config, torch.randn(3, length, generator=generator))
+    sizes = tuple((stop - start) * 3 for start, stop in bounds)
+    blockwise = TeacherForcingAttention(by, sizes)(0, queries, keys, values, None)
+    mask = teacher_forcing_mask(bounds, 3)
+    dense = grouped_attention(rotate(queries, by), rotate(keys, by), values, mask[None, None])
+    torch.testing.assert_close(blockwise, dense, rtol=1e-5, atol=1e-5)
+    reference = torch.nn.functional.scaled_dot_product_attention(
+        rotate(queries, by),
+        rotate(keys, by).repeat_interleave(2, dim=1),
+        values.repeat_interleave(2, dim=1),
+        attn_mask=mask,
+    )
+    torch.testing.assert_close(dense, reference.transpose(1, 2).flatten(2), rtol=1e-5, atol=1e-5)
+
+
+def test_clean_half_of_the_mask_is_block_causal() -> None:
+    bounds = block_bounds(5, 2)
+    size = (5 - 2) * 2
+    assert torch.equal(teacher_forcing_mask(bounds, 2)[:size, :size], block_causal_mask(bounds, 2)[:size, :size])
+
+
+def test_future_frames_and_actions_leave_past_blocks_unchanged(model: WorldModel) -> None:
+    noisy, clean, maps, sigma = clip()
+    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    noisy[..., 3:, :, :] += 1.0
+    clean[..., 3:, :, :] += 1.0
+    maps[..., 3:, :, :] -= 1.0
+    sigma[:, 1:] *= 0.5
+    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    assert torch.equal(frames_of(before, 0, 3), frames_of(after, 0, 3))
+    assert bool((frames_of(before, 3, 5) - frames_of(after, 3, 5)).abs().amax() > 1e-3)
+    assert bool((frames_of(before, 0, 1) == 0).all())
+
+
+def test_a_noisy_block_does_not_see_its_own_clean_frames(model: WorldModel) -> None:
+    noisy, clean, maps, sigma = clip()
+    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    clean[..., 3:5, :, :] += 1.0
+    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    assert torch.equal(frames_of(before, 1, 5), frames_of(after, 1, 5))
+    assert not torch.allclose(frames_of(before, 5, 7), frames_of(after, 5, 7))
+
+
+def test_cached_passes_equal_the_full_block_causal_pass(model: WorldModel) -> None:
+    noisy, clean, maps, sigma = clip()
+    full = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    cache = KVCache(sink_blocks=1, recent_blocks=3)
+    for block, (start, stop) in enumerate(block_bounds(FRAMES, BLOCK)):
+        own = frames_of(maps, start, stop)
+        if block:
+            cached = model(frames_of(noisy, start, stop), sigma[:, block - 1], action_maps=own, cache=cache).velocity
+            torch.testing.assert_close(cached, frames_of(full, start, stop), rtol=1e-5, atol=1e-5)
+        model(frames_of(clean, start, stop), torch.zeros(2), action_maps=own, cache=cache, write_cache=True)
+    assert cache.frames == FRAMES
+    assert cache.blocks_seen == 4
+
+
+def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(model: WorldModel) -> None:
+    _, clean, _, _ = clip()
+    stored = []
+    for sigma in (0.0, 0.7):
+        cache = KVCache()
+        model(frames_of(clean, 0, 1), torch.full((2,), sigma), cache=cache, write_cache=True)
+        stored.append(cache._blocks[0].keys[1])
+    assert torch.equal(stored[0], stored[1])
+    block = frames_of(clean, 0, 2)
+    as_zero = model(block, torch.zeros(2), clean_frames=torch.tensor([[True, False]] * 2), features_at=1).features
+    as_clean = model(block, torch.zeros(2), clean_frames=torch.ones(2, 2, dtype=torch.bool), features_at=1).features
+    assert as_zero is not None
+    assert as_clean is not None
+    assert not torch.allclose(as_zero, as_clean)
+
+
+def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_trained_positions(
+    model: WorldModel,
+) -> None:
+    cache = KVCache(sink_blocks=1, recent_blocks=2)
+    sizes = []
+    for block in range(12):
+        frames = 1 if block == 0 else BLOCK
+        latents = torch.full((1, 3, 4, frames, 4, 4), float(block))
+        model(latents, torch.zeros(1), cache=cache, write_cache=True)
+        sizes.append((cache.frames, cache.nbytes))
+    assert max(frames for frames, _ in sizes) == 1 + 2 * BLOCK
+    assert len(set(sizes[3:])) == 1
+    first = KVCache(1, 2)
+    model(torch.zeros(1, 3, 4, 1, 4, 4), torch.zeros(1), cache=first, write_cache=True)
+    assert torch.equal(cache._blocks[0].keys[0], first._blocks[0].keys[0])
+
+
+def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_blocks(model: WorldModel) -> None:
+    """After eviction the rest is read exactly as if the evicted block had never been there."""
+    rolled, fresh = KVCache(1, 1), KVCache(1, 1)
+    _, clean, _, sigma = clip()
+    for start, stop in ((0, 1), (1, 3), (3, 5)):
+        model(frames_of(clean, start, stop), torch.zeros(2), cache=rolled, write_cache=True)
+    fresh._blocks, fresh.reference = list(rolled._blocks), rolled.reference
+    block = frames_of(clean, 5, 7)
+    assert torch.equal(
+        model(block, sigma[:, 0], cache=rolled).velocity, model(block, sigma[:, 0], cache=fresh).velocity
+    )
+
+
+def test_copies_of_a_cache_go_on_separately(model: WorldModel) -> None:
+    cache = KVCache()
+    model(torch.zeros(1, 3, 4, 1, 4, 4), torch.zeros(1), cache=cache, write_cache=True)
+    other = cache.copy()
+    model(torch.ones(1, 3, 4, BLOCK, 4, 4), torch.zeros(1), cache=other, write_cache=True)
+    assert (cache.frames, other.frames) == (1, 1 + BLOCK)
+
+
+def test_misuse_is_refused(model: WorldModel) -> None:
+    noisy, clean, maps, sigma = clip()
+    with pytest.raises(DataError, match="Only clean frames are written"):
+        model(clean, sigma[:, 0], write_cache=True)
+    with pytest.raises(DataError, match="one sigma a block"):
+        model.forward_teacher_forcing(noisy, clean, sigma[:, :1], action_maps=maps, block_size=BLOCK)
+    with pytest.raises(ConfigError, match="at least the observed frame"):
+        KVCache(sink_blocks=0)
+    with pytest.raises(ConfigError, match="outside begin_block"):
+        KVCache().write(0, noisy, noisy)

@@ -1,0 +1,253 @@
+"""Tokenizers: layout, causality, projection, the reference frame, files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.errors import CheckpointError, DataError, UnavailableError
+from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
+from worldline_core.model.tokenizer.fit import fit_patch_tokenizer
+from worldline_core.model.tokenizer.patch import PatchTokenizer
+from worldline_core.model.tokenizer.pixels import frames_to_video, video_to_frames
+from worldline_core.model.tokenizer.train import TokenizerConfig, decoder_batch, disturb, train_decoder
+from worldline_core.model.tokenizer.wan import WAN22_MEAN, WAN22_STD, WanTokenizer
+
+
+def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
+    """Smooth backgrounds with a moving bright square, ``(b 3 t 32 48)`` in [-1, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    background = torch.nn.functional.interpolate(
+        torch.rand(count, 3, 5, 7, generator=generator), (32, 48), mode="bilinear"
+    )
+    video = background[:, :, None].repeat(1, 1, frames, 1, 1)
+    for item in range(count):
+        x, y = (int(v) for v in torch.randint(0, 20, (2,), generator=generator))
+        for frame in range(frames):
+            video[item, :, frame, y : y + 8, x + 2 * frame : x + 2 * frame + 8] = torch.tensor([0.9, 0.1, 0.2])[
+                :, None, None
+            ]
+    return video * 2 - 1
+
+
+@pytest.fixture(scope="module")
+def fitted() -> PatchTokenizer:
+    torch.manual_seed(0)
+    tokenizer = fit_patch_tokenizer(
+        [scenes(seed=s) for s in range(4)], channels=24, refinement_width=8, refinement_depth=1
+    )
+    return tokenizer.eval().requires_grad_(False)
+
+
+def test_pixels_survive_the_round_trip() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (3, 8, 12, 3), dtype=np.uint8)
+    assert np.array_equal(video_to_frames(frames_to_video(frames)), frames)
+    assert frames_to_video(frames, (4, 6)).shape == (3, 3, 4, 6)
+    halved = video_to_frames(frames_to_video(frames, (4, 6)))
+    expected = frames.reshape(3, 4, 2, 6, 2, 3).mean(axis=(2, 4))
+    assert np.abs(halved - expected).max() <= 1.0
+    with pytest.raises(DataError, match="Not RGB frames"):
+        frames_to_video(frames.astype(np.float32))
+
+
+def test_latents_have_the_contracted_shape_and_about_unit_scale(fitted: PatchTokenizer) -> None:
+    latents = fitted.encode(scenes(seed=9))
+    assert latents.shape == (6, 24, 3, 4, 6)
+    assert 0.3 < float(latents[:, :, 1:].std()) < 3.0
+    assert fitted.decode(latents).shape == (6, 3, 9, 32, 48)
+    assert isinstance(fitted, VideoTokenizer)
+
+
+def test_bases_are_orthonormal_and_the_linear_decode_is_a_projection(fitted: PatchTokenizer) -> None:
+    for basis in (fitted.static_basis, fitted.motion_basis):
+        torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis)), rtol=0, atol=1e-4)
+    latents = fitted.encode(scenes(seed=9))
+    torch.testing.assert_close(fitted.encode(fitted.decode_linear(latents)), latents, rtol=1e-3, atol=1e-3)
+
+
+def test_all_components_reconstruct_exactly() -> None:
+    clips = [torch.rand(64, 3, 5, 8, 8, generator=torch.Generator().manual_seed(s)) * 2 - 1 for s in range(40)]
+    full = fit_patch_tokenizer(clips, channels=192 * 4, refinement_width=4, refinement_depth=1)
+    assert full.config.static_channels == 192
+    video = clips[0][:4]
+    torch.testing.assert_close(full.decode_linear(full.encode(video)), video, rtol=0, atol=2e-3)
+
+
+def test_a_still_group_is_coded_like_its_first_frame(fitted: PatchTokenizer) -> None:
+    still = scenes(seed=9)[:, :, :1].repeat(1, 1, 9, 1, 1)
+    latents = fitted.encode(still)
+    torch.testing.assert_close(latents, latents[:, :, :1].expand_as(latents), rtol=1e-4, atol=1e-4)
+    assert float(latents[:, fitted.config.static_channels :].abs().max()) < 1e-4
+
+
+def test_encoding_and_decoding_are_causal(fitted: PatchTokenizer) -> None:
+    video = scenes(seed=9)
+    changed = video.clone()
+    changed[:, :, 5:] = -changed[:, :, 5:]
+    before, after = fitted.encode(video), fitted.encode(changed)
+    assert torch.equal(before[:, :, :2], after[:, :, :2])
+    assert not torch.equal(before[:, :, 2], after[:, :, 2])
+    assert torch.equal(fitted.decode(before)[:, :, :5], fitted.decode(after)[:, :, :5])
+
+
+def test_blocks_decode_as_they_arrive(fitted: PatchTokenizer) -> None:
+    latents = fitted.encode(scenes(seed=9))
+    block = fitted.decode(latents[:, :, [0, 2]])
+    torch.testing.assert_close(block[:, :, 1:], fitted.decode(latents)[:, :, 5:], rtol=1e-5, atol=1e-5)
+
+
+def test_a_short_training_improves_on_the_linear_decode_and_uses_the_reference(tmp_path: Path) -> None:
+    videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(4) for v in scenes(seed=s)]
+    tokenizer = fit_patch_tokenizer(
+        [scenes(seed=s) for s in range(4)], channels=8, refinement_width=8, refinement_depth=1
+    )
+    config = TokenizerConfig(
+        steps=50, batch_size=4, clip_frames=9, warmup_steps=5, bfloat16=False, average_decay=0.9, learning_rate=5e-3
+    )
+    train_decoder(tokenizer, videos, config, tmp_path)
+    held_out = scenes(seed=11)
+    latents = tokenizer.encode(held_out)
+    errors = [
+        float((decoded - held_out).abs().mean())
+        for decoded in (
+            tokenizer.decode(latents, held_out[:, :, 0]),
+            tokenizer.decode(latents),
+            tokenizer.decode_linear(latents),
+        )
+    ]
+    assert errors[0] < 0.9 * errors[1]
+    assert errors[1] < errors[2]
+    with pytest.raises(DataError, match="reference frame does not fit"):
+        tokenizer.decode(latents, held_out[:, :, 0, :16])
+
+
+def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path) -> None:
+    videos = [((v + 1) * 127.5).round().to(torch.uint8) for v in scenes()]
+    results = []
+    for name, cut in (("whole", False), ("cut", True)):
+        torch.manual_seed(1)
+        tokenizer = fit_patch_tokenizer([scenes()], channels=8, refinement_width=4, refinement_depth=1)
+        config = TokenizerConfig(steps=6, batch_size=2, clip_frames=9, checkpoint_every=3)
+        if cut:
+            started = fit_patch_tokenizer([scenes()], channels=8, refinement_width=4, refinement_depth=1)
+            started.load_state_dict(tokenizer.state_dict())
+            broken = videos.copy()
+
+            class StopError(Exception):
+                pass
+
+            calls = iter(range(4))
+
+            class Failing(list):  # the fifth batch is never read
+                def __len__(self) -> int:
+                    return super().__len__()
+
+                def __getitem__(self, index):  # type: ignore[override]
+                    if next(self.budget, None) is None:
+                        raise StopError
+                    return super().__getitem__(index)
+
+            failing = Failing(broken)
+            failing.budget = iter(range(2 * 5))
+            del calls
+            with pytest.raises(StopError, match=""):
+                train_decoder(started, failing, config, tmp_path / name)
+        train_decoder(tokenizer, videos, config, tmp_path / name)
+        results.append(tokenizer.state_dict())
+    for key, value in results[0].items():
+        assert torch.equal(value, results[1][key]), key
+
+
+def test_batches_depend_on_the_step_alone_and_disturbance_spares_the_first_frame(fitted: PatchTokenizer) -> None:
+    videos = [((v + 1) * 127.5).round().to(torch.uint8) for v in scenes()]
+    config = TokenizerConfig(batch_size=2, clip_frames=9)
+    assert torch.equal(decoder_batch(videos, config, 7), decoder_batch(videos, config, 7))
+    assert not torch.equal(decoder_batch(videos, config, 7), decoder_batch(videos, config, 8))
+    latents = fitted.encode(scenes())
+    disturbed = disturb(latents, 0.3, torch.Generator().manual_seed(0))
+    assert torch.equal(disturbed[:, :, 0], latents[:, :, 0])
+    assert float((disturbed - latents).abs().max()) > 0.05
+    assert torch.equal(disturb(latents, 0.0, torch.Generator().manual_seed(0)), latents)
+
+
+def test_tokenizer_files_round_trip_and_are_read_strictly(fitted: PatchTokenizer, tmp_path: Path) -> None:
+    fitted.save(tmp_path / "a", {"seed": 0})
+    fitted.save(tmp_path / "b", {"seed": 0})
+    for name in ("tokenizer.json", "tokenizer.safetensors"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    loaded = load_tokenizer(tmp_path / "a")
+    video = scenes(seed=9)
+    assert torch.equal(loaded.encode(video), fitted.encode(video))
+    assert isinstance(loaded, PatchTokenizer)
+    assert loaded.encoder_digest == fitted.encoder_digest
+    loaded.refinement.leave.bias.data += 1.0
+    assert loaded.encoder_digest == fitted.encoder_digest
+    loaded.scale *= 2.0
+    assert loaded.encoder_digest != fitted.encoder_digest
+    weights = tmp_path / "b" / "tokenizer.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="not those the tokenizer describes"):
+        load_tokenizer(tmp_path / "b")
+    description = json.loads((tmp_path / "a" / "tokenizer.json").read_text())
+    (tmp_path / "a" / "tokenizer.json").write_text(json.dumps(description | {"kind": "other"}))
+    with pytest.raises(CheckpointError, match="Unknown kind of tokenizer"):
+        load_tokenizer(tmp_path / "a")
+    description["config"]["static_channels"] += 1
+    (tmp_path / "a" / "tokenizer.json").write_text(json.dumps(description))
+    with pytest.raises(CheckpointError, match="wrong shape"):
+        load_tokenizer(tmp_path / "a")
+    with pytest.raises(CheckpointError, match="No tokenizer here"):
+        load_tokenizer(tmp_path)
+
+
+def test_videos_and_latents_of_another_layout_are_refused(fitted: PatchTokenizer) -> None:
+    with pytest.raises(DataError, match="cannot code a video of this shape"):
+        fitted.encode(scenes(frames=8))
+    with pytest.raises(DataError, match="Not latents of this tokenizer"):
+        fitted.decode(torch.zeros(1, 5, 2, 4, 6))
+
+
+@pytest.fixture(scope="module")
+def wan_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from diffusers import AutoencoderKLWan
+
+    torch.manual_seed(0)
+    vae = AutoencoderKLWan(
+        base_dim=8, decoder_base_dim=8, z_dim=48, dim_mult=[1, 1, 1, 1], num_res_blocks=1, is_residual=True,
+        in_channels=12, out_channels=12, patch_size=2, scale_factor_spatial=16, clip_output=False,
+        temperal_downsample=[False, True, True], latents_mean=list(WAN22_MEAN), latents_std=list(WAN22_STD),
+    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("wan")
+    vae.save_pretrained(folder / "vae")
+    return folder
+
+
+@torch.no_grad()
+def test_wan_latents_are_the_normalised_mode(wan_folder: Path) -> None:
+    tokenizer = load_tokenizer(wan_folder)
+    assert isinstance(tokenizer, WanTokenizer)
+    assert isinstance(tokenizer, VideoTokenizer)
+    video = scenes(count=1, frames=5)
+    latents = tokenizer.encode(video)
+    assert latents.shape == (1, 48, 2, 2, 3)
+    mode = tokenizer.vae.encode(video).latent_dist.mode()
+    expected = (mode[0, 5] - WAN22_MEAN[5]) / WAN22_STD[5]
+    torch.testing.assert_close(latents[0, 5], expected)
+    assert tokenizer.decode(latents, video[:, :, 0]).shape == video.shape
+    torch.testing.assert_close(tokenizer.decode(latents), tokenizer.vae.decode(mode).sample, rtol=1e-4, atol=1e-4)
+
+
+def test_a_missing_or_damaged_wan_folder_is_named(wan_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UnavailableError, match="Wan autoencoder is not here"):
+        WanTokenizer.load(tmp_path)
+    config = json.loads((wan_folder / "vae" / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        WanTokenizer.load(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(config | {"_class_name": "AutoencoderKL"}))
+    with pytest.raises(CheckpointError, match="Not a Wan autoencoder"):
+        WanTokenizer.load(tmp_path)

@@ -1,0 +1,221 @@
+"""The world model: agreement with diffusers, conditioning, action branch, view slots."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.model.rope import video_positions, view_starts
+from worldline_core.model.world_model import WorldModel
+
+VIEWS = ("head", "left_wrist", "right_wrist")
+
+
+def tiny(**changes: object) -> WorldModelConfig:
+    values: dict[str, object] = {
+        "latent_channels": 4,
+        "hidden_size": 24,
+        "num_layers": 2,
+        "num_heads": 2,
+        "num_kv_heads": 1,
+        "head_dim": 12,
+        "intermediate_size": 32,
+        "rope_sections": (2, 2, 2),
+        "vocab_size": 20,
+    }
+    return WorldModelConfig.model_validate(values | changes)
+
+
+def build(seed: int = 0, **changes: object) -> WorldModel:
+    """A model whose every weight is random, so that no path is silently zero."""
+    generator = torch.Generator().manual_seed(seed)
+    model = WorldModel(tiny(**changes))
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
+    return model.eval()
+
+
+def sample(batch: int = 2, frames: int = 3, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    latents = torch.randn(batch, 3, 4, frames, 4, 6, generator=generator)
+    maps = torch.randn(batch, 3, 9, frames, 4, 6, generator=generator)
+    sigma = torch.rand(batch, generator=generator) * 0.8 + 0.1
+    return latents, maps, sigma
+
+
+def test_velocity_is_zero_on_clean_frames_only() -> None:
+    latents, maps, sigma = sample()
+    velocity = build()(latents, sigma, action_maps=maps).velocity
+    assert velocity.shape == latents.shape
+    assert bool((velocity[:, :, :, 0] == 0).all())
+    assert bool((velocity[:, :, :, 1:].abs() > 0).any(dim=(1, 2, 4, 5)).all())
+
+
+def test_sigma_is_not_read_on_clean_frames() -> None:
+    latents, _, sigma = sample()
+    model = build()
+    per_frame = sigma[:, None].repeat(1, 3)
+    other = per_frame.clone()
+    other[:, 0] = 0.777
+    torch.testing.assert_close(model(latents, per_frame).velocity, model(latents, other).velocity, rtol=0, atol=0)
+    torch.testing.assert_close(model(latents, per_frame).velocity, model(latents, sigma).velocity)
+    other[:, 1] = 0.777
+    assert not torch.allclose(model(latents, per_frame).velocity, model(latents, other).velocity)
+
+
+def test_the_whole_clip_may_be_generated_without_a_clean_frame() -> None:
+    latents, _, sigma = sample()
+    none_clean = torch.zeros(2, 3, dtype=torch.bool)
+    assert bool((build()(latents, sigma, clean_frames=none_clean).velocity[:, :, :, 0] != 0).any())
+
+
+def test_sample_prediction_returns_the_velocity_of_the_emitted_latents() -> None:
+    latents, _, sigma = sample()
+    as_velocity, as_sample = build(prediction="velocity"), build(prediction="sample")
+    emitted = as_velocity(latents, sigma).velocity
+    expected = (latents - emitted) / sigma.clamp_min(0.05).view(-1, 1, 1, 1, 1, 1)
+    torch.testing.assert_close(as_sample(latents, sigma).velocity[:, :, :, 1:], expected[:, :, :, 1:])
+
+
+def test_first_frame_residual_adds_the_clean_first_frame() -> None:
+    latents, _, sigma = sample()
+    emitted = build(prediction="velocity")(latents, sigma).velocity + latents[:, :, :, :1]
+    expected = (latents - emitted) / sigma.clamp_min(0.05).view(-1, 1, 1, 1, 1, 1)
+    model = build(prediction="first_frame_residual")
+    torch.testing.assert_close(model(latents, sigma).velocity[:, :, :, 1:], expected[:, :, :, 1:])
+    with pytest.raises(ConfigError, match="needs it clean"):
+        model(latents, sigma, clean_frames=torch.zeros(2, 3, dtype=torch.bool))
+
+
+def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bit_and_is_trainable() -> None:
+    latents, maps, sigma = sample()
+    model = build()
+    model.action_encoder.reset_output()
+    with torch.no_grad():
+        assert torch.equal(model(latents, sigma, action_maps=maps).velocity, model(latents, sigma).velocity)
+    model(latents, sigma, action_maps=maps).velocity.square().mean().backward()
+    gradient = model.action_encoder.proj.weight.grad
+    assert gradient is not None
+    assert bool((gradient.abs().sum(dim=1) > 0).all())
+
+
+def test_views_share_time_and_have_their_own_height_slots() -> None:
+    positions = video_positions(tiny(), torch.arange(2), (2, 3), VIEWS).reshape(3, 2, 3, 2, 3)
+    assert positions[0, 1].unique().tolist() == [1.0]
+    assert positions[1, 0, :, 0, 0].tolist() == [0.0, 8.0, 20.0]
+    assert positions[1, 0, 2, :, 1].tolist() == [20.0, 21.0]
+    assert positions[2, 0, 1, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_view_offsets_in_pixels_are_divided_by_the_pixels_of_a_patch() -> None:
+    assert view_starts(cosmos3_nano_config(), VIEWS) == [0.0, 480.0, 992.0]
+    assert view_starts(cosmos3_nano_config(view_offset_unit="pixel"), VIEWS) == [0.0, 15.0, 31.0]
+
+
+def test_fps_modulation_stretches_time() -> None:
+    positions = video_positions(cosmos3_nano_config(fps=12.0), torch.arange(3), (1, 1), ("head",), temporal_offset=5.0)
+    assert positions[0].tolist() == [5.0, 7.0, 9.0]
+
+
+def test_views_attend_to_each_other() -> None:
+    latents, _, sigma = sample()
+    model = build()
+    changed = latents.clone()
+    changed[:, 0, :, 1] += 1.0
+    difference = (model(latents, sigma).velocity - model(changed, sigma).velocity).abs()
+    assert bool(difference[:, 1].amax() > 0)
+    assert bool(difference[:, 2].amax() > 0)
+
+
+def test_one_view_runs_alone() -> None:
+    latents, _, sigma = sample()
+    assert build()(latents[:, :1], sigma, views=("head",)).velocity.shape == (2, 1, 4, 3, 4, 6)
+
+
+def test_features_come_from_the_layer_asked_for() -> None:
+    latents, _, sigma = sample()
+    model = build()
+    features = model(latents, sigma, features_at=1).features
+    assert features is not None
+    assert features.shape == (2, 3, 3, 2, 3, 24)
+    last = model(latents, sigma, features_at=2).features
+    assert last is not None
+    assert not torch.allclose(features, last)
+    with pytest.raises(ConfigError, match="counts layers from 1"):
+        model(latents, sigma, features_at=3)
+
+
+def test_text_encoded_once_equals_text_given_each_time_and_padding_changes_nothing() -> None:
+    latents, _, sigma = sample()
+    model = build()
+    ids = torch.tensor([[3, 4, 5], [6, 7, 0]])
+    mask = torch.tensor([[1, 1, 1], [1, 1, 0]])
+    both = model(latents, sigma, text_ids=ids, text_mask=mask).velocity
+    torch.testing.assert_close(model(latents, sigma, text=model.encode_text(ids, mask)).velocity, both)
+    alone = model(latents[1:], sigma[1:], text_ids=ids[1:, :2]).velocity
+    torch.testing.assert_close(both[1:], alone, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(both, model(latents, sigma).velocity, atol=1e-3)
+
+
+def test_a_model_without_the_understanding_tower_refuses_text() -> None:
+    latents, _, sigma = sample()
+    model = build(towers="generation")
+    assert not any("to_q" in name or name.startswith("embed_tokens") for name, _ in model.named_parameters())
+    with pytest.raises(ConfigError, match="no understanding tower"):
+        model(latents, sigma, text_ids=torch.ones(2, 3, dtype=torch.long))
+
+
+def test_parameter_groups_cover_the_generation_tower() -> None:
+    model = build()
+    generation = {name for name, _ in model.generation_parameters()}
+    action = {name for name, _ in model.action_parameters()}
+    alone = {name for name, _ in build(towers="generation").named_parameters()}
+    assert generation | action == alone
+    assert not generation & action
+    assert "layers.0.self_attn.add_q_proj.weight" in generation
+    assert "layers.0.self_attn.norm_added_q.weight" in generation
+
+
+def test_gradient_checkpointing_gives_the_same_gradients() -> None:
+    latents, maps, sigma = sample()
+    gradients = []
+    for enabled in (False, True):
+        model = build()
+        model.gradient_checkpointing = enabled
+        model(latents, sigma, action_maps=maps).velocity.square().mean().backward()
+        gradients.append(model.proj_in.weight.grad)
+    assert gradients[0] is not None
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+def test_a_fresh_model_starts_at_zero_velocity() -> None:
+    latents, maps, sigma = sample()
+    model = WorldModel(tiny())
+    model.initialise(torch.Generator().manual_seed(0))
+    assert bool((model(latents, sigma, action_maps=maps).velocity == 0).all())
+    copying = WorldModel(tiny(prediction="first_frame_residual"))
+    copying.initialise(torch.Generator().manual_seed(0))
+    velocity = copying(latents, sigma, action_maps=maps).velocity[:, :, :, 1:]
+    one_step = latents[:, :, :, 1:] - sigma.view(-1, 1, 1, 1, 1, 1) * velocity
+    torch.testing.assert_close(one_step, latents[:, :, :, :1].expand_as(one_step))
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    latents, maps, sigma = sample()
+    model = build()
+    with pytest.raises(DataError, match="Latents have the wrong shape"):
+        model(latents[:, :2], sigma)
+    with pytest.raises(DataError, match="Action maps have the wrong shape"):
+        model(latents, sigma, action_maps=maps[:, :, :, :2])
+    with pytest.raises(ConfigError, match="Unknown or repeated view"):
+        model(latents, sigma, views=("head", "left_wrist", "tail"))
+
+
+def test_config_that_contradicts_itself_is_refused() -> None:
+    with pytest.raises(ValueError, match="must add up to head_dim / 2"):
+        tiny(rope_sections=(3, 2, 2))
+    with pytest.raises(ValueError, match="must be a multiple of num_kv_heads"):
+        tiny(num_kv_heads=3)

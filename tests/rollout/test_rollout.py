@@ -1,0 +1,217 @@
+"""The rollout step end to end on small random models, and sets of predicted videos."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.tracks import write_index, write_shard
+from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
+from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.tokenizer.fit import fit_patch_tokenizer
+from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.controls import shuffled_partners
+from worldline_core.rollout.rollout import RolloutConfig, rollout
+from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
+
+SIZE = (32, 48)
+N = 33
+NAMES = {"a-0": "ur5e_pair", "a-1": "ur5e_pair", "b/0 x": "aloha_viperx", "b-1": "aloha_viperx", "b-2": "aloha_viperx"}
+
+
+def recorded(seed: int) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    frames = np.repeat(generator.integers(60, 190, (1, 4, 6, 3)).repeat(8, 1).repeat(8, 2), N, axis=0)
+    for frame in range(N):
+        frames[frame, 8:20, frame : frame + 10] = (220, 40, 40)
+    return frames.astype(np.uint8)
+
+
+def track(name: str, shift: float) -> EpisodeTracks:
+    shape = (N, 3, 2)
+    uv = np.zeros((*shape, 2), np.float32)
+    uv[..., 0] = np.linspace(5, 40, N)[:, None, None] + shift
+    uv[..., 1] = 14
+    eye = np.tile(np.eye(4, dtype=np.float32), (N, 3, 1, 1))
+    return EpisodeTracks(
+        episode_id=name, embodiment=NAMES[name], views=VIEWS, arms=("left", "right"), image_size=SIZE, controls="action",
+        camera_motion=("static", "kinematics", "kinematics"), uv=uv, depth=np.ones(shape, np.float32),
+        rot6d=np.ones((*shape, 6), np.float32), gripper=np.ones(shape, np.float32), valid=np.ones(shape, bool),
+        T_base_tool=eye[:, :2], T_base_camera=eye, K=np.tile(np.eye(3, dtype=np.float32), (3, 1, 1)),
+        capsules=np.zeros((N, 1, 2, 3), np.float32), capsule_radii=np.ones(1, np.float32),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("rollout")
+    K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
+    with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
+        for seed, (name, embodiment) in enumerate(NAMES.items()):
+            joints = np.zeros((N, 14), np.float32)
+            episode = Episode(
+                episode_id=name, source="synthetic", embodiment=embodiment, scene="s", task_family="lift", instruction="lift",
+                outcome="unknown", split="test" if seed else "train", fps=8.0, state=joints, action=joints,
+                timestamps=np.arange(N) / 8.0,
+                cameras={view: CameraTrack(view, K, np.eye(4)[None], SIZE[1], SIZE[0]) for view in VIEWS},
+            )  # fmt: skip
+            writer.add(episode, {view: recorded(seed) for view in VIEWS})
+    write_index(root / "tracks", write_shard(root / "tracks", 0, [track(n, s) for s, n in enumerate(NAMES)]))
+    torch.manual_seed(0)
+    video = torch.from_numpy(np.stack([recorded(s) for s in range(4)])).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
+    fit_patch_tokenizer([video], channels=8, refinement_width=4, refinement_depth=1).save(root / "tokenizer")
+    config = WorldModelConfig(
+        latent_channels=8, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=12, intermediate_size=32,
+        rope_sections=(2, 2, 2), towers="generation",
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    model = WorldModel(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
+    contract = {
+        "fps": 8.0,
+        "controls": "action",
+        "sigma_px_ref": 40.0,
+        "wrist_projection": "current_camera",
+        "grid_size": [4, 6],
+    }
+    for kind in ("stage2", "causal"):
+        save_checkpoint(root / kind, model, kind=kind, action_contract=contract, metadata={"clip_latent_frames": 9})
+    return {
+        "episodes": root / "episodes",
+        "tracks": root / "tracks",
+        "tokenizer": root / "tokenizer",
+        "checkpoint": root / "causal",
+    }
+
+
+def digests(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and "run" not in path.relative_to(root).parts
+    }
+
+
+CONFIG = RolloutConfig(method="causal", batch_size=2, seeds=(42, 43))
+
+
+@pytest.fixture(scope="module")
+def predicted(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    output = tmp_path_factory.mktemp("predicted")
+    return output, rollout(CONFIG, inputs, output)
+
+
+def test_every_chosen_episode_is_predicted_in_every_view_and_seed(predicted: tuple[Path, dict]) -> None:
+    output, summary = predicted
+    assert summary == {
+        "method": "causal", "episodes": 4, "predictions": 8, "frames": 8 * N, "checkpoint_kind": "causal", "steps": 4,
+        "recent_blocks": 1,
+    }  # fmt: skip
+    rollouts = RolloutSet.open(output)
+    assert rollouts.method == "causal"
+    assert rollouts.episode_ids == sorted(NAMES.keys() - {"a-0"})
+    assert rollouts.seeds("b-1") == [42, 43]
+    assert set(rollouts.views("b-1")) == set(VIEWS)
+    frames = rollouts.frames("b/0 x", "left_wrist", 43)
+    assert frames.shape == (N, *SIZE, 3)
+    assert not np.array_equal(frames, rollouts.frames("b/0 x", "left_wrist", 42))
+    with pytest.raises(DataError, match="No such prediction"):
+        rollouts.frames("b-1", "head", seed=7)
+
+
+def test_interrupted_rollouts_end_with_the_same_bytes(
+    inputs: dict[str, Path], predicted: tuple[Path, dict], tmp_path: Path
+) -> None:
+    whole, _ = predicted
+    rollout(CONFIG, inputs, tmp_path)
+    (tmp_path / "index.parquet").unlink()
+    (tmp_path / video_path("b-1", 43, "head")).unlink()
+    before = (tmp_path / video_path("a-1", 42, "head")).stat().st_mtime_ns
+    rollout(CONFIG, inputs, tmp_path)
+    assert digests(tmp_path) == digests(whole)
+    assert (tmp_path / video_path("a-1", 42, "head")).stat().st_mtime_ns == before
+
+
+def test_controls_matter_and_zero_differs_from_shuffled(
+    inputs: dict[str, Path], predicted: tuple[Path, dict], tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="too short"):
+        rollout(CONFIG.model_copy(update={"num_frames": 16}), inputs, tmp_path / "short")
+    seen = [RolloutSet.open(predicted[0]).frames("b-1", "head", 42)]
+    for actions in ("zero", "shuffled"):
+        config = CONFIG.model_copy(update={"actions": actions, "seeds": (42,), "num_frames": 17})
+        rollout(config, inputs, tmp_path / actions)
+        seen.append(RolloutSet.open(tmp_path / actions).frames("b-1", "head"))
+    assert seen[1].shape == (17, *SIZE, 3)
+    assert len({video[:17].tobytes() for video in seen}) == 3
+
+
+def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs: dict[str, Path], tmp_path: Path) -> None:
+    config = RolloutConfig(method="copy", sampler="copy_first_frame", max_episodes_per_embodiment=1)
+    given = {name: path for name, path in inputs.items() if name != "checkpoint"}
+    assert rollout(config, given, tmp_path)["checkpoint_kind"] is None
+    frames = RolloutSet.open(tmp_path).frames("a-1", "head").astype(int)
+    assert np.abs(frames - recorded(1)[0].astype(int)).mean() < 4
+    assert np.abs(frames[-1] - frames[0]).max() <= 2
+    assert RolloutSet.open(tmp_path).episode_ids == ["a-1", "b-1"]
+
+
+def test_the_whole_clip_sampler_takes_stage2_checkpoints_only(inputs: dict[str, Path], tmp_path: Path) -> None:
+    config = RolloutConfig(method="stage2", sampler="full_clip", steps=2, embodiments=("ur5e_pair",))
+    with pytest.raises(CheckpointError, match="wrong kind"):
+        rollout(config, inputs, tmp_path)
+    stage2 = inputs | {"checkpoint": inputs["checkpoint"].parent / "stage2"}
+    assert rollout(config, stage2, tmp_path)["frames"] == N
+    with pytest.raises(ConfigError, match="lacks inputs"):
+        rollout(config, {"episodes": inputs["episodes"]}, tmp_path)
+
+
+def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
+    model = WorldModel(WorldModelConfig(latent_channels=8, num_layers=1, towers="generation"))
+    model.initialise()
+    save_checkpoint(tmp_path / "c", model, kind="causal", action_contract={"fps": 10.0, "grid_size": [4, 6]})
+    with pytest.raises(CheckpointError, match="action contract differs"):
+        rollout(CONFIG, inputs | {"checkpoint": tmp_path / "c"}, tmp_path / "out")
+    with pytest.raises(DataError, match="No episode to predict"):
+        rollout(CONFIG.model_copy(update={"splits": ("bank",)}), inputs, tmp_path / "out")
+
+
+def test_shuffled_partners_are_a_derangement_within_each_embodiment() -> None:
+    names = list(NAMES)
+    partners = shuffled_partners(names, NAMES, names, seed=42)
+    assert all(partners[name] != name and NAMES[partners[name]] == NAMES[name] for name in names)
+    assert sorted(partners.values()) == sorted(names)
+    assert partners == shuffled_partners(names[::-1], NAMES, names, seed=42)
+    assert shuffled_partners(["a-0"], NAMES, names, seed=0) == {"a-0": "a-1"}
+    with pytest.raises(DataError, match="No other episode of this embodiment"):
+        shuffled_partners(["a-0"], NAMES, ["a-0", "b-1"], seed=0)
+
+
+def test_sets_of_rollouts_are_read_strictly(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="Not a set of rollouts"):
+        RolloutSet.open(tmp_path)
+    writer = RolloutSetWriter(tmp_path, "m", 8.0)
+    writer.add("e", 0, {"head": recorded(0)[:5]})
+    writer.register("../../e", 0, "head", 5, SIZE)
+    writer.close()
+    assert RolloutSet.open(tmp_path).frames("e", "head", 0).shape == (5, *SIZE, 3)
+    assert not video_path("../../e", 0, "head").startswith(".")
+    table = pq.read_table(tmp_path / "index.parquet")
+    outside = table.set_column(4, "path", [["../../etc/passwd"] * table.num_rows])
+    pq.write_table(outside, tmp_path / "index.parquet")
+    with pytest.raises(ArtifactError, match="lies outside"):
+        RolloutSet.open(tmp_path).frames("e", "head", 0)
+    pq.write_table(table.set_column(1, "method", [["m", "n"]]), tmp_path / "index.parquet")
+    with pytest.raises(ArtifactError, match="holds one method"):
+        RolloutSet.open(tmp_path)

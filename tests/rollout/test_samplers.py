@@ -1,0 +1,171 @@
+"""Euler integration, whole-clip and block-causal sampling."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.world_model import WorldModel, WorldModelOutput
+from worldline_core.rollout.block_causal import BlockCausalSimulator
+from worldline_core.rollout.euler import (
+    CAUSAL_SIGMAS,
+    Noise,
+    check_nodes,
+    euler_step,
+    shifted_sigmas,
+    sigmas_causal,
+    sigmas_full,
+)
+from worldline_core.rollout.full_clip import rollout_full_clip
+
+
+@pytest.fixture(scope="module")
+def model() -> WorldModel:
+    config = WorldModelConfig(
+        latent_channels=4,
+        hidden_size=24,
+        num_layers=2,
+        num_heads=2,
+        num_kv_heads=1,
+        head_dim=12,
+        intermediate_size=32,
+        rope_sections=(2, 2, 2),
+        towers="generation",
+    )
+    generator = torch.Generator().manual_seed(0)
+    model = WorldModel(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
+    return model.eval().requires_grad_(False)
+
+
+def observation(batch: int = 2, frames: int = 9) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    first = torch.randn(batch, 3, 4, 4, 4, generator=generator)
+    return first, torch.randn(batch, 3, 9, frames, 4, 4, generator=generator)
+
+
+def test_nodes_of_the_samplers() -> None:
+    assert shifted_sigmas(4, 5.0) == pytest.approx(CAUSAL_SIGMAS)
+    assert sigmas_causal() == CAUSAL_SIGMAS
+    assert len(sigmas_full()) == 36
+    assert sigmas_full(2) == (1.0, 0.5, 0.0)
+    assert sigmas_causal(2) == pytest.approx((1.0, 5 / 6, 0.0))
+    with pytest.raises(ConfigError, match="at least one step"):
+        shifted_sigmas(0)
+    with pytest.raises(ConfigError, match="must fall from at most 1 to 0"):
+        check_nodes((1.0, 0.5, 0.5, 0.0))
+
+
+def test_euler_reaches_the_sample_of_a_constant_velocity() -> None:
+    clean, noise = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0))
+    latents = noise
+    for sigma, next_sigma in zip(CAUSAL_SIGMAS[:-1], CAUSAL_SIGMAS[1:], strict=True):
+        latents = euler_step(latents, noise - clean, sigma, next_sigma)
+    torch.testing.assert_close(latents, clean)
+
+
+class Oracle(torch.nn.Module):
+    """Emits the exact velocity towards known latents."""
+
+    def __init__(self, clean: torch.Tensor) -> None:
+        super().__init__()
+        self.clean = clean
+
+    def forward(self, latents: torch.Tensor, sigma: torch.Tensor, **_: object) -> WorldModelOutput:
+        velocity = (latents - self.clean) / sigma.view(-1, 1, 1, 1, 1, 1)
+        velocity[:, :, :, 0] = 0
+        return WorldModelOutput(velocity, None)
+
+
+def test_whole_clip_sampler_finds_what_the_velocity_points_to() -> None:
+    first, maps = observation()
+    clean = torch.randn(2, 3, 4, 9, 4, 4)
+    clean[:, :, :, 0] = first
+    predicted = rollout_full_clip(Oracle(clean), first, maps, noise=Noise([42, 43]), steps=5)  # type: ignore[arg-type]
+    torch.testing.assert_close(predicted, clean, rtol=1e-4, atol=1e-4)
+
+
+def test_a_clip_is_predicted_alike_alone_and_in_a_batch(model: WorldModel) -> None:
+    first, maps = observation()
+    both = rollout_full_clip(model, first, maps, noise=Noise([42, 42]), steps=3)
+    alone = rollout_full_clip(model, first[1:], maps[1:], noise=Noise([42]), steps=3)
+    torch.testing.assert_close(both[1:], alone, rtol=1e-4, atol=1e-4)
+    other = rollout_full_clip(model, first[1:], maps[1:], noise=Noise([43]), steps=3)
+    assert not torch.allclose(alone, other, atol=1e-2)
+    assert torch.equal(both[:, :, :, 0], first)
+
+
+def roll(simulator: BlockCausalSimulator, first: torch.Tensor, maps: torch.Tensor) -> list[torch.Tensor]:
+    simulator.start(first, maps[:, :, :, :1])
+    return [simulator.step(maps[:, :, :, s : s + 4]) for s in range(1, maps.shape[3], 4)]
+
+
+def test_block_causal_rollout_accepts_new_controls_and_never_looks_ahead(model: WorldModel) -> None:
+    first, maps = observation(frames=13)
+    before = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    changed = maps.clone()
+    changed[:, :, :, 5:] *= -1
+    after = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, changed)
+    assert torch.equal(before[0], after[0])
+    assert not torch.allclose(before[1], after[1], atol=1e-3)
+    assert len(before) == 3
+    assert before[0].shape == (2, 3, 4, 4, 4, 4)
+
+
+def test_blocks_equal_the_full_block_causal_pass_at_every_step(model: WorldModel) -> None:
+    first, maps = observation()
+    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]), sigmas=(1.0, 0.0))
+    blocks = roll(simulator, first, maps)
+    noise = Noise([42, 43])
+    noisy = torch.cat([first[:, :, :, None], *(noise.draw((3, 4, 4, 4, 4)) for _ in range(2))], dim=3)
+    clean = torch.cat([first[:, :, :, None], *blocks], dim=3)
+    velocity = model.forward_teacher_forcing(noisy, clean, torch.ones(2, 2), action_maps=maps)
+    torch.testing.assert_close(noisy - velocity, clean, rtol=1e-4, atol=1e-4)
+
+
+def test_long_rollouts_keep_a_window_of_constant_size(model: WorldModel) -> None:
+    first, maps = observation(batch=1, frames=1 + 4 * 7)
+    simulator = BlockCausalSimulator(model, noise=Noise([42]), sigmas=(1.0, 0.0), recent_blocks=2)
+    simulator.start(first, maps[:, :, :, :1])
+    sizes = []
+    for start in range(1, maps.shape[3], 4):
+        simulator.step(maps[:, :, :, start : start + 4])
+        sizes.append(simulator.cache.frames)
+    assert sizes == [1, 5, 9, 9, 9, 9, 9]
+
+
+def test_forks_go_on_separately_and_repeat_the_original(model: WorldModel) -> None:
+    first, maps = observation(frames=13)
+    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    simulator.start(first, maps[:, :, :, :1])
+    simulator.step(maps[:, :, :, 1:5])
+    fork = simulator.fork()
+    other = fork.step(-maps[:, :, :, 5:9])
+    continued = simulator.step(maps[:, :, :, 5:9])
+    whole = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    assert torch.equal(continued, whole[1])
+    assert not torch.allclose(other, continued, atol=1e-3)
+
+
+def test_a_simulator_starts_again_from_nothing(model: WorldModel) -> None:
+    first, maps = observation()
+    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    roll(simulator, first, maps)
+    simulator.noise = Noise([42, 43])
+    again = roll(simulator, first, maps)
+    fresh = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    assert torch.equal(again[1], fresh[1])
+
+
+def test_misuse_is_refused(model: WorldModel) -> None:
+    first, maps = observation()
+    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    with pytest.raises(DataError, match="has not been started"):
+        simulator.step(maps[:, :, :, 1:5])
+    simulator.start(first, maps[:, :, :, :1])
+    with pytest.raises(DataError, match="Controls of one block"):
+        simulator.step(maps)

@@ -1,0 +1,161 @@
+"""Reading a pretrained Cosmos3 transformer from a local diffusers folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.model.checkpoint import fill
+from worldline_core.model.config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.model.world_model import WorldModel, is_text_parameter
+
+CLASS_NAME = "Cosmos3OmniTransformer"
+SINGLE, INDEX = "diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.safetensors.index.json"
+UNUSED_PARAMETERS = (
+    "lm_head.",
+    "audio_proj_in.",
+    "audio_proj_out.",
+    "audio_modality_embed",
+    "action_proj_in.",
+    "action_proj_out.",
+    "action_modality_embed",
+)
+"""Heads for text, sound and native actions: this model emits video and takes its actions as maps."""
+
+
+@dataclass(frozen=True)
+class Cosmos3Report:
+    """Which names of the pretrained folder were left out, and which parameters are new here."""
+
+    ignored: tuple[str, ...]
+    new: tuple[str, ...]
+
+
+def config_from_diffusers(config: Mapping[str, Any], *, where: object, fps: float | None = None) -> WorldModelConfig:
+    """Translate a diffusers ``config.json``.
+
+    Args:
+        fps: frame rate of the data; the temporal positions follow it where the pretrained model modulates by fps.
+
+    Raises:
+        CheckpointError: the folder holds another model, or a variant this package does not compute.
+    """
+    expected = {
+        "hidden_act": "silu",
+        "attention_bias": False,
+        "qk_norm_for_text": True,
+        "use_und_k_norm_for_gen": False,
+    }
+    wrong = {key: config.get(key, value) for key, value in expected.items() if config.get(key, value) != value}
+    if config.get("_class_name", CLASS_NAME) != CLASS_NAME or wrong:
+        raise CheckpointError(
+            "Not a Cosmos3 transformer of the supported kind",
+            where=where,
+            expected={"_class_name": CLASS_NAME} | expected,
+            got={"_class_name": config.get("_class_name")} | wrong,
+        )
+    names = {
+        "latent_channels": "latent_channel",
+        "patch_size": "latent_patch_size",
+        "hidden_size": "hidden_size",
+        "num_layers": "num_hidden_layers",
+        "num_heads": "num_attention_heads",
+        "num_kv_heads": "num_key_value_heads",
+        "head_dim": "head_dim",
+        "intermediate_size": "intermediate_size",
+        "rms_norm_eps": "rms_norm_eps",
+        "rope_theta": "rope_theta",
+        "base_fps": "base_fps",
+        "temporal_margin": "unified_3d_mrope_temporal_modality_margin",
+        "vocab_size": "vocab_size",
+        "timestep_scale": "timestep_scale",
+    }
+    changes: dict[str, Any] = {ours: config[theirs] for ours, theirs in names.items() if theirs in config}
+    if config.get("rope_axes_dim") is not None:
+        changes["rope_sections"] = tuple(config["rope_axes_dim"])
+    if config.get("enable_fps_modulation", True):
+        changes["fps"] = fps
+    try:
+        return cosmos3_nano_config(**changes)
+    except ValidationError as error:
+        raise CheckpointError("The Cosmos3 config is not valid", where=where, got=str(error)) from error
+
+
+def load_cosmos3(
+    folder: Path,
+    *,
+    towers: Literal["both", "generation"] = "both",
+    fps: float | None = None,
+    changes: Mapping[str, object] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[WorldModel, Cosmos3Report]:
+    """Load ``folder`` (a transformer, or a pipeline with a ``transformer`` subfolder) into a world model.
+
+    The action branch is new: its output layer is zero, so the model starts as the pretrained one.
+
+    Args:
+        changes: fields of the config to set besides (view slots, their unit).
+
+    Raises:
+        UnavailableError: there is no such folder.
+        CheckpointError: the folder is incomplete, damaged, or holds another architecture.
+    """
+    root = folder / "transformer" if (folder / "transformer").is_dir() else folder
+    if not (root / "config.json").is_file():
+        raise UnavailableError(
+            "The Cosmos3 weights are not here",
+            where=folder,
+            expected="a diffusers folder with config.json and *.safetensors",
+            next_step="download nvidia/Cosmos3-Nano in diffusers format and give its folder",
+        )
+    raw = _read_json(root / "config.json")
+    config = config_from_diffusers(raw, where=root / "config.json", fps=fps)
+    config = WorldModelConfig.model_validate(config.model_dump() | {"towers": towers} | dict(changes or {}))
+    tensors = _read_tensors(root)
+    ignored = sorted(name for name in tensors if name.startswith(UNUSED_PARAMETERS))
+    if towers == "generation":
+        ignored = sorted({*ignored, *(name for name in tensors if is_text_parameter(name))})
+    kept = {name: tensor for name, tensor in tensors.items() if name not in set(ignored)}
+    model = WorldModel(config)
+    own = model.state_dict()
+    new = sorted(name for name in own if name.startswith("action_encoder.") or name == "view_embedding")
+    fill(model, kept | {name: own[name] for name in new}, where=root, dtype=dtype)
+    return model, Cosmos3Report(tuple(ignored), tuple(new))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError("Not valid JSON", where=path, got=str(error)) from error
+    if not isinstance(content, dict):
+        raise CheckpointError("Not a JSON object", where=path, got=type(content).__name__)
+    return content
+
+
+def _read_tensors(root: Path) -> dict[str, Tensor]:
+    if (root / INDEX).is_file():
+        names = sorted(set(_read_json(root / INDEX).get("weight_map", {}).values()))
+    else:
+        names = [SINGLE]
+    tensors: dict[str, Tensor] = {}
+    for name in names:
+        path = root / Path(name).name
+        if not path.is_file():
+            raise CheckpointError("A weight file is missing", where=path, next_step="download the folder again")
+        try:
+            with safe_open(path, framework="pt") as shard:
+                for key in shard.keys():  # noqa: SIM118 - safe_open is not iterable
+                    tensors[key] = shard.get_tensor(key)
+        except SafetensorError as error:
+            raise CheckpointError("A weight file is damaged", where=path, got=str(error)) from error
+    return tensors

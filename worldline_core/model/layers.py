@@ -1,0 +1,160 @@
+"""One layer of the mixture of transformers: an understanding half (text) beside a generation half (video).
+
+Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the customary name
+from einops import rearrange
+from torch import Tensor, nn
+
+from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.rope import Rotation, rotate
+
+
+class GenerationAttention(Protocol):
+    """How video tokens look at each other: everything at once, block by block, or through a cache.
+
+    Called with normalised, not yet rotated queries and keys, ``(b heads n d)``.
+    """
+
+    def __call__(
+        self, layer: int, queries: Tensor, keys: Tensor, values: Tensor, text: tuple[Tensor, Tensor] | None
+    ) -> Tensor: ...
+
+
+def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Attention of ``h`` query heads over ``g <= h`` key heads, ``(b heads n d)``.
+
+    The query heads that share a key head are interleaved as rows of one head. That is the same sum, needs no
+    copies of keys and values, and stays on the fused kernels (``enable_gqa`` falls back to the slow one).
+
+    Args:
+        mask: boolean, True where attention is allowed, broadcastable to ``(b 1 queries keys)``.
+    """
+    groups = queries.shape[1] // keys.shape[1]
+    rows = rearrange(queries, "b (k g) n d -> b k (n g) d", g=groups)
+    if mask is not None and mask.shape[-2] != 1:
+        mask = mask.repeat_interleave(groups, dim=-2)
+    mixed = F.scaled_dot_product_attention(rows, keys, values, attn_mask=mask)
+    return rearrange(mixed, "b k (n g) d -> b n (k g d)", g=groups)
+
+
+class RMSNorm(nn.Module):
+    """Root-mean-square normalisation over the last axis, in float32 for half-precision inputs."""
+
+    def __init__(self, size: int, eps: float) -> None:
+        super().__init__()
+        self.eps = eps
+        self.weight = nn.Parameter(torch.ones(size))
+
+    def forward(self, values: Tensor) -> Tensor:
+        return F.rms_norm(values, (values.shape[-1],), self.weight.to(values.dtype), self.eps)
+
+
+class GatedFeedForward(nn.Module):
+    """SwiGLU."""
+
+    def __init__(self, hidden_size: int, intermediate_size: int) -> None:
+        super().__init__()
+        self.gate_proj = nn.Linear(hidden_size, intermediate_size, bias=False)
+        self.up_proj = nn.Linear(hidden_size, intermediate_size, bias=False)
+        self.down_proj = nn.Linear(intermediate_size, hidden_size, bias=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.down_proj(F.silu(self.gate_proj(values)) * self.up_proj(values))
+
+
+class MixtureAttention(nn.Module):
+    """Query, key, value and output projections of both halves; how they meet is the caller's choice."""
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        self.head_dim = config.head_dim
+        inner, shared = config.num_heads * config.head_dim, config.num_kv_heads * config.head_dim
+        if config.towers == "both":
+            self.to_q = nn.Linear(config.hidden_size, inner, bias=False)
+            self.to_k = nn.Linear(config.hidden_size, shared, bias=False)
+            self.to_v = nn.Linear(config.hidden_size, shared, bias=False)
+            self.to_out = nn.Linear(inner, config.hidden_size, bias=False)
+            self.norm_q = RMSNorm(config.head_dim, config.rms_norm_eps)
+            self.norm_k = RMSNorm(config.head_dim, config.rms_norm_eps)
+        self.add_q_proj = nn.Linear(config.hidden_size, inner, bias=False)
+        self.add_k_proj = nn.Linear(config.hidden_size, shared, bias=False)
+        self.add_v_proj = nn.Linear(config.hidden_size, shared, bias=False)
+        self.to_add_out = nn.Linear(inner, config.hidden_size, bias=False)
+        self.norm_added_q = RMSNorm(config.head_dim, config.rms_norm_eps)
+        self.norm_added_k = RMSNorm(config.head_dim, config.rms_norm_eps)
+
+    def _heads(self, values: Tensor) -> Tensor:
+        return rearrange(values, "b n (k d) -> b n k d", d=self.head_dim)
+
+    def understand(self, values: Tensor, by: Rotation) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Causal self-attention over text; also returns the rotated keys and values the video reads."""
+        queries = rotate(rearrange(self.norm_q(self._heads(self.to_q(values))), "b n k d -> b k n d"), by)
+        keys = rotate(rearrange(self.norm_k(self._heads(self.to_k(values))), "b n k d -> b k n d"), by)
+        value = rearrange(self._heads(self.to_v(values)), "b n k d -> b k n d")
+        size = queries.shape[-2]
+        causal = torch.ones(size, size, dtype=torch.bool, device=values.device).tril()
+        mixed = grouped_attention(queries, keys, value, causal[None, None])
+        return self.to_out(mixed), (keys, value)
+
+    def generate(
+        self, values: Tensor, attend: GenerationAttention, layer: int, text: tuple[Tensor, Tensor] | None
+    ) -> Tensor:
+        """Attention of the video tokens, as ``attend`` lays down."""
+        queries = rearrange(self.norm_added_q(self._heads(self.add_q_proj(values))), "b n k d -> b k n d")
+        keys = rearrange(self.norm_added_k(self._heads(self.add_k_proj(values))), "b n k d -> b k n d")
+        value = rearrange(self._heads(self.add_v_proj(values)), "b n k d -> b k n d")
+        return self.to_add_out(attend(layer, queries, keys, value, text))
+
+
+class MixtureLayer(nn.Module):
+    """Pre-norm attention and feed-forward of both halves. There is no adaptive normalisation."""
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        eps = config.rms_norm_eps
+        self.self_attn = MixtureAttention(config)
+        if config.towers == "both":
+            self.mlp = GatedFeedForward(config.hidden_size, config.intermediate_size)
+            self.input_layernorm = RMSNorm(config.hidden_size, eps)
+            self.post_attention_layernorm = RMSNorm(config.hidden_size, eps)
+        self.mlp_moe_gen = GatedFeedForward(config.hidden_size, config.intermediate_size)
+        self.input_layernorm_moe_gen = RMSNorm(config.hidden_size, eps)
+        self.post_attention_layernorm_moe_gen = RMSNorm(config.hidden_size, eps)
+
+    def forward(
+        self,
+        generation: Tensor | None,
+        attend: GenerationAttention | None,
+        layer: int,
+        *,
+        understanding: Tensor | None = None,
+        text_rotation: Rotation | None = None,
+        text: tuple[Tensor, Tensor] | None = None,
+    ) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, Tensor] | None]:
+        """Advance either half or both.
+
+        Args:
+            generation: video tokens ``(b n d)``, or None to read text only.
+            attend: attention pattern of the video tokens.
+            understanding: text tokens ``(b m d)``; their keys and values then serve the video of this layer.
+            text: keys and values of the text, when they were computed before.
+
+        Returns:
+            video tokens, text tokens, and the text keys and values of this layer.
+        """
+        if understanding is not None and text_rotation is not None:
+            mixed, text = self.self_attn.understand(self.input_layernorm(understanding), text_rotation)
+            understanding = understanding + mixed
+            understanding = understanding + self.mlp(self.post_attention_layernorm(understanding))
+        if generation is not None and attend is not None:
+            normalised = self.input_layernorm_moe_gen(generation)
+            generation = generation + self.self_attn.generate(normalised, attend, layer, text)
+            generation = generation + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(generation))
+        return generation, understanding, text

@@ -1,0 +1,219 @@
+"""A causal linear patch tokenizer with a small convolutional decoder.
+
+The first frame is coded alone in 8 x 8 patches, then groups of four frames in 4 x 8 x 8 patches. The orthonormal basis
+of a group has two parts: *static* vectors, constant over the four frames, whose spatial patterns are also those of the
+first frame; and *motion* vectors, which sum to zero over time. A group in which nothing moves is therefore coded
+exactly as the first frame is, with zero motion channels: copying the background is the identity on latents.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Float
+from pydantic import Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from worldline_core.config.base import StrictModel
+from worldline_core.errors import CheckpointError, DataError
+from worldline_core.model.checkpoint import fill
+from worldline_core.model.tokenizer.base import (
+    DESCRIPTION,
+    FORMAT,
+    WEIGHTS,
+    check_latents,
+    check_video,
+    read_description,
+)
+from worldline_core.model.tokenizer.refinement import Refinement
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+
+
+class PatchTokenizerConfig(StrictModel):
+    """Layout of the codes and width of the decoder."""
+
+    static_channels: int = Field(24, ge=1)
+    motion_channels: int = Field(8, ge=0)
+    spatial_compression: int = Field(8, ge=2, multiple_of=4)
+    temporal_compression: int = Field(4, ge=1)
+    refinement_width: int = Field(48, ge=4)
+    refinement_depth: int = Field(2, ge=1)
+
+
+class PatchTokenizer(nn.Module):
+    """Linear codes, orthonormal bases, and a decoder that adds what the codes leave out."""
+
+    KIND = "patch"
+    mean: Tensor
+    static_basis: Tensor
+    motion_basis: Tensor
+    scale: Tensor
+
+    def __init__(self, config: PatchTokenizerConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or PatchTokenizerConfig()
+        self.latent_channels = self.config.static_channels + self.config.motion_channels
+        self.spatial_compression = self.config.spatial_compression
+        self.temporal_compression = self.config.temporal_compression
+        pixels = 3 * self.spatial_compression**2
+        self.register_buffer("mean", torch.zeros(pixels))
+        self.register_buffer("static_basis", torch.zeros(self.config.static_channels, pixels))
+        self.register_buffer(
+            "motion_basis", torch.zeros(self.config.motion_channels, self.temporal_compression * pixels)
+        )
+        self.register_buffer("scale", torch.ones(self.latent_channels))
+        self.refinement = Refinement(
+            self.temporal_compression, self.config.refinement_width, self.config.refinement_depth
+        )
+        self.metadata: dict[str, Any] = {}
+
+    @property
+    def encoder_digest(self) -> str:
+        """Digest of all that :meth:`encode` depends on; a retrained decoder does not change it."""
+        content = repr((self.config.static_channels, self.config.motion_channels, self.spatial_compression)).encode()
+        for name in ("mean", "static_basis", "motion_basis", "scale"):
+            content += getattr(self, name).detach().float().cpu().contiguous().numpy().tobytes()
+        return hashlib.sha256(content).hexdigest()
+
+    def _patches(self, video: Tensor) -> Tensor:
+        size = self.spatial_compression
+        return rearrange(video, "b c t (h p) (w q) -> b t h w (c p q)", p=size, q=size) - self.mean
+
+    def _pixels(self, patches: Tensor) -> Tensor:
+        size = self.spatial_compression
+        return rearrange(patches + self.mean, "b t h w (c p q) -> b c t (h p) (w q)", p=size, q=size)
+
+    def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
+        """Codes of a clip of ``1 + 4 k`` frames in [-1, 1].
+
+        Raises:
+            DataError: the video has another shape.
+        """
+        check_video(self, video)
+        with torch.autocast(device_type=video.device.type, enabled=False):
+            patches = self._patches(video.float())
+            first, groups = patches[:, :1], patches[:, 1:]
+            groups = rearrange(groups, "b (n g) h w d -> b n g h w d", g=self.temporal_compression)
+            means = torch.cat((first, groups.mean(dim=2)), dim=1)
+            static = means @ self.static_basis.T
+            motion = rearrange(groups, "b n g h w d -> b n h w (g d)") @ self.motion_basis.T
+            motion = torch.cat(
+                (torch.zeros_like(static[:, :1, ..., :1]).expand(*static[:, :1].shape[:-1], motion.shape[-1]), motion),
+                dim=1,
+            )
+            codes = torch.cat((static, motion), dim=-1) / self.scale
+        return rearrange(codes, "b t h w c -> b c t h w")
+
+    def decode_linear(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
+        """What the codes alone say (the orthogonal projection of the video)."""
+        check_latents(self, latents)
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            codes = rearrange(latents.float(), "b c t h w -> b t h w c") * self.scale
+            static, motion = codes.split((self.config.static_channels, self.config.motion_channels), dim=-1)
+            means = static @ self.static_basis
+            groups = repeat(means[:, 1:], "b n h w d -> b n g h w d", g=self.temporal_compression)
+            moving = motion[:, 1:] @ self.motion_basis
+            groups = groups + rearrange(moving, "b n h w (g d) -> b n g h w d", g=self.temporal_compression)
+            patches = torch.cat((means[:, :1], rearrange(groups, "b n g h w d -> b (n g) h w d")), dim=1)
+            return self._pixels(patches)
+
+    def decode(
+        self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
+    ) -> Float[Tensor, "b 3 t h w"]:
+        """Latents to video in [-1, 1]; with the observed first frame, still background keeps its full detail.
+
+        Group ``j`` is decoded from latent frames 0 and ``j`` only, so blocks can be decoded as they arrive.
+        """
+        return self.refine(self.decode_linear(latents), reference)
+
+    def refine(
+        self, coarse: Float[Tensor, "b 3 t h w"], reference: Float[Tensor, "b 3 h w"] | None = None
+    ) -> Float[Tensor, "b 3 t h w"]:
+        """Run the convolutional decoder over a linear decode."""
+        batch, time = coarse.shape[0], self.temporal_compression
+        if reference is not None and reference.shape != coarse[:, :, 0].shape:
+            raise DataError(
+                "The reference frame does not fit the latents",
+                expected=tuple(coarse[:, :, 0].shape),
+                got=tuple(reference.shape),
+            )
+        first = repeat(coarse[:, :, 0], "b c h w -> b g c h w", g=time)
+        groups = rearrange(coarse[:, :, 1:], "b c (n g) h w -> b n g c h w", g=time)
+        groups = torch.cat((first[:, None], groups), dim=1)
+        count = groups.shape[1]
+        known = (
+            torch.ones(batch, device=coarse.device)
+            if reference is not None
+            else torch.zeros(batch, device=coarse.device)
+        )
+        reference = coarse[:, :, 0] if reference is None else reference.to(coarse.dtype)
+        refined = self.refinement(
+            rearrange(groups, "b n g c h w -> (b n) g c h w"),
+            repeat(coarse[:, :, 0], "b c h w -> (b n) c h w", n=count),
+            repeat(reference, "b c h w -> (b n) c h w", n=count),
+            repeat(known, "b -> (b n)", n=count),
+        )
+        refined = rearrange(refined, "(b n) g c h w -> b n g c h w", n=count)
+        rest = rearrange(refined[:, 1:], "b n g c h w -> b c (n g) h w")
+        return torch.cat((rearrange(refined[:, 0, :1], "b g c h w -> b c g h w"), rest), dim=2)
+
+    def save(self, folder: Path, metadata: Mapping[str, Any] | None = None) -> None:
+        """Write the bases in float32 and the decoder in float16. Equal weights give equal bytes."""
+        tensors = {}
+        for name, tensor in sorted(self.state_dict().items()):
+            dtype = torch.float16 if name.startswith("refinement.") else torch.float32
+            tensors[name] = tensor.detach().to("cpu", dtype).contiguous().clone()
+        content = save(tensors)
+        write_bytes_atomic(folder / WEIGHTS, content)
+        write_json_atomic(
+            folder / DESCRIPTION,
+            {
+                "format": FORMAT,
+                "version": 1,
+                "kind": self.KIND,
+                "config": self.config.model_dump(mode="json"),
+                "metadata": dict(self.metadata if metadata is None else metadata),
+                "weights_sha256": hashlib.sha256(content).hexdigest(),
+            },
+        )
+
+    @classmethod
+    def load(cls, folder: Path) -> PatchTokenizer:
+        """Read a tokenizer written by :meth:`save`, strictly.
+
+        Raises:
+            CheckpointError: the folder is incomplete, damaged, or of another kind.
+        """
+        content = read_description(folder)
+        if content.get("kind") != cls.KIND:
+            raise CheckpointError("Not a patch tokenizer", where=folder, expected=cls.KIND, got=content.get("kind"))
+        try:
+            tokenizer = cls(PatchTokenizerConfig.model_validate(content.get("config")))
+        except ValidationError as error:
+            raise CheckpointError("The tokenizer's config is not valid", where=folder, got=str(error)) from error
+        path = folder / WEIGHTS
+        if not path.is_file():
+            raise CheckpointError("The tokenizer has no weights", where=path)
+        raw = path.read_bytes()
+        digest = hashlib.sha256(raw).hexdigest()
+        if digest != content.get("weights_sha256"):
+            raise CheckpointError(
+                "The weights are not those the tokenizer describes",
+                where=path,
+                expected=content.get("weights_sha256"),
+                got=digest,
+            )
+        try:
+            tensors = load(raw)
+        except SafetensorError as error:
+            raise CheckpointError("The weights file is damaged", where=path, got=str(error)) from error
+        fill(tokenizer, tensors, where=path, dtype=torch.float32)
+        tokenizer.metadata = dict(content.get("metadata", {}))
+        return tokenizer.eval().requires_grad_(False)

@@ -1,0 +1,108 @@
+"""The Wan 2.2 video autoencoder, through diffusers, with the interface of every tokenizer here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.model.tokenizer.base import check_latents, check_video
+
+if TYPE_CHECKING:
+    from diffusers import AutoencoderKLWan
+
+# fmt: off
+WAN22_MEAN = (
+    -0.2289, -0.0052, -0.1323, -0.2339, -0.2799, 0.0174, 0.1838, 0.1557, -0.1382, 0.0542, 0.2813, 0.0891,
+    0.1570, -0.0098, 0.0375, -0.1825, -0.2246, -0.1207, -0.0698, 0.5109, 0.2665, -0.2108, -0.2158, 0.2502,
+    -0.2055, -0.0322, 0.1109, 0.1567, -0.0729, 0.0899, -0.2799, -0.1230, -0.0313, -0.1649, 0.0117, 0.0723,
+    -0.2839, -0.2083, -0.0520, 0.3748, 0.0152, 0.1957, 0.1433, -0.2944, 0.3573, -0.0548, -0.1681, -0.0667,
+)
+WAN22_STD = (
+    0.4765, 1.0364, 0.4514, 1.1677, 0.5313, 0.4990, 0.4818, 0.5013, 0.8158, 1.0344, 0.5894, 1.0901,
+    0.6885, 0.6165, 0.8454, 0.4978, 0.5759, 0.3523, 0.7135, 0.6804, 0.5833, 1.4146, 0.8986, 0.5659,
+    0.7069, 0.5338, 0.4889, 0.4917, 0.4069, 0.4999, 0.6866, 0.4093, 0.5709, 0.6065, 0.6415, 0.4944,
+    0.5726, 1.2042, 0.5458, 1.6887, 0.3971, 1.0600, 0.3943, 0.5537, 0.5444, 0.4089, 0.7468, 0.7744,
+)
+# fmt: on
+
+
+class WanTokenizer(nn.Module):
+    """``AutoencoderKLWan``: encoding takes the mode of the posterior, latents are ``(mode - mean) / std`` a channel."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, vae: AutoencoderKLWan, *, where: object = "AutoencoderKLWan") -> None:
+        super().__init__()
+        self.vae = vae
+        self.latent_channels = int(vae.config["z_dim"])
+        self.spatial_compression = int(vae.config["scale_factor_spatial"])
+        self.temporal_compression = int(vae.config["scale_factor_temporal"])
+        mean, std = vae.config["latents_mean"], vae.config["latents_std"]
+        if self.latent_channels == len(WAN22_MEAN) != len(mean):
+            mean, std = WAN22_MEAN, WAN22_STD
+        if len(mean) != self.latent_channels or len(std) != self.latent_channels:
+            raise CheckpointError(
+                "The autoencoder's latent statistics do not match its channels",
+                where=where,
+                expected=f"{self.latent_channels} means and deviations",
+                got=f"{len(mean)} and {len(std)}",
+            )
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32).view(1, -1, 1, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(std, dtype=torch.float32).view(1, -1, 1, 1, 1), persistent=False)
+
+    def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
+        """Normalised latents of a clip of ``1 + 4 k`` frames in [-1, 1].
+
+        Raises:
+            DataError: the video has another shape.
+        """
+        check_video(self, video)
+        # The autoencoder was trained without mixed precision; it runs in the dtype of its weights.
+        with torch.autocast(device_type=video.device.type, enabled=False):
+            mode = self.vae.encode(video.to(self.vae.dtype)).latent_dist.mode()
+        return ((mode.float() - self.mean) / self.std).to(video.dtype)
+
+    def decode(
+        self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
+    ) -> Float[Tensor, "b 3 t h w"]:
+        """Video in [-1, 1]. The reference frame is not used: this decoder needs no help with still background."""
+        check_latents(self, latents)
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            codes = (latents.float() * self.std + self.mean).to(self.vae.dtype)
+            return self.vae.decode(codes).sample.to(latents.dtype)
+
+    @classmethod
+    def load(cls, folder: Path, dtype: torch.dtype = torch.float32) -> WanTokenizer:
+        """Read a local diffusers folder (an autoencoder, or a pipeline with a ``vae`` subfolder); nothing is downloaded.
+
+        Raises:
+            UnavailableError: there is no such folder.
+            CheckpointError: it is incomplete, damaged, or holds another autoencoder.
+        """
+        from diffusers import AutoencoderKLWan
+
+        root = folder / "vae" if (folder / "vae").is_dir() else folder
+        if not (root / "config.json").is_file():
+            raise UnavailableError(
+                "The Wan autoencoder is not here",
+                where=folder,
+                expected="a diffusers folder with config.json and *.safetensors",
+                next_step="download Wan-AI/Wan2.2-TI2V-5B-Diffusers (subfolder vae) and give its folder",
+            )
+        name = AutoencoderKLWan.load_config(str(root)).get("_class_name")
+        if name != AutoencoderKLWan.__name__:
+            raise CheckpointError("Not a Wan autoencoder", where=root, expected=AutoencoderKLWan.__name__, got=name)
+        try:
+            vae = AutoencoderKLWan.from_pretrained(
+                str(root), local_files_only=True, use_safetensors=True, torch_dtype=dtype
+            )
+        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+            raise CheckpointError("The Wan autoencoder cannot be read", where=root, got=str(error)) from error
+        return cls(vae.eval().requires_grad_(False), where=root)

@@ -1,0 +1,350 @@
+"""The action-driven world model: a mixture of transformers over text and multi-view video latents.
+
+Axis legend: b batch, v view, c latent channel, t latent frame, h w latent grid, n tokens in order ``(t v h w)``,
+d model width. Convention: ``z_sigma = (1 - sigma) z + sigma eps``, velocity ``eps - z`` (method.md section 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.action_encoder import ActionEncoder
+from worldline_core.model.block_causal import FullAttention, TeacherForcingAttention, block_bounds
+from worldline_core.model.config import VIEWS, WorldModelConfig, cosmos3_nano_config
+from worldline_core.model.kv_cache import CachedAttention, KVCache
+from worldline_core.model.layers import GenerationAttention, MixtureLayer, RMSNorm
+from worldline_core.model.rope import rotation, text_positions, video_positions
+from worldline_core.model.time_embedding import TimeEmbedder
+
+__all__ = ["TextContext", "WorldModel", "WorldModelConfig", "WorldModelOutput", "cosmos3_nano_config"]
+
+TEXT_PARAMETERS = (
+    "embed_tokens.",
+    "norm.",
+    ".to_q.",
+    ".to_k.",
+    ".to_v.",
+    ".to_out.",
+    ".norm_q.",
+    ".norm_k.",
+    ".mlp.",
+    ".input_layernorm.",
+    ".post_attention_layernorm.",
+)
+"""Name parts of the understanding tower's parameters; everything else belongs to the generation tower."""
+
+
+def is_text_parameter(name: str) -> bool:
+    """Whether a parameter belongs to the understanding (text) tower."""
+    return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
+
+
+@dataclass(frozen=True)
+class TextContext:
+    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once."""
+
+    layers: tuple[tuple[Tensor, Tensor], ...]
+    mask: Bool[Tensor, "b m"] | None
+    size: int
+
+
+@dataclass(frozen=True)
+class WorldModelOutput:
+    """Velocity ``(b v c t h w)``, zero on clean frames; and, when asked for, the tokens after one layer."""
+
+    velocity: Tensor
+    features: Tensor | None
+
+
+class WorldModel(nn.Module):
+    """Predicts the velocity of multi-view latents from the first frame, action maps, and optionally text."""
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        if config.towers == "both":
+            self.embed_tokens = nn.Embedding(config.vocab_size, config.hidden_size)
+            self.norm = RMSNorm(config.hidden_size, config.rms_norm_eps)
+        self.layers = nn.ModuleList([MixtureLayer(config) for _ in range(config.num_layers)])
+        self.norm_moe_gen = RMSNorm(config.hidden_size, config.rms_norm_eps)
+        self.proj_in = nn.Linear(config.patch_dim, config.hidden_size)
+        self.proj_out = nn.Linear(config.hidden_size, config.patch_dim)
+        self.time_embedder = TimeEmbedder(config.hidden_size)
+        self.action_encoder = ActionEncoder(config.action_channels, config.patch_size, config.hidden_size)
+        self.view_embedding: nn.Parameter | None = None
+        if config.view_embedding:
+            self.view_embedding = nn.Parameter(torch.zeros(len(config.views), config.hidden_size))
+        self.gradient_checkpointing = False
+
+    def initialise(self, generator: torch.Generator | None = None) -> None:
+        """Weights for training from scratch: small normals, residual outputs scaled by depth, head and actions zero."""
+        residual = (2 * self.config.num_layers) ** -0.5
+        for name, parameter in self.named_parameters():
+            if parameter.ndim < 2:
+                value = 1.0 if "norm" in name else 0.0
+                nn.init.constant_(parameter, value)
+                continue
+            std = 0.02 if name.startswith("action_encoder.conv") else parameter[0].numel() ** (-0.5)
+            if name.endswith(("to_add_out.weight", "to_out.weight", "down_proj.weight")):
+                std *= residual
+            if name.startswith("embed_tokens"):
+                std = 0.02
+            nn.init.normal_(parameter, 0.0, std, generator=generator)
+        nn.init.zeros_(self.proj_out.weight)
+        self.action_encoder.reset_output()
+        if self.view_embedding is not None:
+            nn.init.zeros_(self.view_embedding)
+
+    def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """What Stage II trains besides the action branch (method.md section 4)."""
+        for name, parameter in self.named_parameters():
+            if not is_text_parameter(name) and not name.startswith("action_encoder."):
+                yield name, parameter
+
+    def action_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """The action branch, trained at its own rate."""
+        for name, parameter in self.named_parameters():
+            if name.startswith("action_encoder."):
+                yield name, parameter
+
+    def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
+        """Run the understanding tower over right-padded token ids ``(b m)``.
+
+        Raises:
+            ConfigError: the model was built or loaded without its understanding tower.
+        """
+        if self.config.towers != "both":
+            raise ConfigError(
+                "This model has no understanding tower, so it takes no text",
+                expected='towers="both"',
+                got=self.config.towers,
+                next_step="load the Stage I checkpoint with both towers, or leave the text out",
+            )
+        size = text_ids.shape[1]
+        if text_mask is None:
+            lengths = torch.full((len(text_ids),), size, device=text_ids.device)
+        else:
+            lengths = text_mask.sum(dim=1)
+        by = rotation(self.config, text_positions(lengths, size))
+        by = (rearrange(by[0], "b n d -> b 1 n d"), rearrange(by[1], "b n d -> b 1 n d"))
+        tokens = self.embed_tokens(text_ids)
+        contexts = []
+        for index, layer in enumerate(self.layers):
+            _, tokens, context = layer(None, None, index, understanding=tokens, text_rotation=by)
+            contexts.append(context)
+        padded = text_mask is not None and not bool(text_mask.all())
+        return TextContext(tuple(contexts), text_mask.bool() if padded and text_mask is not None else None, size)
+
+    def forward(
+        self,
+        latents: Float[Tensor, "b v c t h w"],
+        sigma: Tensor,
+        *,
+        clean_frames: Bool[Tensor, "b t"] | None = None,
+        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        text_ids: Tensor | None = None,
+        text_mask: Tensor | None = None,
+        text: TextContext | None = None,
+        views: Sequence[str] = VIEWS,
+        frame_offset: int = 0,
+        cache: KVCache | None = None,
+        write_cache: bool = False,
+        features_at: int | None = None,
+    ) -> WorldModelOutput:
+        """One denoising pass.
+
+        Args:
+            latents: noisy latents; clean frames hold the conditioning itself.
+            sigma: noise level in [0, 1], ``(b)`` or ``(b t)``; not read on clean frames.
+            clean_frames: frames that are conditioning: no time embedding, velocity 0. By default the first frame, or
+                none when the pass continues a cache; in a write pass all of them.
+            action_maps: maps at latent resolution; None runs without the action branch.
+            text_ids: token ids ``(b m)``, with ``text_mask`` (1 = real); or ``text``, encoded before.
+            views: names of the views in ``latents``.
+            frame_offset: temporal position of the first frame (ignored with a cache, which counts by itself).
+            cache: attend to the window of finished blocks too; the current frames follow it in time.
+            write_cache: store this block's keys and values (it must be clean: the conditioned-frame form).
+            features_at: return the video tokens after this many layers (1-based), as ``(b v t h w d)``.
+
+        Raises:
+            DataError: a shape does not fit.
+            ConfigError: a view is unknown, or text is given to a model without the understanding tower.
+        """
+        self._check(latents, views, action_maps)
+        batch, _, _, frames, _, _ = latents.shape
+        if clean_frames is None:
+            clean_frames = torch.zeros(batch, frames, dtype=torch.bool, device=latents.device)
+            if write_cache:
+                clean_frames = ~clean_frames
+            elif cache is None:
+                clean_frames[:, 0] = True
+        if write_cache and (cache is None or not bool(clean_frames.all())):
+            raise DataError("Only clean frames are written to a cache", expected="a cache, and all frames clean")
+        if text is None and text_ids is not None:
+            text = self.encode_text(text_ids, text_mask)
+        index = torch.arange(frames, device=latents.device)
+        grid = (latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size)
+        if cache is not None:
+            if text is not None:
+                raise ConfigError("Block-causal passes take no text", next_step="text belongs to Stage I only")
+            attend: GenerationAttention = self._cached_attention(cache, index, grid, views, write_cache)
+        else:
+            offset = 0.0 if text is None else text.size + self.config.temporal_margin
+            by = rotation(self.config, video_positions(self.config, index + frame_offset, grid, views, offset))
+            attend = FullAttention(by, None if text is None else text.mask)
+        tokens = self._embed(latents, sigma, clean_frames, action_maps, views)
+        tokens, features = self._run(tokens, attend, text, features_at)
+        if write_cache and cache is not None:
+            cache.end_block()
+            if cache.reference is None:
+                cache.reference = latents[:, :, :, :1].detach()
+        reference = latents[:, :, :, :1] if cache is None else cache.reference
+        if self.config.prediction == "first_frame_residual" and cache is None and not bool(clean_frames[:, 0].all()):
+            raise ConfigError(
+                "A model that predicts residuals to the first frame needs it clean", next_step="condition on it"
+            )
+        velocity = self._velocity(tokens, latents, sigma, clean_frames, reference)
+        if features is not None:
+            features = rearrange(features, "b (t v h w) d -> b v t h w d", t=frames, v=len(views), h=grid[0], w=grid[1])
+        return WorldModelOutput(velocity, features)
+
+    def forward_teacher_forcing(
+        self,
+        noisy: Float[Tensor, "b v c t h w"],
+        clean: Float[Tensor, "b v c t h w"],
+        sigma: Float[Tensor, "b blocks"],
+        *,
+        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        block_size: int = 4,
+        views: Sequence[str] = VIEWS,
+    ) -> Float[Tensor, "b v c t h w"]:
+        """Block-causal velocity of every block in one pass (method.md section 4, Stage III step 1).
+
+        Noisy block ``i`` sees the clean blocks before it and itself, with its own action maps. Frame 0 of ``noisy`` is
+        not read; its velocity is 0.
+
+        Raises:
+            DataError: a shape does not fit, or the clip does not divide into blocks.
+        """
+        self._check(noisy, views, action_maps)
+        batch, _, _, frames, _, _ = noisy.shape
+        bounds = block_bounds(frames, block_size)
+        if clean.shape != noisy.shape or sigma.shape != (batch, len(bounds) - 1):
+            raise DataError(
+                "Teacher forcing needs clean latents like the noisy ones and one sigma a block",
+                expected=f"{tuple(noisy.shape)} and {(batch, len(bounds) - 1)}",
+                got=f"{tuple(clean.shape)} and {tuple(sigma.shape)}",
+            )
+        history = frames - block_size
+        grid = (noisy.shape[-2] // self.config.patch_size, noisy.shape[-1] // self.config.patch_size)
+        frame_sigma = repeat(sigma, "b blocks -> b (blocks size)", size=block_size)
+        latents = torch.cat((clean[..., :history, :, :], noisy[..., 1:, :, :].to(clean.dtype)), dim=3)
+        frame_sigma = torch.cat((frame_sigma.new_zeros(batch, history), frame_sigma), dim=1)
+        is_clean = torch.arange(history + frames - 1, device=noisy.device) < history
+        is_clean = repeat(is_clean, "t -> b t", b=batch)
+        maps = None
+        if action_maps is not None:
+            maps = torch.cat((action_maps[..., :history, :, :], action_maps[..., 1:, :, :]), dim=3)
+        index = torch.cat((torch.arange(history), torch.arange(1, frames))).to(noisy.device)
+        by = rotation(self.config, video_positions(self.config, index, grid, views))
+        per_frame = len(views) * grid[0] * grid[1]
+        sizes = tuple((stop - start) * per_frame for start, stop in bounds)
+        tokens = self._embed(latents, frame_sigma, is_clean, maps, views)
+        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes), None, None)
+        velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
+        return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
+
+    def _check(self, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
+        config = self.config
+        expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
+        if (
+            latents.ndim != 6
+            or latents.shape[1] != len(views)
+            or latents.shape[2] != config.latent_channels
+            or latents.shape[-1] % config.patch_size
+            or latents.shape[-2] % config.patch_size
+        ):
+            raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
+        if action_maps is not None:
+            wanted = (*latents.shape[:2], config.action_channels, *latents.shape[3:])
+            if action_maps.shape != wanted:
+                raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
+
+    def _cached_attention(
+        self, cache: KVCache, index: Tensor, grid: tuple[int, int], views: Sequence[str], store: bool
+    ) -> CachedAttention:
+        if cache.needs_rotation:
+            window = torch.arange(cache.frames, device=index.device)
+            cache.set_rotation(rotation(self.config, video_positions(self.config, window, grid, views)))
+        by = rotation(self.config, video_positions(self.config, index + cache.frames, grid, views))
+        if store:
+            cache.begin_block(len(index))
+        return CachedAttention(by, cache, store)
+
+    def _embed(
+        self, latents: Tensor, sigma: Tensor, clean: Tensor, action_maps: Tensor | None, views: Sequence[str]
+    ) -> Tensor:
+        """Patches to tokens; time embedding on noisy frames only; action residual; view embedding."""
+        size = self.config.patch_size
+        patches = rearrange(latents, "b v c t (h p) (w q) -> b t (v h w) (p q c)", p=size, q=size)
+        tokens = self.proj_in(patches.to(self.proj_in.weight.dtype))
+        if sigma.ndim == 1:
+            sigma = sigma[:, None]
+        time = self.time_embedder(sigma.float() * (1000.0 * self.config.timestep_scale))
+        time = torch.where(clean[..., None], torch.zeros((), dtype=time.dtype, device=time.device), time)
+        tokens = tokens + rearrange(time, "b t d -> b t 1 d").to(tokens.dtype)
+        if self.view_embedding is not None:
+            chosen = self.view_embedding[[self.config.views.index(view) for view in views]]
+            chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
+            tokens = tokens + chosen.to(tokens.dtype)
+        tokens = rearrange(tokens, "b t n d -> b (t n) d")
+        if action_maps is not None:
+            tokens = tokens + self.action_encoder(action_maps.to(self.proj_in.weight.dtype)).to(tokens.dtype)
+        return tokens
+
+    def _run(
+        self, tokens: Tensor, attend: GenerationAttention, text: TextContext | None, features_at: int | None
+    ) -> tuple[Tensor, Tensor | None]:
+        if features_at is not None and not 1 <= features_at <= len(self.layers):
+            raise ConfigError("features_at counts layers from 1", expected=f"1..{len(self.layers)}", got=features_at)
+        features = None
+        for index, layer in enumerate(self.layers):
+            context = None if text is None else text.layers[index]
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                tokens, _, _ = checkpoint(layer, tokens, attend, index, text=context, use_reentrant=False)
+            else:
+                tokens, _, _ = layer(tokens, attend, index, text=context)
+            if features_at == index + 1:
+                features = tokens
+        return self.norm_moe_gen(tokens), features
+
+    def _velocity(
+        self, tokens: Tensor, latents: Tensor, sigma: Tensor, clean: Tensor, reference: Tensor | None
+    ) -> Tensor:
+        size = self.config.patch_size
+        emitted = rearrange(
+            self.proj_out(tokens),
+            "b (t v h w) (p q c) -> b v c t (h p) (w q)",
+            v=latents.shape[1],
+            t=latents.shape[3],
+            h=latents.shape[-2] // size,
+            p=size,
+            q=size,
+        )
+        if self.config.prediction != "velocity":
+            if self.config.prediction == "first_frame_residual":
+                if reference is None:
+                    raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
+                emitted = emitted.float() + reference.float()
+            per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
+            divisor = rearrange(per_frame.float().clamp_min(self.config.minimum_sigma), "b t -> b 1 1 t 1 1")
+            emitted = (latents.float() - emitted.float()) / divisor
+        return emitted.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)

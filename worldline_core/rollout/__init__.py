@@ -1,0 +1,1 @@
+"""Predicting videos: Euler integration of the flow, whole clips or block by block, and sets of predicted videos."""

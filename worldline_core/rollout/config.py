@@ -1,0 +1,54 @@
+"""Configuration of the rollout step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from worldline_core.config.base import StrictModel
+from worldline_core.rollout.controls import Controls
+
+
+class RolloutConfig(StrictModel):
+    """Which episodes are predicted, and how."""
+
+    method: str = Field("worldline", min_length=1)
+    """Name the predictions carry in scores and reports."""
+    sampler: Literal["full_clip", "block_causal", "copy_first_frame"] = "block_causal"
+    steps: int | None = Field(None, ge=1)
+    """Euler steps: 35 for a whole clip, 4 a block, unless given."""
+    actions: Controls = "true"
+    seeds: tuple[int, ...] = Field((42,), min_length=1)
+    splits: tuple[str, ...] = ("test",)
+    banks: tuple[str, ...] | None = None
+    """Only episodes of these candidate banks."""
+    embodiments: tuple[str, ...] | None = None
+    max_episodes_per_embodiment: int | None = Field(None, ge=1)
+    num_frames: int = Field(33, ge=5)
+    """Longest prediction; shorter episodes are predicted as far as whole blocks (or groups) go."""
+    batch_size: int = Field(8, ge=1)
+    sink_blocks: int = Field(1, ge=1)
+    recent_blocks: int | None = Field(None, ge=0)
+    """Recent blocks in the cache; by default 3, or fewer where the model was trained on shorter clips."""
+    crf: int = Field(8, ge=0, le=51)
+    bfloat16: bool = True
+    device: str = "cpu"
+
+    @model_validator(mode="after")
+    def _distinct_seeds(self) -> Self:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f"seeds repeat: {self.seeds}")
+        return self
+
+
+@dataclass(frozen=True)
+class Job:
+    """One prediction: an episode, whose controls drive it, a seed, and how many frames it gets."""
+
+    position: int
+    episode_id: str
+    controls_of: str
+    seed: int
+    frames: int

@@ -1,0 +1,159 @@
+"""Sets of predicted videos on disk: one mp4 a view and seed, and an index."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from worldline_core.data.video import decode_video, encode_video
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.atomic import atomic_path
+
+INDEX_FILE = "index.parquet"
+_SCHEMA = pa.schema(
+    [
+        ("episode_id", pa.string()),
+        ("method", pa.string()),
+        ("view", pa.string()),
+        ("seed", pa.int64()),
+        ("path", pa.string()),
+        ("num_frames", pa.int64()),
+        ("height", pa.int64()),
+        ("width", pa.int64()),
+        ("fps", pa.float64()),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class RolloutRow:
+    """One predicted video."""
+
+    episode_id: str
+    method: str
+    view: str
+    seed: int
+    path: str
+    num_frames: int
+    height: int
+    width: int
+    fps: float
+
+
+def video_path(episode_id: str, seed: int, view: str) -> str:
+    """Where a prediction lies in its set; odd characters of the id are replaced and a digest keeps names apart."""
+    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in episode_id)
+    if safe != episode_id or safe.startswith("."):
+        safe = f"{safe.lstrip('.')}-{hashlib.sha256(episode_id.encode()).hexdigest()[:8]}"
+    return f"videos/{safe}/seed-{seed}/{view}.mp4"
+
+
+class RolloutSetWriter:
+    """Writes predictions one by one; :meth:`close` writes the index. Bytes depend on the frames alone."""
+
+    def __init__(self, root: Path, method: str, fps: float, *, crf: int = 8) -> None:
+        self.root = root
+        self.method = method
+        self.fps = fps
+        self.crf = crf
+        self._rows: list[RolloutRow] = []
+
+    def has(self, episode_id: str, seed: int, views: tuple[str, ...]) -> bool:
+        """Whether every video of a prediction is already there (files appear only when whole)."""
+        return all((self.root / video_path(episode_id, seed, view)).is_file() for view in views)
+
+    def add(self, episode_id: str, seed: int, frames: Mapping[str, np.ndarray]) -> None:
+        """Encode ``uint8 (N, H, W, 3)`` frames of every view."""
+        for view, video in frames.items():
+            path = self.root / video_path(episode_id, seed, view)
+            with atomic_path(path) as temporary:
+                # Full chroma and a low factor: metrics should see the prediction, not the codec.
+                encode_video(temporary, video, self.fps, crf=self.crf, pixel_format="yuv444p")
+            self.register(episode_id, seed, view, video.shape[0], (video.shape[1], video.shape[2]))
+
+    def register(self, episode_id: str, seed: int, view: str, num_frames: int, size: tuple[int, int]) -> None:
+        """Enter a video that an earlier, interrupted call has written."""
+        path = video_path(episode_id, seed, view)
+        self._rows.append(RolloutRow(episode_id, self.method, view, seed, path, num_frames, *size, self.fps))
+
+    def close(self) -> None:
+        """Write the index, ordered by episode, seed and view."""
+        rows = sorted(self._rows, key=lambda row: (row.episode_id, row.seed, row.view))
+        table = pa.Table.from_pylist([asdict(row) for row in rows], schema=_SCHEMA)
+        with atomic_path(self.root / INDEX_FILE) as temporary:
+            pq.write_table(table, temporary)
+
+
+class RolloutSet:
+    """Read access to a finished set."""
+
+    def __init__(self, root: Path, rows: list[RolloutRow]) -> None:
+        self.root = root
+        self.rows = rows
+        self.method = rows[0].method
+        self.fps = rows[0].fps
+        self._by_key = {(row.episode_id, row.view, row.seed): row for row in rows}
+
+    @classmethod
+    def open(cls, root: Path) -> RolloutSet:
+        """Open a set.
+
+        Raises:
+            ArtifactError: the index is missing, lacks a column, is empty, or mixes methods.
+        """
+        root = Path(root)
+        path = root / INDEX_FILE
+        if not path.is_file():
+            raise ArtifactError("Not a set of rollouts", where=root, expected=INDEX_FILE, next_step="run rollout")
+        table = pq.read_table(path)
+        if not set(_SCHEMA.names) <= set(table.column_names):
+            raise ArtifactError(
+                "The index of the rollouts lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
+            )
+        rows = [RolloutRow(**row) for row in table.select(_SCHEMA.names).to_pylist()]
+        methods = sorted({row.method for row in rows})
+        if len(methods) != 1:
+            raise ArtifactError("A set of rollouts holds one method", where=path, expected="one", got=methods)
+        return cls(root, rows)
+
+    @property
+    def episode_ids(self) -> list[str]:
+        """Predicted episodes, in order."""
+        return list(dict.fromkeys(row.episode_id for row in self.rows))
+
+    def seeds(self, episode_id: str) -> list[int]:
+        """Seeds an episode was predicted with, ascending."""
+        return sorted({row.seed for row in self.rows if row.episode_id == episode_id})
+
+    def views(self, episode_id: str) -> list[str]:
+        """Views of an episode."""
+        return list(dict.fromkeys(row.view for row in self.rows if row.episode_id == episode_id))
+
+    def frames(self, episode_id: str, view: str, seed: int | None = None) -> np.ndarray:
+        """``uint8 (N, H, W, 3)`` RGB, the conditioning frame first; without a seed, of the smallest one.
+
+        Raises:
+            DataError: there is no such prediction.
+            ArtifactError: its file leads out of the set.
+        """
+        seeds = self.seeds(episode_id)
+        if seed is None and seeds:
+            seed = seeds[0]
+        row = None if seed is None else self._by_key.get((episode_id, view, seed))
+        if row is None:
+            raise DataError(
+                "No such prediction",
+                where=self.root,
+                expected=f"seeds {seeds}, views {self.views(episode_id)}",
+                got=f"episode {episode_id}, view {view}, seed {seed}",
+            )
+        path = (self.root / row.path).resolve()
+        if not path.is_relative_to(self.root.resolve()):
+            raise ArtifactError("A video of the set lies outside of it", where=self.root, got=row.path)
+        return decode_video(path, expected_frames=row.num_frames)
