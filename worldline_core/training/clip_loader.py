@@ -1,0 +1,102 @@
+"""From clip names to tensors: latents, action maps rendered from tracks, text ids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
+from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
+from worldline_core.actions.tracks import ActionTracks
+from worldline_core.errors import ArtifactError
+from worldline_core.training.clip_sampler import PRIMARY, Clip, ClipBatch
+from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.text import TextEncoder
+
+WristProjection = Literal["current_camera", "clip_start_camera"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One micro-batch. Outcome labels are not here on purpose: they never reach the model."""
+
+    clips: tuple[Clip, ...]
+    views: tuple[str, ...]
+    latents: Float[Tensor, "b v c t h w"]
+    action_maps: Float[Tensor, "b v 9 t h w"] | None = None
+    text_ids: Int[Tensor, "b n"] | None = None
+    text_mask: Bool[Tensor, "b n"] | None = None
+
+
+class ClipLoader:
+    """Loads batches of clips from the caches."""
+
+    def __init__(
+        self,
+        store: LatentStore,
+        *,
+        views: tuple[str, ...],
+        tracks: ActionTracks | None = None,
+        text: TextEncoder | None = None,
+        sigma_px_ref: float = 10.0,
+        wrist_projection: WristProjection = "current_camera",
+        device: str = "cpu",
+    ) -> None:
+        self.store = store
+        self.views = views
+        self.tracks = tracks
+        self.text = text
+        self.sigma_px_ref = sigma_px_ref
+        self.wrist_projection: WristProjection = wrist_projection
+        self.device = device
+        self._tracks: dict[str, EpisodeTracks] = {}
+
+    def load(self, batch: ClipBatch) -> Batch:
+        """Read, render and move one batch.
+
+        Raises:
+            ArtifactError: if latents or tracks lack an episode.
+            DataError: if latents are not finite.
+        """
+        rows = [self.store.row(clip.episode_id) for clip in batch.clips]
+        if batch.view is None:
+            views, per_clip = self.views, [self.views] * len(rows)
+        elif batch.view == PRIMARY:
+            # The task-facing view takes the head slot whatever it is called in its source.
+            views, per_clip = (self.views[0],), [(row.primary_view,) for row in rows]
+        else:
+            views, per_clip = (batch.view,), [(batch.view,)] * len(rows)
+        latents = torch.stack(
+            [
+                self.store.clip(clip.episode_id, clip.start, clip.num_frames, clip.stride, names)
+                for clip, names in zip(batch.clips, per_clip, strict=True)
+            ]
+        ).to(self.device)
+        maps = None if self.tracks is None else self.action_maps(batch.clips, views)
+        ids = mask = None
+        if self.text is not None:
+            ids, mask = self.text([row.instruction for row in rows])
+            ids, mask = ids.to(self.device), mask.to(self.device)
+        return Batch(batch.clips, views, latents, maps, ids, mask)
+
+    def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
+        """Maps at latent resolution: latent frame j takes the control of video frame 4 j (method.md section 2)."""
+        cut = []
+        for clip in clips:
+            frames = [clip.start + clip.stride * index for index in latent_frame_indices(clip.num_frames)]
+            tracks = self._episode_tracks(clip.episode_id)
+            cut.append(tracks.clip(frames, wrist_projection=self.wrist_projection, start=clip.start))
+        grid = (self.store.latent_shape[1], self.store.latent_shape[2])
+        tensors = collate_tracks(cut, views=views).to(self.device)
+        return render_action_maps(tensors, cut[0].image_size, grid_size=grid, sigma_px_ref=self.sigma_px_ref)
+
+    def _episode_tracks(self, episode_id: str) -> EpisodeTracks:
+        if self.tracks is None:
+            raise ArtifactError("Action maps were asked for, but there are no action tracks.", where=episode_id)
+        if episode_id not in self._tracks:
+            self._tracks[episode_id] = self.tracks.tracks(episode_id)
+        return self._tracks[episode_id]

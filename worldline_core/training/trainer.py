@@ -1,0 +1,266 @@
+"""The training loop of every stage: optimiser, averages, metrics, and a state from which a killed run continues."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from worldline_core.config.base import StrictModel
+from worldline_core.errors import ConfigError, TrainingError
+from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.metrics_log import MetricsLog
+from worldline_core.training.training_state import STATE_FILE, load_training_state, save_training_state
+
+
+class OptimizerConfig(StrictModel):
+    """AdamW with linear warm-up, a plateau, and an optional linear decay over the last ``decay_steps``."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = Field(default=1e-6, ge=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    decay_steps: int = Field(default=0, ge=0)
+    clip_norm: float = Field(default=1.0, gt=0)
+
+
+class TrainerConfig(StrictModel):
+    """Length, batch and bookkeeping of a run. ``batch_size`` counts clips a device and micro-step."""
+
+    steps: int = Field(ge=1)
+    batch_size: int = Field(default=8, ge=1)
+    accumulation: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0)
+    optimizer: OptimizerConfig = OptimizerConfig()
+    ema_decay: float = Field(default=0.999, ge=0, lt=1)
+    precision: Literal["fp32", "bf16"] = "bf16"
+    device: str = "cpu"
+    log_every: int = Field(default=20, ge=1)
+    validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
+    validation_batches: int = Field(default=4, ge=0)
+    save_every_seconds: float = Field(default=60.0, ge=0)
+    save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters that share a learning-rate multiplier."""
+
+    name: str
+    parameters: Mapping[str, nn.Parameter]
+    multiplier: float = 1.0
+
+
+class NamedClips(Protocol):
+    """A batch says which clips it holds, so that an error can name them."""
+
+    @property
+    def clips(self) -> tuple[Clip, ...]: ...
+
+
+class Objective[BatchT: NamedClips](Protocol):
+    """What a stage minimises. State that changes from step to step (loss scales) is saved with the run."""
+
+    def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]: ...
+
+    def state(self) -> dict[str, Any]: ...
+
+    def load_state(self, state: dict[str, Any]) -> None: ...
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """Averaged weights of the trained parameters, and the last metrics."""
+
+    average: dict[str, Tensor]
+    metrics: dict[str, float]
+
+
+def learning_rate_factor(config: OptimizerConfig, step: int, steps: int) -> float:
+    """Factor on the base rate at ``step`` (0-based) of ``steps``."""
+    warmup = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
+    decay = min(1.0, (steps - step) / config.decay_steps) if config.decay_steps else 1.0
+    return warmup * decay
+
+
+def step_generator(seed: int, index: int, device: str) -> torch.Generator:
+    """The random stream of one micro-step: it depends on (seed, index) only, so nothing has to be carried over."""
+    digest = hashlib.blake2b(f"{seed}/{index}".encode(), digest_size=8).digest()
+    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+
+
+def autocast(config: TrainerConfig) -> AbstractContextManager[object]:
+    """bf16 matrix products where the config asks for them; weights and optimiser stay in float32."""
+    if config.precision == "fp32":
+        return nullcontext()
+    return torch.autocast(torch.device(config.device).type, dtype=torch.bfloat16)
+
+
+def train[BatchT: NamedClips](
+    config: TrainerConfig,
+    *,
+    groups: Sequence[ParameterGroup],
+    objective: Objective[BatchT],
+    load: Callable[[int], BatchT],
+    validate: Callable[[], dict[str, float]] | None,
+    output: Path,
+    identity: Mapping[str, Any],
+    title: str,
+    rank: int = 0,
+    world_size: int = 1,
+) -> TrainingResult:
+    """Train until ``config.steps``; called again with the same ``output``, it continues from the last saved state.
+
+    On a CPU the result does not depend on where a run was interrupted.
+
+    Args:
+        load: micro-step index to batch (a pure function).
+        validate: called with the averaged weights in the model.
+        identity: JSON values that name this run (config, inputs); a state of another run is refused.
+
+    Raises:
+        TrainingError: if the loss or the gradient is not finite.
+        ArtifactError: if a saved state is damaged or belongs to another run.
+    """
+    from tqdm import tqdm
+
+    parameters = {f"{group.name}/{name}": value for group in groups for name, value in group.parameters.items()}
+    if not parameters:
+        raise ConfigError("There is nothing to train.", where=title, expected="at least one trainable parameter")
+    optimizer = _optimizer(config.optimizer, groups)
+    average = ExponentialAverage(parameters, config.ema_decay)
+    fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    state_path = output / STATE_FILE
+    first, sums, count, last = 0, {}, 0, {}
+    if state_path.is_file():
+        facts = load_training_state(state_path, parameters, average, optimizer, fingerprint)
+        first, sums, count, last = facts["step"], facts["sums"], facts["count"], facts["last"]
+        objective.load_state(facts["objective"])
+    log = MetricsLog(output / "metrics.jsonl", first) if rank == 0 else None
+    timings = MetricsLog(output / "run" / "timings.jsonl", first) if rank == 0 else None
+    started = saved_at = time.monotonic()
+    progress = tqdm(total=config.steps, initial=first, desc=title, unit="step", disable=None if rank == 0 else True)
+    for step in range(first, config.steps):
+        factor = learning_rate_factor(config.optimizer, step, config.steps)
+        for slot, group in zip(optimizer.param_groups, groups, strict=True):
+            slot["lr"] = config.optimizer.learning_rate * group.multiplier * factor
+        values, norm = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
+        average.update(step)
+        values["gradient_norm"] = norm
+        sums = {key: sums.get(key, 0.0) + value for key, value in values.items()}
+        count += 1
+        done = step + 1
+        if done % config.log_every == 0 or done == config.steps:
+            last = {key: value / count for key, value in sums.items()}
+            sums, count = {}, 0
+            row = {"step": done, "learning_rate": config.optimizer.learning_rate * factor, **last}
+            seconds = time.monotonic() - started
+            clips = (done - first) * config.batch_size * config.accumulation * world_size
+            if log is not None and timings is not None:
+                log.add(row)
+                timings.add({"step": done, "seconds": seconds, "clips_per_second": clips / seconds})
+            progress.set_postfix(loss=f"{last['loss']:.4f}", refresh=False)
+        due = config.validate_every and done % config.validate_every == 0
+        if validate is not None and (due or done == config.steps):
+            with average.swapped(), torch.no_grad():
+                scores = {f"validation/{key}": value for key, value in validate().items()}
+            last = {**last, **scores}
+            if log is not None:
+                log.add({"step": done, **scores})
+        progress.update(1)
+        by_steps = config.save_every_steps and done % config.save_every_steps == 0
+        if rank == 0 and (by_steps or time.monotonic() - saved_at >= config.save_every_seconds or done == config.steps):
+            facts = {
+                "step": done,
+                "fingerprint": fingerprint,
+                "sums": sums,
+                "count": count,
+                "last": last,
+                "objective": objective.state(),
+            }
+            save_training_state(state_path, parameters, average, optimizer, facts)
+            saved_at = time.monotonic()
+    progress.close()
+    names = [name for group in groups for name in group.parameters]
+    return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
+
+
+def process_rank() -> tuple[int, int]:
+    """(rank, world size) as torchrun sets them; (0, 1) otherwise. Joins the process group when there is one."""
+    world_size = int(os.environ.get("WORLD_SIZE", "1"))
+    rank = int(os.environ.get("RANK", "0"))
+    if world_size > 1 and not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return rank, world_size
+
+
+def _optimizer(config: OptimizerConfig, groups: Sequence[ParameterGroup]) -> torch.optim.AdamW:
+    return torch.optim.AdamW(
+        [
+            {"params": list(group.parameters.values()), "lr": config.learning_rate * group.multiplier}
+            for group in groups
+        ],
+        betas=config.betas,
+        weight_decay=config.weight_decay,
+        fused=True,
+    )
+
+
+def _step[BatchT: NamedClips](
+    config: TrainerConfig,
+    objective: Objective[BatchT],
+    load: Callable[[int], BatchT],
+    optimizer: torch.optim.Optimizer,
+    parameters: Mapping[str, nn.Parameter],
+    step: int,
+    title: str,
+    rank: int,
+    world_size: int,
+) -> tuple[dict[str, float], float]:
+    """One optimiser step; returns the mean metrics of its micro-steps and the gradient norm before clipping."""
+    optimizer.zero_grad(set_to_none=True)
+    totals: dict[str, float] = {}
+    for part in range(config.accumulation):
+        index = step * config.accumulation + part
+        batch = load(index)
+        generator = step_generator(config.seed, index * world_size + rank, config.device)
+        with autocast(config):
+            loss, values = objective.loss(batch, generator, step)
+        if not math.isfinite(loss.item()):
+            raise TrainingError(
+                "The loss is not finite.",
+                where=f"{title}, step {step}, clips {', '.join(clip.episode_id for clip in batch.clips)}",
+                expected="a finite loss",
+                got=loss.item(),
+                next_step="lower the learning rate, or look at these clips; the last saved state is from before",
+            )
+        (loss / config.accumulation).backward()
+        for key, value in {"loss": loss.item(), **values}.items():
+            totals[key] = totals.get(key, 0.0) + value / config.accumulation
+    if world_size > 1:
+        for parameter in parameters.values():
+            if parameter.grad is not None:
+                torch.distributed.all_reduce(parameter.grad)
+                parameter.grad /= world_size
+    norm = float(nn.utils.clip_grad_norm_(parameters.values(), config.optimizer.clip_norm))
+    if not math.isfinite(norm):
+        raise TrainingError(
+            "The gradient is not finite.",
+            where=f"{title}, step {step}",
+            got=norm,
+            next_step="lower the learning rate or the clipping norm",
+        )
+    optimizer.step()
+    return totals, norm

@@ -1,0 +1,103 @@
+"""Everything that a killed training run needs to go on bit by bit: one safetensors file, replaced atomically."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from worldline_core.errors import ArtifactError
+from worldline_core.store.atomic import atomic_path
+from worldline_core.training.exponential_average import ExponentialAverage
+
+STATE_FILE = Path("run") / "training_state" / "state.safetensors"
+
+
+def save_training_state(
+    path: Path,
+    parameters: Mapping[str, nn.Parameter],
+    average: ExponentialAverage,
+    optimizer: torch.optim.Optimizer,
+    facts: Mapping[str, Any],
+) -> None:
+    """Write weights, averages, optimizer moments and the random state; ``facts`` (JSON) go into the file's header."""
+    tensors: dict[str, Tensor] = {"random_state": torch.get_rng_state()}
+    for name, parameter in parameters.items():
+        tensors[f"weight/{name}"] = parameter.detach()
+        tensors[f"average/{name}"] = average.average[name]
+        for key, value in optimizer.state.get(parameter, {}).items():
+            tensors[f"{key}/{name}"] = value
+    with atomic_path(path) as temporary:
+        save_file(
+            {name: tensor.cpu().contiguous() for name, tensor in tensors.items()},
+            temporary,
+            metadata={"facts": json.dumps(facts)},
+        )
+
+
+def read_training_facts(path: Path) -> dict[str, Any]:
+    """The JSON facts of a state file.
+
+    Raises:
+        ArtifactError: if it is damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as stored:
+            return json.loads((stored.metadata() or {})["facts"])
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise ArtifactError(
+            "The training state is damaged.",
+            where=path,
+            got=repr(error),
+            next_step="delete it to start this run again",
+        ) from error
+
+
+@torch.no_grad()
+def load_training_state(
+    path: Path,
+    parameters: Mapping[str, nn.Parameter],
+    average: ExponentialAverage,
+    optimizer: torch.optim.Optimizer,
+    fingerprint: str,
+) -> dict[str, Any]:
+    """Fill everything from a state file and return its facts.
+
+    Raises:
+        ArtifactError: if it is damaged, or belongs to a run with another configuration or model.
+    """
+    facts = read_training_facts(path)
+    if facts["fingerprint"] != fingerprint:
+        raise ArtifactError(
+            "The training state belongs to another run.",
+            where=path,
+            expected=fingerprint,
+            got=facts["fingerprint"],
+            next_step="use another output folder, or delete this training state",
+        )
+    with safe_open(path, framework="pt") as stored:
+        names = set(stored.keys())
+        missing = [name for name in parameters if f"weight/{name}" not in names]
+        if missing:
+            raise ArtifactError("The training state lacks weights.", where=path, got=missing[:5])
+        for name, parameter in parameters.items():
+            parameter.copy_(stored.get_tensor(f"weight/{name}"))
+            slots = {
+                key: stored.get_tensor(f"{key}/{name}")
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{key}/{name}" in names
+            }
+            if slots:
+                optimizer.state[parameter] = {
+                    key: value if key == "step" and parameter.device.type == "cpu" else value.to(parameter.device)
+                    for key, value in slots.items()
+                }
+        average.load({name: stored.get_tensor(f"average/{name}") for name in parameters})
+        torch.set_rng_state(stored.get_tensor("random_state"))
+    return facts

@@ -1,0 +1,49 @@
+"""Losses on held-out clips: always the same clips, noise and noise levels."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+from worldline_core.training.clip_loader import ClipLoader
+from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.latent_store import LatentRow, LatentStore
+from worldline_core.training.objective import FlowMatchingObjective
+from worldline_core.training.trainer import TrainerConfig, autocast, step_generator
+
+logger = logging.getLogger(__name__)
+VALIDATION_SEED = 20_000
+
+
+def validation_function(
+    store: LatentStore,
+    clips: ClipSampling,
+    splits: Sequence[str],
+    trainer: TrainerConfig,
+    rows: Sequence[LatentRow],
+    loader: ClipLoader,
+    objective: FlowMatchingObjective,
+) -> Callable[[], dict[str, float]] | None:
+    """A function that measures the held-out losses, or None (said in the log) where there are no such clips."""
+    longest = max(clips.lengths) - 1
+    held_out = [row for row in rows if row.split in splits and row.num_frames > longest * max(clips.strides)]
+    if not held_out or not trainer.validation_batches:
+        logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", longest + 1, splits)
+        return None
+    # At least two clips, so that "shuffled actions" are another clip's.
+    size = max(2, trainer.batch_size)
+    sampler = ClipSampler(store, clips, splits=splits, batch_size=size, seed=VALIDATION_SEED, rows=held_out)
+
+    def validate() -> dict[str, float]:
+        totals: dict[str, float] = {}
+        objective.model.eval()
+        for index in range(trainer.validation_batches):
+            batch = loader.load(sampler.clips(index))
+            with autocast(trainer):
+                values = objective.validation_losses(batch, step_generator(VALIDATION_SEED, index, trainer.device))
+            for key, value in values.items():
+                totals[key] = totals.get(key, 0.0) + value / trainer.validation_batches
+        objective.model.train()
+        return totals
+
+    return validate
