@@ -125,6 +125,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command."""
     from tasks.command_line import exit_with_clear_errors
 
+    # Threads that spin at barriers take the cores from the video decoders beside them. Read when torch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = build_parser().parse_args(argv)
     exit_with_clear_errors(lambda: arguments.run(arguments))
 

@@ -85,3 +85,8 @@ def test_unknown_preset_lists_those_there_are() -> None:
     assert "tiny" in preset_names()
     with pytest.raises(ConfigError, match="did you mean 'tiny'"):
         preset_path("tinny")
+
+
+def test_anchors_and_merges_work(tmp_path: Path) -> None:
+    text = "a: &one {steps: 1, rate: 2.0}\nb: {<<: *one, rate: 3.0}\n"
+    assert read_yaml(_write(tmp_path, text)) == {"a": {"steps": 1, "rate": 2.0}, "b": {"steps": 1, "rate": 3.0}}

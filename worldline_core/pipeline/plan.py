@@ -64,7 +64,7 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
         yield Node("render_actions.banks", "render_actions", config.render_actions, {"episodes": "curate.banks"})
     for name, run in config.rollouts.items():
         yield _rollout_node(name, run, models)
-    yield from _evaluation_nodes(config, models)
+    yield from _evaluation_nodes(config, models, project)
 
 
 def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path]) -> Node:
@@ -84,7 +84,7 @@ def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path]) -> Nod
     return Node(f"rollout.{name}", "rollout", run.config, inputs)
 
 
-def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path]) -> Iterator[Node]:
+def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], project: Path) -> Iterator[Node]:
     segmenter: dict[str, str | Path] = {"segmenter": models["segmenter"]} if "segmenter" in models else {}
 
     def rollouts(episodes: str) -> dict[str, str | Path]:
@@ -106,6 +106,9 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path]) -> Ite
             **segmenter,
             **banks,
         }
+        # Outcomes stay with the recordings and are opened after the choice: curation never sees them.
+        if config.curate_banks is not None:
+            inputs["sealed"] = project / config.curate_banks.sources[0].path
         yield Node("evaluate_planning", "evaluate_planning", config.evaluate_planning, inputs)
         scores["evaluate_planning"] = "evaluate_planning"
     trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")

@@ -189,7 +189,7 @@ _STEPS = (
         "evaluate_planning",
         "PlanningConfig",
         ("banks", "rollouts.*"),
-        ("tracks", "segmenter"),
+        ("tracks", "segmenter", "sealed"),
         summary="bracket selection among candidate controls, success of the choice",
     ),
     Step(

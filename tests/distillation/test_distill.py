@@ -1,0 +1,333 @@
+"""The whole distill step on random weights and latents: its result, its resumption after kills, its refusals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from pydantic import ValidationError
+from safetensors.torch import save_file
+
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.tracks import ActionTracks, write_index, write_shard
+from worldline_core.data import episode_index
+from worldline_core.distillation import objectives, trajectory_store
+from worldline_core.distillation.batches import robot_masks
+from worldline_core.distillation.config import DistillConfig
+from worldline_core.distillation.distill import distill
+from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError
+from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.store.digest import digest_file, folder_files
+from worldline_core.training.clip_loader import ClipLoader
+from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.latent_store import LatentStore, clip_key
+
+VIEWS = ("head", "left_wrist", "right_wrist")
+FRAMES = 21
+EPISODES = {"a": "train", "b": "train", "c": "validation"}
+IMAGE = (32, 32)
+CONTRACT = {
+    "sigma_px_ref": 40.0,
+    "wrist_projection": "current_camera",
+    "tokenizer": "0123",
+    "grid_size": [4, 4],
+}
+
+
+def write_latents(root: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    root.mkdir()
+    tensors = {
+        clip_key(name, 1, start): torch.randn(3, 4, 1 + (FRAMES - 1 - start) // 4, 4, 4, generator=generator).half()
+        for name in EPISODES
+        for start in range(0, FRAMES, 4)
+    }
+    save_file(tensors, root / "00000.safetensors")
+    rows = [
+        {
+            "episode_id": name,
+            "shard": "00000.safetensors",
+            "num_frames": FRAMES,
+            "views": list(VIEWS),
+            "source": "test",
+            "embodiment": "test",
+            "split": split,
+            "instruction": "",
+            "primary_view": "head",
+        }
+        for name, split in EPISODES.items()
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), root / "index.parquet")
+    description = {
+        "layout": "clips",
+        "start_step": 4,
+        "strides": [1],
+        "tokenizer": "0123",
+        "latent_shape": [4, 4, 4],
+        "image_size": list(IMAGE),
+    }
+    (root / "store.json").write_text(json.dumps(description))
+
+
+def tracks_of(name: str) -> EpisodeTracks:
+    """One arm that moves to the right, one metre in front of the head camera; the right wrist is not calibrated."""
+    random = np.random.default_rng(len(name))
+    K = np.stack([np.array([[32.0, 0, 15.5], [0, 32.0, 15.5], [0, 0, 1]])] * 3)
+    K[2] = np.nan
+    position = np.stack([np.linspace(-0.4, 0.4, FRAMES), np.zeros(FRAMES), np.ones(FRAMES)], axis=-1)
+    capsules = np.stack([position, position + np.array([0.0, 0.2, 0.0])], axis=1)[:, None]
+    cameras = np.broadcast_to(np.eye(4), (FRAMES, 3, 4, 4))
+    tools = np.broadcast_to(np.eye(4), (FRAMES, 1, 4, 4))
+    shape = (FRAMES, 3, 1)
+    return EpisodeTracks(
+        episode_id=name,
+        embodiment="test",
+        views=VIEWS,
+        arms=("right",),
+        image_size=IMAGE,
+        controls="action",
+        camera_motion=("static", "recorded", "absent"),
+        uv=random.uniform(0, 32, (*shape, 2)).astype(np.float32),
+        depth=np.ones(shape, np.float32),
+        rot6d=np.ones((*shape, 6), np.float32),
+        gripper=np.ones(shape, np.float32),
+        valid=np.ones(shape, bool),
+        T_base_tool=tools.astype(np.float32),
+        T_base_camera=cameras.astype(np.float32),
+        K=K.astype(np.float32),
+        capsules=capsules.astype(np.float32),
+        capsule_radii=np.array([0.05], np.float32),
+    )
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, make_model: Callable) -> dict[str, Path]:
+    folders = {name: tmp_path / name for name in ("latents", "tracks", "episodes", "stage2", "tokenizer", "stage1")}
+    write_latents(folders["latents"])
+    folders["tracks"].mkdir()
+    write_index(folders["tracks"], write_shard(folders["tracks"], 0, [tracks_of(name) for name in EPISODES]))
+    folders["episodes"].mkdir()
+    rows = [
+        episode_index.EpisodeRow(
+            episode_id=name,
+            dataset="datasets/test",
+            episode_index=number,
+            start=0,
+            stop=FRAMES,
+            num_frames=FRAMES,
+            video_frames=FRAMES,
+            fps=8.0,
+            source="test",
+            embodiment="test",
+            scene="s",
+            task_family="grasp",
+            instruction="",
+            outcome="success",
+            split=split,
+            views=VIEWS,
+            bank=None,
+            candidate=None,
+            primary_view="head",
+        )
+        for number, (name, split) in enumerate(EPISODES.items())
+    ]
+    episode_index.write_index(folders["episodes"], rows)
+    for kind in ("stage1", "stage2"):
+        save_checkpoint(folders[kind], make_model(0), kind=kind, action_contract=CONTRACT)
+    return folders
+
+
+def trainer(steps: int, **changes: object) -> dict[str, object]:
+    return {
+        "steps": steps,
+        "batch_size": 2,
+        "precision": "fp32",
+        "log_every": 6,
+        "validation_batches": 1,
+        "save_every_seconds": 3600,
+        "save_every_steps": 2,
+        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
+        **changes,
+    }
+
+
+def config(**distribution_matching: object) -> DistillConfig:
+    return DistillConfig.model_validate(
+        {
+            "clips": {"lengths": [17]},
+            "block_size": 2,
+            "teacher_forcing": {"trainer": trainer(3), "history_noise": 0.1},
+            "trajectory_regression": {
+                "trainer": trainer(3),
+                "trajectories": {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]},
+            },
+            "distribution_matching": {"trainer": trainer(12), **distribution_matching},
+        }
+    )
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): digest_file(path) for path in folder_files(folder)}
+
+
+def test_three_steps_give_a_causal_checkpoint(inputs: dict[str, Path], tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    counts = distill(config(), inputs, output)
+    model, info = load_checkpoint(output, expect_kind="causal", action_contract=CONTRACT)
+    assert info.metadata["distillation"] == "distribution_matching"
+    assert info.metadata["sigmas"] == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
+    assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
+    assert counts["episodes"] == 2
+    json.dumps(counts, allow_nan=False)
+    start, _ = load_checkpoint(inputs["stage2"])
+    changed = [not torch.equal(a, b) for a, b in zip(model.parameters(), start.parameters(), strict=True)]
+    assert all(changed)
+    for step in ("teacher_forcing", "trajectory_regression", "distribution_matching"):
+        rows = [json.loads(line) for line in (output / step / "metrics.jsonl").read_text().splitlines()]
+        assert rows[-1]["validation/rollout_error"] > 0
+        assert f"{step}/validation/rollout_error" in counts
+        if step != "distribution_matching":
+            load_checkpoint(output / step, expect_kind="causal")
+    losses = [row for row in rows if "fake_score" in row]
+    assert {"distribution_matching", "robot", "robot_motion", "anchor", "boundary"} <= set(losses[-1])
+    index = json.loads((output / "trajectory_regression" / "trajectories.json").read_text())
+    assert len(index["shards"]) == 2
+
+
+def test_a_finished_run_is_read_not_repeated(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "out"
+    counts = distill(config(), inputs, output)
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("trained again")
+
+    monkeypatch.setattr("worldline_core.distillation.stage.train", refuse)
+    assert distill(config(), inputs, output) == counts
+
+
+class KilledError(Exception):
+    pass
+
+
+def killing(function: Callable, at_call: int) -> Callable:
+    """The function, but its call number `at_call` raises, as a kill at this moment would end it."""
+    calls = 0
+
+    def wrapped(*args: object, **kwargs: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == at_call:
+            raise KilledError("killed")
+        return function(*args, **kwargs)
+
+    return wrapped
+
+
+@pytest.mark.parametrize("real_score", ["stage2", "causal_teacher"])
+def test_a_run_killed_anywhere_ends_with_the_same_bytes(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
+) -> None:
+    settings = config(real_score=real_score)
+    distill(settings, inputs, tmp_path / "whole")
+    kills = [
+        (objectives.TeacherForcingObjective, "loss", 3),
+        (trajectory_store, "write_bytes_atomic", 2),
+        (objectives.TrajectoryObjective, "loss", 3),
+        (objectives.DistributionMatchingObjective, "loss", 8),
+    ]
+    for owner, name, call in kills:
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, killing(getattr(owner, name), call))
+            with pytest.raises(KilledError, match="killed"):
+                distill(settings, inputs, tmp_path / "killed")
+    distill(settings, inputs, tmp_path / "killed")
+    assert digests(tmp_path / "killed") == digests(tmp_path / "whole")
+
+
+def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model: Callable) -> None:
+    model = make_model(0)
+    objective = objectives.DistributionMatchingObjective(model, make_model(1), make_model(2), config(), None)
+    steps = [objective.exit_step(step) for step in range(60)]
+    assert steps == [objective.exit_step(step) for step in range(60)]
+    assert set(steps) == {0, 1, 2, 3}
+
+
+def test_an_iteration_changes_one_of_the_two_models(inputs: dict[str, Path], tmp_path: Path) -> None:
+    settings = config()
+    distill(settings, inputs, tmp_path / "out")
+    rows = (tmp_path / "out" / "distribution_matching" / "metrics.jsonl").read_text().splitlines()
+    first = json.loads(rows[0])
+    # Scaled by their share of the iterations: the mean over a cycle is the mean of the updates that report them.
+    assert first["loss"] == pytest.approx(
+        (
+            5 * first["fake_score"]
+            + first["distribution_matching"]
+            + 0.005 * first["anchor"]
+            + 0.05 * first["boundary"]
+            + 0.005 * first["robot"]
+            + 0.1 * first["robot_motion"]
+        )
+        / 6,
+        rel=1e-4,
+    )
+
+
+def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[str, Path]) -> None:
+    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=VIEWS, tracks=ActionTracks.open(inputs["tracks"]))
+    masks = robot_masks(loader, [Clip("a", 0, 17, 1), Clip("b", 4, 17, 1)], VIEWS)
+    assert masks.shape == (2, 3, 5, 4, 4)
+    assert set(masks.unique().tolist()) == {0.0, 1.0}
+    assert not bool(masks[:, 2].any())
+    columns = torch.arange(4.0)
+    centre = [(masks[0, 0, t].amax(0) * columns).sum() / masks[0, 0, t].amax(0).sum() for t in (0, 4)]
+    assert centre[1] > centre[0]
+
+
+def test_clips_must_be_whole_blocks(inputs: dict[str, Path], tmp_path: Path) -> None:
+    broken = config().model_copy(update={"block_size": 4})
+    with pytest.raises(ConfigError, match="one observed frame and whole blocks"):
+        distill(broken.model_copy(update={"block_size": 3}), inputs, tmp_path / "out")
+
+
+def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="wrong kind"):
+        distill(config(), {**inputs, "stage2": inputs["stage1"]}, tmp_path / "out")
+    description = json.loads((inputs["latents"] / "store.json").read_text())
+    (inputs["latents"] / "store.json").write_text(json.dumps({**description, "tokenizer": "other"}))
+    with pytest.raises(CheckpointError, match="action contract differs"):
+        distill(config(), inputs, tmp_path / "out2")
+
+
+def test_distribution_matching_runs_whole_cycles() -> None:
+    with pytest.raises(ValidationError, match="multiples of 6"):
+        DistillConfig.model_validate({"distribution_matching": {"trainer": trainer(10)}})
+    with pytest.raises(ValidationError, match="must rise"):
+        DistillConfig.model_validate({"distribution_matching": {"sigma_range": [0.9, 0.1]}})
+
+
+def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path) -> None:
+    nodes = torch.randn(2, 5, 3, 4, 4, 2, 2, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(2, 3, 5, 2, 2)
+
+    def make(number: int) -> tuple[list[Clip], torch.Tensor, torch.Tensor]:
+        return [Clip("a", number, 17, 1), Clip("b", number, 17, 1)], nodes + number, mask
+
+    with pytest.raises(ArtifactError, match="Not a folder of finished"):
+        TrajectoryStore.open(tmp_path)
+    write_trajectories(tmp_path, 2, make, {"seed": 1})
+    store = TrajectoryStore.open(tmp_path)
+    assert len(store) == 4
+    assert store.clips([3, 0]) == (Clip("b", 1, 17, 1), Clip("a", 0, 17, 1))
+    torch.testing.assert_close(store.nodes([3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
+    assert store.masks([1]).dtype == torch.float32
+    with pytest.raises(ArtifactError, match="other settings"):
+        write_trajectories(tmp_path, 2, make, {"seed": 2})

@@ -1,0 +1,205 @@
+"""Distribution matching: direction of the gradient, who receives it, the schedule, and the student's own rollouts."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from worldline_core.distillation.causal_history import CacheWindow
+from worldline_core.distillation.distribution_matching import (
+    causal_score,
+    distribution_gradient,
+    distribution_matching_loss,
+    fake_score_loss,
+    full_clip_score,
+    is_student_iteration,
+    self_forced_rollout,
+)
+from worldline_core.errors import ConfigError
+from worldline_core.rollout.block_causal import BlockCausalSimulator
+from worldline_core.rollout.euler import Noise
+from worldline_core.training.flow_matching import LossWeighting
+
+
+def gaussian_score(mean: torch.Tensor):
+    """Velocity of data that is a single point: x0 is `mean`, so v = (x_t - mean) / sigma."""
+
+    def velocity(noisy: torch.Tensor, clean: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
+        level = sigma.repeat_interleave(2, dim=1)[:, None, None, :, None, None]
+        answer = torch.zeros_like(noisy)
+        answer[..., 1:, :, :] = (noisy - mean)[..., 1:, :, :] / level
+        return answer
+
+    return velocity
+
+
+def rollout(model, clip, exit_step: int = 3, **options):
+    return self_forced_rollout(
+        model,
+        clip.latents[..., :1, :, :],
+        options.pop("maps", clip.maps),
+        options.pop("noise", clip.noise),
+        exit_step,
+        views=clip.views,
+        block_size=clip.block_size,
+        window=CacheWindow(),
+        with_gradient=options.pop("with_gradient", False),
+    )
+
+
+def test_five_fake_score_updates_then_one_of_the_student() -> None:
+    kinds = [is_student_iteration(i) for i in range(12)]
+    assert kinds == ([False] * 5 + [True]) * 2
+
+
+def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(clip) -> None:
+    generated = clip.latents.clone().requires_grad_()
+    real_mean, fake_mean = clip.latents + 1.0, clip.latents - 1.0
+    sigma = torch.full((2, 2), 0.5)
+    gradient = distribution_gradient(
+        gaussian_score(real_mean), gaussian_score(fake_mean), generated, clip.noise, sigma, clip.block_size
+    )
+    # (x - (z + 1)) / s - (x - (z - 1)) / s = -2 / s
+    torch.testing.assert_close(gradient[..., 1:, :, :], torch.full_like(gradient[..., 1:, :, :], -4.0))
+    assert not bool(gradient[..., :1, :, :].any())
+    distribution_matching_loss(generated, gradient).backward()
+    step = -generated.grad[..., 1:, :, :]
+    assert bool((step > 0).all())  # descending the loss moves every value up, to the mean of the real score
+    assert not bool(generated.grad[..., :1, :, :].any())
+
+
+def test_equal_scores_leave_the_student_alone(clip) -> None:
+    generated = clip.latents.clone().requires_grad_()
+    score = gaussian_score(clip.latents)
+    gradient = distribution_gradient(score, score, generated, clip.noise, torch.full((2, 2), 0.3), clip.block_size)
+    loss = distribution_matching_loss(generated, gradient)
+    loss.backward()
+    assert loss.item() == 0
+    assert not bool(generated.grad.any())
+
+
+@pytest.mark.parametrize("score", [causal_score, full_clip_score])
+def test_a_student_update_reaches_the_student_alone(make_model, clip, score) -> None:
+    student, real, fake = make_model(0), make_model(1), make_model(2)
+    options = {"views": clip.views, "block_size": clip.block_size}
+    generated = rollout(student, clip, 1, with_gradient=True)
+    gradient = distribution_gradient(
+        score(real, clip.maps, **options),
+        score(fake, clip.maps, **options),
+        generated,
+        clip.noise,
+        torch.full((2, 2), 0.6),
+        clip.block_size,
+    )
+    distribution_matching_loss(generated, gradient).backward()
+    assert all(parameter.grad is None for model in (real, fake) for parameter in model.parameters())
+    assert any(bool(parameter.grad.any()) for parameter in student.parameters() if parameter.grad is not None)
+
+
+def test_a_fake_score_update_reaches_the_fake_score_alone(make_model, clip) -> None:
+    student, fake = make_model(0), make_model(2)
+    generated = rollout(student, clip)
+    assert not generated.requires_grad
+    score = causal_score(fake, clip.maps, views=clip.views, block_size=clip.block_size)
+    fake_score_loss(
+        score,
+        generated,
+        clip.noise.flip(0),
+        torch.full((2, 2), 0.6),
+        block_size=clip.block_size,
+        weighting=LossWeighting(),
+    ).backward()
+    assert all(parameter.grad is None for parameter in student.parameters())
+    assert all(parameter.grad is not None for parameter in fake.parameters())
+
+
+def test_only_the_exit_pass_carries_a_gradient(make_model, clip) -> None:
+    student = make_model(0)
+    calls: list[bool] = []
+    original = student.forward
+
+    def watched(*args, **kwargs):
+        calls.append(torch.is_grad_enabled())
+        return original(*args, **kwargs)
+
+    student.forward = watched
+    rollout(student, clip, 2, with_gradient=True)
+    # observed frame; block 1: nodes 0, 1, then the exit; its cache write; block 2: nodes 0, 1, exit (not cached)
+    assert calls == [False, False, False, True, False, False, False, True]
+
+
+def test_no_gradient_flows_through_the_cache(make_model, clip) -> None:
+    student = make_model(0)
+    noise = clip.noise.clone().requires_grad_()
+    generated = rollout(student, clip, 0, noise=noise, with_gradient=True)
+    generated[..., 3:, :, :].sum().backward()
+    assert bool(noise.grad[..., 3:, :, :].any())
+    assert not bool(noise.grad[..., 1:3, :, :].any())
+
+
+def test_the_rollout_is_causal(make_model, clip) -> None:
+    student = make_model(0)
+    maps, noise = clip.maps.clone(), clip.noise.clone()
+    maps[..., 3:, :, :] += 1.0
+    noise[..., 3:, :, :] += 1.0
+    before, after = rollout(student, clip), rollout(student, clip, maps=maps, noise=noise)
+    assert torch.equal(before[..., :3, :, :], after[..., :3, :, :])
+    assert not torch.allclose(before[..., 3:, :, :], after[..., 3:, :, :])
+
+
+def test_memory_of_the_history_does_not_grow_with_the_rollout(make_model, clip) -> None:
+    from worldline_core.distillation.causal_history import CausalHistory
+
+    history = CausalHistory(make_model(0), clip.views, CacheWindow(sink_blocks=1, recent_blocks=2))
+    history.remember(clip.latents[..., :1, :, :], clip.maps[..., :1, :, :])
+    sizes = []
+    for _ in range(6):
+        history.remember(clip.latents[..., 1:3, :, :], clip.maps[..., 1:3, :, :])
+        sizes.append(history.cache.nbytes)
+    assert sizes[0] < sizes[1] == sizes[2] == sizes[-1]
+
+
+def test_an_exit_step_outside_of_the_schedule_is_refused(make_model, clip) -> None:
+    with pytest.raises(ConfigError, match="No such exit step"):
+        rollout(make_model(0), clip, 4)
+
+
+@pytest.mark.parametrize("window", [CacheWindow(), CacheWindow(recent_blocks=0)])
+def test_rollout_equals_the_block_causal_sampler(make_model, clip, window: CacheWindow) -> None:
+    student = make_model(0)
+    simulator = BlockCausalSimulator(
+        student,
+        noise=Noise([1, 2]),
+        block_size=clip.block_size,
+        sink_blocks=window.sink_blocks,
+        recent_blocks=window.recent_blocks,
+        views=clip.views,
+    )
+    simulator.start(clip.latents[:, :, :, 0], clip.maps[:, :, :, :1])
+    predicted = [simulator.step(clip.maps[..., start : start + 2, :, :]) for start in (1, 3)]
+    same_noise = Noise([1, 2])
+    drawn = [same_noise.draw((3, 4, 2, 4, 4)) for _ in predicted]
+    generated = self_forced_rollout(
+        student,
+        clip.latents[..., :1, :, :],
+        clip.maps,
+        torch.cat((clip.noise[..., :1, :, :], *drawn), dim=3),
+        3,
+        views=clip.views,
+        block_size=clip.block_size,
+        window=window,
+        with_gradient=False,
+    )
+    assert torch.equal(generated[..., 1:, :, :], torch.cat(predicted, dim=3))
+
+
+def test_residual_predicting_students_generate_and_learn_as_well(make_model, clip) -> None:
+    student, real, fake = (make_model(seed, prediction="first_frame_residual") for seed in range(3))
+    generated = rollout(student, clip, 2, with_gradient=True)
+    sigma = torch.full((2, 2), 0.4)
+    scores = [full_clip_score(m, clip.maps, views=clip.views, block_size=2) for m in (real, fake)]
+    gradient = distribution_gradient(*scores, generated, clip.noise, sigma, clip.block_size)
+    loss = distribution_matching_loss(generated, gradient)
+    loss.backward()
+    assert bool(loss.isfinite())
+    assert any(bool(parameter.grad.any()) for parameter in student.parameters() if parameter.grad is not None)

@@ -1,0 +1,110 @@
+"""A small world with known outcomes: a dark gripper over a grey table, a red cube, three views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from worldline_core.actions.tracks import write_index, write_shard
+from worldline_core.data.episode import VIEWS, Episode
+from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.rollout.rollout_set import RolloutSetWriter
+
+NUM_FRAMES = 17
+HEIGHT, WIDTH = 48, 72
+FPS = 8.0
+
+
+@dataclass(frozen=True)
+class SmallWorld:
+    """Folders of the inputs of the evaluation steps, and what each episode shows."""
+
+    inputs: dict[str, Path]
+    outcomes: dict[str, str]
+
+
+def film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Frames by view, exact head masks, tool points of one attempt to lift the red cube."""
+    generator = np.random.default_rng(seed)
+    column = int(generator.integers(20, 50))
+    head = np.full((NUM_FRAMES, HEIGHT, WIDTH, 3), (120, 116, 110), dtype=np.uint8)
+    head += generator.integers(0, 6, head.shape[1:], dtype=np.uint8)
+    masks = np.zeros(head.shape[:3], dtype=bool)
+    wrist = np.full_like(head, 100)
+    points = np.zeros((NUM_FRAMES, 1, 2))
+    for frame in range(NUM_FRAMES):
+        down = np.clip(frame / 8, 0, 1)
+        up = np.clip((frame - 8) / 6, 0, 1)
+        tip = round(14 + 17 * down - 16 * up)
+        cube_top = 32 - (round(16 * up) if success else 0)
+        head[frame, cube_top : cube_top + 7, column : column + 7] = (220, 20, 20)
+        masks[frame, max(0, tip - 12) : tip, column - 3 : column + 10] = True
+        for finger in (column - 3, column + 7):
+            masks[frame, tip : tip + 5, finger : finger + 3] = True
+        head[frame][masks[frame]] = (25, 25, 28)
+        points[frame, 0] = (column + 3, tip - 6)
+        if frame < 9 or success:
+            wrist[frame, 20:44, 24:48] = (220, 20, 20)
+    return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
+
+
+def _tracks(episode_id: str, points: np.ndarray) -> SimpleNamespace:
+    views = len(VIEWS)
+    uv = np.zeros((NUM_FRAMES, views, 1, 2))
+    uv[:, 0] = points
+    valid = np.zeros((NUM_FRAMES, views, 1), dtype=bool)
+    valid[:, 0] = True
+    return SimpleNamespace(
+        episode_id=episode_id, embodiment="box_arm", num_frames=NUM_FRAMES, views=VIEWS, arms=("right",),
+        image_size=(HEIGHT, WIDTH), controls="action", camera_motion=("static",) * views, uv=uv, valid=valid,
+        depth=np.ones((NUM_FRAMES, views, 1)), rot6d=np.zeros((NUM_FRAMES, views, 1, 6)),
+        gripper=np.zeros((NUM_FRAMES, views, 1)), T_base_tool=np.tile(np.eye(4), (NUM_FRAMES, 1, 1, 1)),
+        T_base_camera=np.tile(np.eye(4), (NUM_FRAMES, views, 1, 1)), K=np.tile(np.eye(3), (views, 1, 1)),
+        capsules=np.zeros((NUM_FRAMES, 1, 2, 3)), capsule_radii=np.ones(1),
+    )  # fmt: skip
+
+
+def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) -> SmallWorld:
+    episodes, tracks = root / "episodes", root / "tracks"
+    methods = {"good": root / "good", "copy": root / "copy"}
+    writers = {name: RolloutSetWriter(path, name, FPS) for name, path in methods.items()}
+    index = []
+    with EpisodeSetWriter(episodes, fps=FPS, image_size=(HEIGHT, WIDTH), pixel_format="yuv444p") as writer:
+        for number, (episode_id, success) in enumerate(cases.items()):
+            frames, masks, points = film(success, seed=0 if bank else number)
+            state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
+            episode = Episode(
+                episode_id=episode_id, source="test", embodiment="box_arm", scene=f"scene_{number % 2}",
+                task_family="lift", instruction="lift the red cube",
+                outcome="unknown" if bank else ("success" if success else "failure"), split=split, fps=FPS,
+                state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
+                candidate=number if bank else None,
+            )  # fmt: skip
+            writer.add(episode, frames, {"head": masks})
+            index += write_shard(tracks, number, [_tracks(episode_id, points)])
+            writers["good"].add(episode_id, 0, frames)
+            writers["copy"].add(episode_id, 0, {view: np.repeat(video[:1], NUM_FRAMES, 0) for view, video in frames.items()})
+    write_index(tracks, index)
+    for rollout in writers.values():
+        rollout.close()
+    inputs = {"tracks": tracks, **{f"rollouts.{name}": path for name, path in methods.items()}}
+    inputs["banks" if bank else "episodes"] = episodes
+    return SmallWorld(inputs, {name: "success" if success else "failure" for name, success in cases.items()})
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+    """Two successes and two failures of the test split."""
+    cases = {"ep-0": True, "ep-1": False, "ep-2": True, "ep-3": False}
+    return _write(tmp_path_factory.mktemp("recordings"), cases, split="test", bank=None)
+
+
+@pytest.fixture(scope="session")
+def bank(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+    """One bank of six candidates, the fifth one alone succeeds; labels are sealed nowhere yet."""
+    cases = {f"cand-{number}": number == 4 for number in range(6)}
+    return _write(tmp_path_factory.mktemp("bank"), cases, split="bank", bank="bank-0")

@@ -1,0 +1,159 @@
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.planning import outcomes
+from worldline_core.evaluation.planning.evaluate_planning import (
+    CHOICES_FILE,
+    SEALED_FILE,
+    PlanningConfig,
+    evaluate_planning,
+)
+from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig, evaluate_policy
+from worldline_core.evaluation.scores import read_scores
+from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig, evaluate_video
+
+VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
+POLICY = PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100)
+PLANNING = PlanningConfig(segmenter="colour", budgets=(2, 4, 6, 32), resamples=100)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "run" not in path.relative_to(folder).parts
+    }
+
+
+def test_video_metrics_prefer_the_right_videos(recordings, tmp_path):
+    counts = evaluate_video(VIDEO, recordings.inputs, tmp_path)
+    assert counts["methods"] == ["copy", "good"]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    good, copy = summary["metrics"]["test"]["good"], summary["metrics"]["test"]["copy"]
+    assert good["robot_iou_exact"]["mean"] > 0.8 > copy["robot_iou_exact"]["mean"]
+    assert good["robot_iou"]["mean"] > 0.9
+    assert good["ssim"]["mean"] > copy["ssim"]["mean"]
+    assert good["end_effector_error_px"]["mean"] < 1 < copy["end_effector_error_px"]["mean"]
+    assert set(summary["metrics"]) == {"test", "test/box_arm", "test/success", "test/failure"}
+    assert "psnr@left_wrist" in good
+    difference = next(
+        row for row in summary["differences"]["test"] if row["metric"] == "robot_iou_exact" and row["first"] == "copy"
+    )
+    assert difference["second"] == "good"
+    assert difference["mean"] == pytest.approx(copy["robot_iou_exact"]["mean"] - good["robot_iou_exact"]["mean"])
+    accuracy = summary["segmenters"][0]["accuracy_on_true_frames"]["test"]["robot_iou_exact"]
+    assert accuracy["mean"] > 0.8
+    assert "LPIPS is not available" in summary["unavailable"]["lpips"]
+    assert not any(score.metric == "lpips" for score in read_scores(tmp_path))
+    by_frame = pq.read_table(tmp_path / "by_frame.parquet").to_pylist()
+    first = [row["mean"] for row in by_frame if (row["method"], row["metric"], row["frame"]) == ("copy", "psnr", 0)]
+    assert min(first) > 30  # the conditioning frame counts
+
+
+def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, tmp_path):
+    evaluate_video(VIDEO, recordings.inputs, tmp_path / "whole")
+    evaluate_video(VIDEO, recordings.inputs, tmp_path / "again")
+    parts = sorted((tmp_path / "again/run/parts").rglob("*.json"))
+    for path in [*parts[::2], tmp_path / "again/scores.parquet", tmp_path / "again/summary.json"]:
+        path.unlink()
+    evaluate_video(VIDEO, recordings.inputs, tmp_path / "again")
+    assert contents(tmp_path / "whole") == contents(tmp_path / "again")
+
+
+def test_predictions_of_unknown_episodes_are_refused(recordings, bank, tmp_path):
+    inputs = recordings.inputs | {"rollouts.other": bank.inputs["rollouts.good"]}
+    with pytest.raises(DataError, match="not in the EpisodeSet"):
+        evaluate_video(VIDEO, inputs, tmp_path)
+    without = {name: path for name, path in recordings.inputs.items() if not name.startswith("rollouts")}
+    with pytest.raises(ArtifactError, match="No predicted videos"):
+        evaluate_video(VIDEO, without, tmp_path)
+
+
+def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
+    result = evaluate_policy(POLICY, recordings.inputs, tmp_path)
+    assert result["accuracy"] == {"copy": 0.5, "good": 1.0, "true": 1.0}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["trajectories"] == 4
+    assert summary["methods"]["copy"]["test/lift"]["confusion"] == {
+        "true_success": 0, "false_success": 0, "true_failure": 2, "false_failure": 2,
+    }  # fmt: skip
+    decisions = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
+    evidence = json.loads(decisions[0]["evidence"])
+    assert "head_view_confirms_target_displacement" in evidence[0]
+
+
+def test_policy_evaluation_is_balanced(recordings, tmp_path):
+    limited = POLICY.model_copy(update={"max_per_group": 1})
+    assert evaluate_policy(limited, recordings.inputs, tmp_path)["trajectories"] == 2
+    rows = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
+    assert sorted({(row["episode_id"], row["outcome"]) for row in rows})[0][1] != "unknown"
+    assert {row["outcome"] for row in rows} == {"success", "failure"}
+
+
+def _seal(folder: Path, labels: dict[str, str]) -> None:
+    table = pa.table({"episode_id": list(labels), "outcome": list(labels.values())})
+    pq.write_table(table, folder / SEALED_FILE)
+
+
+@pytest.fixture
+def sealed(bank, tmp_path):
+    banks = tmp_path / "banks"
+    shutil.copytree(bank.inputs["banks"], banks)
+    _seal(banks, bank.outcomes)
+    return bank.inputs | {"banks": banks}
+
+
+def test_planning_chooses_by_predicted_videos(sealed, tmp_path):
+    result = evaluate_planning(PLANNING, sealed, tmp_path / "out")
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert result["direct_execution"] == pytest.approx(1 / 6)
+    budgets = summary["methods"]["good"]["budgets"]
+    assert set(budgets) == {"2", "4", "6"}  # 32 is more than the bank has
+    assert [budgets[n]["success"]["mean"] for n in ("2", "4", "6")] == [0.0, 0.0, 1.0]
+    assert budgets["6"]["gain"]["mean"] == pytest.approx(5 / 6)
+    assert summary["methods"]["true"]["budgets"]["6"]["success"]["mean"] == 1.0
+    assert summary["oracle"]["mean"] == 1.0
+
+
+def test_labels_are_opened_only_after_every_choice_is_on_disk(sealed, tmp_path, monkeypatch):
+    opened = []
+    read = outcomes.read_outcomes
+
+    def watched(path, episode_ids):
+        choices = pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist()
+        opened.append({(row["method"], row["budget"]) for row in choices})
+        return read(path, episode_ids)
+
+    monkeypatch.setattr(outcomes, "read_outcomes", watched)
+    evaluate_planning(PLANNING, sealed, tmp_path / "out")
+    assert opened == [{(method, budget) for method in ("true", "good", "copy") for budget in (2, 4, 6)}]
+
+
+def test_choices_do_not_depend_on_labels(bank, sealed, tmp_path):
+    evaluate_planning(PLANNING, sealed, tmp_path / "one")
+    flipped = {name: "failure" if label == "success" else "success" for name, label in bank.outcomes.items()}
+    _seal(sealed["banks"], flipped)
+    evaluate_planning(PLANNING, sealed, tmp_path / "two")
+    assert (tmp_path / "one" / CHOICES_FILE).read_bytes() == (tmp_path / "two" / CHOICES_FILE).read_bytes()
+    (sealed["banks"] / SEALED_FILE).unlink()
+    with pytest.raises(ArtifactError, match="no sealed outcomes"):
+        evaluate_planning(PLANNING, sealed, tmp_path / "three")
+    assert (tmp_path / "three" / CHOICES_FILE).read_bytes() == (tmp_path / "one" / CHOICES_FILE).read_bytes()
+
+
+def test_candidates_without_a_label_are_named(sealed, tmp_path):
+    _seal(sealed["banks"], {"cand-0": "success"})
+    with pytest.raises(DataError, match="without a sealed outcome"):
+        evaluate_planning(PLANNING, sealed, tmp_path / "out")
+
+
+def test_ordinary_recordings_are_no_bank(recordings, tmp_path):
+    inputs = {name: path for name, path in recordings.inputs.items() if name != "episodes"}
+    with pytest.raises(DataError, match="no candidate"):
+        evaluate_planning(PLANNING, inputs | {"banks": recordings.inputs["episodes"]}, tmp_path)

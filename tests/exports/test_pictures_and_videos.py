@@ -1,0 +1,127 @@
+"""Scaling, labels, sheets, overlays and side-by-side videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from worldline_core.data.video import decode_video
+from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.exports.labels import fit_text, text_strip, text_width_px
+from worldline_core.exports.overlays import draw_action_overlay, enlarged_intrinsics, gaussian, heat_picture
+from worldline_core.exports.pictures import jpeg_bytes, png_bytes, scale_frames, scaled_size
+from worldline_core.exports.side_by_side import GAP_PX, LABEL_HEIGHT_PX, compose_side_by_side, write_side_by_side
+
+
+def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray:
+    return np.full((count, *size, 3), value, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "target", "expected"),
+    [
+        ((64, 96), 256, (256, 384)),
+        ((128, 192), 256, (256, 384)),
+        ((480, 640), 256, (256, 342)),
+        ((63, 95), 64, (64, 96)),
+        ((300, 301), 256, (256, 258)),
+    ],
+)
+def test_display_sizes_are_even_and_fit(size: tuple[int, int], target: int, expected: tuple[int, int]) -> None:
+    assert scaled_size(*size, target) == expected
+
+
+def test_nearest_keeps_every_pixel() -> None:
+    frames = np.random.default_rng(0).integers(0, 255, (2, 4, 6, 3), dtype=np.uint8)
+    assert np.array_equal(scale_frames(frames, (8, 12), "nearest"), frames.repeat(2, axis=1).repeat(2, axis=2))
+
+
+def test_long_labels_are_cut_to_their_strip() -> None:
+    text = "a very long name of a method that nobody could fit into a column"
+    shown = fit_text(text, 120, 15)
+    assert shown.endswith("...")
+    assert text_width_px(shown, 15) <= 120
+    assert fit_text("short", 120, 15) == "short"
+    assert text_strip(text, 120, 24).shape == (24, 120, 3)
+
+
+def test_evenly_spaced_holds_both_ends() -> None:
+    assert evenly_spaced(33, 5) == [0, 8, 16, 24, 32]
+    assert evenly_spaced(2, 5) == [0, 1]
+    assert evenly_spaced(0, 5) == []
+
+
+def test_contact_sheet_holds_every_picture() -> None:
+    rows = [SheetRow("first", clip(3, 200), "note"), SheetRow("second", clip(2, 90, (32, 32)))]
+    sheet = contact_sheet(rows, tile_height=64, title="sheet", column_titles=["a", "b", "c"])
+    assert (sheet == 200).all(axis=-1).sum() == 3 * 64 * 96
+    assert (sheet == 90).all(axis=-1).sum() == 2 * 64 * 64
+    assert np.array_equal(sheet, contact_sheet(rows, tile_height=64, title="sheet", column_titles=["a", "b", "c"]))
+    with pytest.raises(ValueError, match="at least one row"):
+        contact_sheet([])
+
+
+def test_columns_stay_in_step_and_end_with_the_shortest() -> None:
+    columns = {"true": clip(9, 10), "Stage II": clip(5, 20), "causal": clip(7, 30, (32, 48))}
+    frames = compose_side_by_side(columns, tile_height=64)
+    assert frames.shape == (5, 64 + LABEL_HEIGHT_PX, 3 * 96 + 2 * GAP_PX, 3)
+    body = frames[:, LABEL_HEIGHT_PX:]
+    starts = (0, 96 + GAP_PX, 2 * (96 + GAP_PX))
+    assert [int(body[:, :, start : start + 96].mean()) for start in starts] == [10, 20, 30]
+    with pytest.raises(ValueError, match="at least one column"):
+        compose_side_by_side({})
+
+
+def test_side_by_side_video_and_poster(tmp_path: Path) -> None:
+    columns = {"true": clip(6, 60), "causal": clip(6, 180)}
+    made = write_side_by_side(tmp_path / "video.mp4", columns, 8.0, tile_height=64)
+    frames = decode_video(made.video)
+    assert frames.shape == (made.num_frames, made.height, made.width, 3)
+    assert abs(int(frames[3, 60, 40].mean()) - 60) <= 3
+    assert abs(int(frames[3, 60, 150].mean()) - 180) <= 3
+    assert cv2.imread(str(made.poster)).shape == frames[0].shape
+    again = write_side_by_side(tmp_path / "again.mp4", columns, 8.0, tile_height=64)
+    assert again.video.read_bytes() == made.video.read_bytes()
+
+
+def test_heat_lies_where_the_tool_is() -> None:
+    heat = gaussian(np.array([30.0, 20.0]), 64, 96)
+    assert np.unravel_index(heat.argmax(), heat.shape) == (20, 30)
+    assert heat[20, 30] == pytest.approx(1.0)
+    sigma = 10 * 96 / 512
+    assert gaussian(np.array([30.0, 20.0]), 64, 96)[20, 33] == pytest.approx(np.exp(-0.5 * (3 / sigma) ** 2), rel=1e-5)
+
+
+def test_overlay_marks_valid_arms_only() -> None:
+    frame = np.full((64, 96, 3), 90, dtype=np.uint8)
+    uv = np.array([[20.0, 30.0], [70.0, 30.0]])
+    drawn = draw_action_overlay(frame, uv, np.array([True, False]), gripper=np.array([1.0, 0.0]), scale=2)
+    assert drawn.shape == (128, 192, 3)
+    changed = (drawn != 90).any(axis=-1)
+    assert changed[50:72, 30:52].any()
+    assert not changed[:, 100:].any()
+
+
+def test_intrinsics_follow_the_enlargement() -> None:
+    K = np.array([[90.0, 0.0, 47.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]])
+    point = np.array([0.1, -0.2, 0.7])
+    u, v, w = K @ point
+    large = enlarged_intrinsics(K, 4) @ point
+    assert np.allclose(large[:2] / large[2], (np.array([u, v]) / w + 0.5) * 4 - 0.5)
+
+
+def test_signed_channels_have_two_colours() -> None:
+    picture = heat_picture(np.array([[-1.0, 0.0, 1.0]]), tile_height=1)
+    negative, zero, positive = picture[0].astype(int)
+    assert negative[2] > negative[0]
+    assert positive[0] > positive[2]
+    assert zero.min() > 200
+
+
+def test_encoded_pictures_are_reproducible() -> None:
+    picture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
+    assert png_bytes(picture) == png_bytes(picture.copy())
+    assert jpeg_bytes(picture) == jpeg_bytes(picture.copy())

@@ -1,0 +1,50 @@
+"""prefect.yaml: Prefect ignores misspelt keys silently, so every key, entrypoint and parameter is checked here."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect import Flow
+
+from worldline_core.config import read_yaml
+from worldline_core.config.loader import preset_names
+
+TOP_KEYS = {"name", "prefect-version", "definitions", "deployments"}
+DEPLOYMENT_KEYS = {"name", "description", "entrypoint", "parameters", "schedules", "work_pool", "tags"}
+SCHEDULE_KEYS = {"cron", "timezone", "active"}
+WORK_POOL_KEYS = {"name", "job_variables"}
+
+
+@pytest.fixture(scope="module")
+def deployments(project_root: Path) -> list[dict[str, Any]]:
+    content = read_yaml(project_root / "prefect.yaml")
+    assert set(content) <= TOP_KEYS
+    return content["deployments"]
+
+
+def test_names(deployments: list[dict[str, Any]]) -> None:
+    assert [deployment["name"] for deployment in deployments] == ["pipeline", "nightly-evaluation"]
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_keys_entrypoint_and_parameters(deployments: list[dict[str, Any]], index: int) -> None:
+    deployment = deployments[index]
+    assert set(deployment) <= DEPLOYMENT_KEYS
+    assert set(deployment["work_pool"]) <= WORK_POOL_KEYS
+    for schedule in deployment.get("schedules", []):
+        assert set(schedule) <= SCHEDULE_KEYS
+    path, _, function = deployment["entrypoint"].partition(":")
+    flow = getattr(importlib.import_module(path.removesuffix(".py").replace("/", ".")), function)
+    assert isinstance(flow, Flow)
+    flow.validate_parameters({**{"config": None, "overrides": (), "artifacts": "artifacts"}, **deployment["parameters"]})
+    assert deployment["parameters"]["preset"] in preset_names()
+
+
+def test_misspelt_parameter_is_refused(deployments: list[dict[str, Any]]) -> None:
+    from flows.pipeline import pipeline
+
+    with pytest.raises(Exception, match="presett"):
+        pipeline.validate_parameters({"presett": "tiny"})

@@ -1,0 +1,158 @@
+"""Pictures, determinism, resume and banks of the recorder; needs off-screen OpenGL."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from pydantic import ValidationError
+
+mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
+
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
+from worldline_core.recorder.defects import DEFECTS
+from worldline_core.recorder.episode_recorder import EpisodeRecorder, Recording
+from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, prepare_rendering, record
+from worldline_core.recorder.rendering import SceneRenderer
+
+
+@pytest.fixture(scope="module")
+def recorder() -> EpisodeRecorder:
+    prepare_rendering()
+    recorder = EpisodeRecorder("aloha_viperx")
+    try:
+        SceneRenderer(recorder.scene).close()
+    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
+        pytest.skip(f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri")
+    return recorder
+
+
+@pytest.fixture(scope="module")
+def recording(recorder: EpisodeRecorder) -> Recording:
+    return recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 3), num_frames=17)
+
+
+def digests(root: Path) -> dict[str, str]:
+    files = [path for path in root.rglob("*") if path.is_file() and path.relative_to(root).parts[0] != "run"]
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, recording: Recording) -> None:
+    recorder.record(episode_id="between", split="test", family="play", entropy=(9,), num_frames=17)
+    again = recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 3), num_frames=17)
+    other = recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 4), num_frames=17)
+    np.testing.assert_array_equal(again.episode.state, recording.episode.state)
+    for view, images in recording.frames.items():
+        np.testing.assert_array_equal(again.frames[view], images)
+        np.testing.assert_array_equal(again.robot_masks[view], recording.robot_masks[view])
+        assert not np.array_equal(other.frames[view], images)
+
+
+def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
+    """The centre of a cube, projected with K and T_base_camera, lies in the middle of the cube's pixels."""
+    layout = recorder.layout("lift", np.random.default_rng(3))
+    assert layout.cube is not None
+    motion = recorder.move(layout, np.random.default_rng(4), 17)
+    assert motion is not None
+    filmed = recorder.film(
+        layout, motion, episode_id="e", scene_id="scene_00", split="train", jitter=np.random.default_rng(0)
+    )
+    colour = {"red": 0, "green": 1, "blue": 2}
+    address = int(recorder.scene.model.joint("cube").qposadr[0])
+    camera = filmed.episode.cameras["head"]
+    centre = np.linalg.inv(camera.poses([0])[0]) @ np.append(motion.qpos[0, address : address + 3], 1.0)
+    u, v = (camera.K @ centre[:3])[:2] / centre[2]
+    half_width = 0.028 * camera.K[0, 0] / centre[2]
+    image = filmed.frames["head"][0].astype(float)
+    saturation = image.max(axis=2) - image.min(axis=2)
+    rows, columns = np.nonzero(saturation > 110)
+    near = (np.abs(columns - u) < 12) & (np.abs(rows - v) < 12)
+    assert near.sum() > 20, f"no saturated pixels around the projected cube; colours {colour}"
+    assert abs(columns[near].mean() - u) < 1.5
+    assert abs(rows[near].mean() - v) < half_width
+    assert half_width > 4.0
+
+
+def test_the_wrist_camera_moves_with_the_arm_and_the_head_stands(recording: Recording) -> None:
+    cameras = recording.episode.cameras
+    assert set(cameras) == {"head", "left_wrist", "right_wrist"}
+    assert not cameras["head"].moving
+    assert all(cameras[view].moving for view in ("left_wrist", "right_wrist"))
+    for camera in cameras.values():
+        rotation = camera.T_base_camera[:, :3, :3]
+        np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(len(rotation), 0), atol=1e-9)
+        np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-9)
+
+
+def test_robot_masks_cover_dark_arms_on_a_bright_table(recording: Recording) -> None:
+    mask, image = recording.robot_masks["head"], recording.frames["head"].mean(axis=3)
+    assert 0.05 < mask.mean() < 0.5
+    assert image[mask].mean() + 40 < image[~mask].mean()
+
+
+def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, tmp_path: Path) -> None:
+    groups = (
+        RecordGroup(embodiment="so101", count=2, families=("lift", "play")),
+        RecordGroup(embodiment="aloha_viperx", count=1),
+    )
+    config = RecordConfig(groups=groups, seed=5, num_frames=17, workers=1, defects={"so101": {"frozen_camera": 1}})
+    counts = record(config, {}, tmp_path / "whole")
+    assert counts["episodes"] == 3
+    # What a kill leaves behind: one finished episode, given in another order.
+    _record_job((plan_jobs(config)[-1], config, tmp_path / "resumed"))
+    record(config, {}, tmp_path / "resumed")
+    assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
+    rows = EpisodeSet.open(tmp_path / "whole").rows
+    assert [row.embodiment for row in rows] == ["aloha_viperx", "so101", "so101"]
+    assert rows[0].scene in {f"scene_{n:02d}" for n in range(12)}
+
+
+def test_bank_outcomes_are_sealed(recorder: EpisodeRecorder, tmp_path: Path) -> None:
+    spec = BankSpec(name="bank", embodiment="aloha_viperx", family="state_change", scene="scene_12", layout=1)
+    config = RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, success_range=(0.25, 0.75))
+    record_banks(config, {}, tmp_path / "banks")
+    episodes = EpisodeSet.open(tmp_path / "banks")
+    assert {row.outcome for row in episodes.rows} == {"unknown"}
+    assert [row.candidate for row in episodes.rows] == [0, 1, 2, 3]
+    sealed = pq.read_table(tmp_path / "banks" / SEALED_FILE).to_pylist()
+    assert {row["outcome"] for row in sealed} == {"success", "failure"}
+    first = [episodes.frames(i, "head", [0])[0] for i in range(4)]
+    assert all(np.abs(first[0].astype(int) - image.astype(int)).mean() < 1.0 for image in first[1:])
+    actions = [episodes.episode(i).action for i in range(4)]
+    np.testing.assert_array_equal(actions[0][0], actions[1][0])
+    assert not np.array_equal(actions[0], actions[1])
+
+
+@pytest.mark.parametrize("name", sorted(DEFECTS))
+def test_defects_spoil_what_they_say(name: str, recording: Recording) -> None:
+    spoiled = DEFECTS[name](recording, np.random.default_rng(0))
+    episode, healthy = spoiled.episode, recording.episode
+    changed = {
+        "static_lead_in": np.ptp(episode.state[:16], axis=0).max() == 0 and episode.num_frames == healthy.num_frames + 16,
+        "reset_segment": np.abs(np.diff(episode.state, axis=0)).max() > np.abs(np.diff(healthy.state, axis=0)).max(),
+        "frozen_camera": np.ptp(spoiled.frames["head"][4:].astype(int), axis=0).max() == 0,
+        "corrupted_frames": sum(frame.max() == 0 for frame in spoiled.frames["head"]) == 4,
+        "lagged_state": np.array_equal(episode.state[4:], healthy.state[:-4]),
+        "inverted_extrinsics": np.allclose(
+            episode.cameras["head"].T_base_camera @ healthy.cameras["head"].T_base_camera, np.eye(4), atol=1e-9
+        ),
+        "intrinsics_of_other_size": episode.cameras["head"].K[0, 0] > 3 * healthy.cameras["head"].K[0, 0],
+    }
+    assert changed[name]
+    assert all(len(images) == episode.num_frames for images in spoiled.frames.values())
+    assert recording.episode is healthy
+
+
+def test_more_defects_than_recordings_are_refused() -> None:
+    with pytest.raises(ValidationError, match="3 defects for 2 training episodes of so101"):
+        RecordConfig(groups=(RecordGroup(embodiment="so101", count=2),), defects={"so101": {"lagged_state": 3}})
+
+
+def test_jobs_have_unique_ids_and_draws() -> None:
+    groups = tuple(RecordGroup(embodiment="so101", split=split, count=5) for split in ("train", "test"))
+    jobs = plan_jobs(RecordConfig(groups=groups))
+    assert len({job.episode_id for job in jobs}) == len({job.entropy for job in jobs}) == 10

@@ -1,0 +1,94 @@
+"""The nightly comparison: history, verdicts, and the page with trends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from worldline_core.errors import ArtifactError
+from worldline_core.report.nightly import Measured, compare_with_history, read_history, record_night, verdict
+
+
+def scores(folder: Path, mean: float) -> dict[str, Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    values = {"robot_iou@head": {"mean": mean, "low": mean - 0.02, "high": mean + 0.02, "count": 9}}
+    values["end_effector_error_px@head"] = {
+        "mean": 10 * (1 - mean),
+        "low": 10 * (1 - mean) - 0.3,
+        "high": 10 * (1 - mean) + 0.3,
+        "count": 9,
+    }
+    groups = {"test": {"shipped_stage2": values}, "test/ur5e_pair": {"shipped_stage2": values}}
+    (folder / "summary.json").write_text(json.dumps({"metrics": groups}))
+    return {"evaluate_video": folder}
+
+
+def test_first_night_has_nothing_to_compare_with(tmp_path: Path) -> None:
+    compared = record_night(tmp_path / "history", "2026-11-20", scores(tmp_path / "a", 0.6))
+    assert compared.previous is None
+    assert {change.verdict for change in compared.changes} == {"new"}
+    assert {change.metric for change in compared.changes} == {
+        "video/test/shipped_stage2/robot_iou@head", "video/test/shipped_stage2/end_effector_error_px@head",
+    }  # fmt: skip
+
+
+def test_a_drop_beyond_the_interval_is_a_regression(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    record_night(history, "2026-11-20", scores(tmp_path / "a", 0.6))
+    same = record_night(history, "2026-11-21", scores(tmp_path / "b", 0.59))
+    assert [c.metric for c in same.regressions] == []
+    worse = record_night(history, "2026-11-22", scores(tmp_path / "c", 0.5))
+    assert len(worse.regressions) == 2  # IoU fell, and the error in pixels rose
+    assert worse.previous == "2026-11-21"
+
+
+@pytest.mark.parametrize(
+    ("metric", "mean", "expected"),
+    [
+        ("ssim", 0.9, "better"),
+        ("ssim", 0.45, "same"),
+        ("ssim", 0.2, "worse"),
+        ("lpips", 0.9, "worse"),
+        ("lpips", 0.2, "better"),
+    ],
+)
+def test_verdicts(metric: str, mean: float, expected: str) -> None:
+    assert verdict(metric, Measured(mean, mean, mean), Measured(0.5, 0.4, 0.6)) == expected
+
+
+def test_the_same_night_is_replaced(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    for mean in (0.5, 0.6):
+        record_night(history, "2026-11-20", scores(tmp_path / "a", mean))
+    nights = read_history(history)
+    assert [night.night for night in nights] == ["2026-11-20"]
+    assert nights[0].metrics["video/test/shipped_stage2/robot_iou@head"].mean == 0.6
+
+
+def test_page_shows_trends_and_regressions(tmp_path: Path, run_artifacts: dict[str, Path]) -> None:
+    history = tmp_path / "history"
+    record_night(history, "2026-11-20", scores(tmp_path / "a", 0.99))
+    folder = compare_with_history(
+        {name: run_artifacts[name] for name in ("evaluate_video", "evaluate_policy", "evaluate_planning")},
+        history,
+        "2026-11-21",
+    )
+    page = (folder / "index.html").read_text()
+    assert "video/test/shipped_stage2/robot_iou@head" in page
+    assert "became worse" in page
+    comparison = json.loads((folder / "comparison.json").read_text())
+    assert "video/test/shipped_stage2/robot_iou@head" in comparison["regressions"]
+    assert {c["metric"] for c in comparison["changes"]} >= {"policy/all/true/accuracy", "planning/N=32/true/success"}
+
+
+def test_a_night_without_scores_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="night without scores"):
+        record_night(tmp_path, "2026-11-20", {})
+
+
+def test_a_damaged_history_is_named(tmp_path: Path) -> None:
+    (tmp_path / "history.jsonl").write_text('{"night": "2026-11-20"}\n')
+    with pytest.raises(ArtifactError, match=r"(?s)not a night.*history\.jsonl"):
+        read_history(tmp_path)

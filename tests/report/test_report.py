@@ -1,0 +1,169 @@
+"""The page: every section, nothing from a network, nothing broken by its content, the same bytes again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import av
+import pytest
+
+from worldline_core.errors import ArtifactError
+from worldline_core.report.report import ReportConfig, report
+
+SECTIONS = (
+    "summary", "videos", "video", "policy", "planning", "cost", "data", "filters", "actions", "training", "models", "provenance",
+)  # fmt: skip
+VOID = {"meta", "img", "input", "br", "hr", "link", "source"}
+
+
+class Page(HTMLParser):
+    """Checks nesting and collects references, ids and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.references: list[str] = []
+        self.identities: list[str] = []
+        self.scripts = 0
+        self.handlers: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.references += [v for k in ("src", "href", "poster") if (v := values.get(k))]
+        self.identities += [values["id"]] if values.get("id") else []
+        self.handlers += [name for name in values if name.startswith("on")]
+        self.scripts += tag == "script"
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> without a beginning"
+        assert self.open.pop() == tag
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = (
+        path for path in sorted(folder.rglob("*")) if path.is_file() and "run" not in path.relative_to(folder).parts
+    )
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def section(text: str, anchor: str) -> str:
+    return text.split(f'id="{anchor}"')[1].split("</section>")[0]
+
+
+def test_page_is_well_formed_and_has_every_section(full_report: Path) -> None:
+    text = (full_report / "index.html").read_text()
+    page = Page(text)
+    assert page.open == []
+    assert len(page.identities) == len(set(page.identities))
+    assert set(SECTIONS) <= set(page.identities)
+    assert "Missing:" not in text
+
+
+def test_nothing_comes_from_a_network(full_report: Path) -> None:
+    text = (full_report / "index.html").read_text()
+    assert [r for r in Page(text).references if re.match(r"^[a-z]+:|^//", r)] == []
+    assert not re.search(r"url\(|@import|https?://", text)
+    assert "default-src &#x27;none&#x27;" in text
+
+
+def test_every_referenced_file_exists_and_every_medium_is_referenced(full_report: Path) -> None:
+    references = {r for r in Page((full_report / "index.html").read_text()).references if not r.startswith("#")}
+    assert [r for r in references if not (full_report / r).is_file()] == []
+    assert {f"media/{path.name}" for path in (full_report / "media").iterdir()} <= references
+    assert any(r.endswith(".rrd") for r in references)
+    assert any(r.endswith(".mcap") for r in references)
+
+
+def test_hostile_text_stays_text(full_report: Path) -> None:
+    text = (full_report / "index.html").read_text()
+    page = Page(text)
+    assert page.scripts == 2  # the run's facts and the page's own script
+    assert page.handlers == []
+    assert "&lt;script&gt;alert(" in text
+    assert "</script>" not in (full_report / "run" / "run.js").read_text()
+
+
+def test_videos_play_in_browsers(full_report: Path) -> None:
+    path = full_report / "media" / "episode0_shipped_head.mp4"
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert sum(1 for _ in container.decode(stream)) == 9
+        assert stream.width > 4 * 96  # truth, Stage II, causal, shuffled actions, copy of the first frame
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")  # the index comes first: playable while loading
+
+
+def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: Path, tmp_path: Path) -> None:
+    report(ReportConfig(tile_height=64, rerun=False, mcap=False), run_artifacts, tmp_path)
+    again, before = digest(tmp_path), digest(full_report)
+    assert {name: value for name, value in again.items() if name != "index.html"} == {
+        n: v for n, v in before.items() if n != "index.html"
+    }
+    report(ReportConfig(tile_height=64, rerun=False, mcap=False), run_artifacts, tmp_path)
+    assert digest(tmp_path) == again
+
+
+def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path) -> None:
+    text = (full_report / "index.html").read_text()
+    run = (full_report / "run" / "run.js").read_text()
+    for fact in ("2026-11-21T05:00:00Z", "12.5 s", "torch 2.11"):
+        assert fact not in text
+        assert fact in run
+    parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
+    assert set(parts) == set(re.findall(r'data-run="(\w+)"', text))
+    assert Page(parts["cost"]).open == []
+
+
+def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:
+    text = (full_report / "index.html").read_text()
+    summary = section(text, "summary")
+    assert "+0.21" in summary  # over shuffled actions
+    assert "94\u202f%" in summary  # kept by the causal model
+    assert "lpips" in section(text, "video")
+    assert "no weights in the configured folder" in section(text, "video")
+    assert "0.930" in section(text, "video")  # the segmenter's own accuracy
+    assert "selector&#x27;s ceiling" in section(text, "planning")
+    assert "median of 3 on held-out scenes" in section(text, "videos")
+    assert "truncated_video" in section(text, "filters")
+    assert "quarantine_static.jpg" in section(text, "filters")
+
+
+def test_split_is_checked_not_assumed(full_report: Path) -> None:
+    assert "none of the 2 test scenes is among the 1 training scenes" in section(
+        (full_report / "index.html").read_text(), "data"
+    )
+
+
+def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
+    some = {name: run_artifacts[name] for name in ("curate", "train_stage1")}
+    metrics = report(ReportConfig(), some, tmp_path)
+    text = (tmp_path / "index.html").read_text()
+    assert Page(text).open == []
+    assert metrics["missing"] == ["videos", "video", "policy", "planning", "cost", "actions", "models"]
+    for anchor in metrics["missing"]:
+        assert "Missing:" in section(text, anchor)
+    assert "Stage II: action-driven, three views, Distillation" in section(text, "training")
+    assert "filtered EpisodeSet is missing" in section(text, "filters")
+
+
+def test_a_report_of_nothing_is_a_page(tmp_path: Path) -> None:
+    metrics = report(ReportConfig(), {}, tmp_path)
+    assert metrics["sections"] == 1
+    assert Page((tmp_path / "index.html").read_text()).open == []
+
+
+def test_a_damaged_artifact_is_named(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
+    broken = tmp_path / "scores"
+    broken.mkdir()
+    (broken / "summary.json").write_text("{")
+    with pytest.raises(ArtifactError, match=r"(?s)JSON file is damaged.*summary\.json"):
+        report(ReportConfig(), {"evaluate_video": broken}, tmp_path / "out")
