@@ -1,0 +1,1 @@
+"""Recorder: simulated robots, scenes and noisy controllers that produce the embedded recordings."""

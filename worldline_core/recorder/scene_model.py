@@ -1,0 +1,201 @@
+"""Build the MuJoCo model of one embodiment with its table and task objects (Apache/MIT robot assets only).
+
+One model serves all episodes of an embodiment: colours, lights, camera poses and the places of static bodies are
+set per episode, unused objects are parked far below the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldline_core.errors import DataError
+from worldline_core.recorder.robots import ROBOTS_FOLDER, Robot
+
+CUBE_HALF = 0.028
+PAD_RADIUS = 0.055
+DRAWER_TRAVEL = 0.10
+DRAWER_HALF = (0.055, 0.050, 0.026)
+FRAME_RATE = 8
+SUBSTEPS = 30
+TIMESTEP = 1.0 / (FRAME_RATE * SUBSTEPS)
+PARKED = np.array([-3.0, 0.0, -4.0])
+
+
+@dataclass(frozen=True)
+class SceneModel:
+    """Compiled model and the addresses that the recorder needs (per arm, in the order of ``robot.arms``)."""
+
+    robot: Robot
+    model: Any
+    joint_qpos: tuple[np.ndarray, ...]
+    joint_dofs: tuple[np.ndarray, ...]
+    arm_actuators: tuple[np.ndarray, ...]
+    finger_qpos: tuple[np.ndarray, ...]
+    finger_actuators: tuple[np.ndarray, ...]
+    tool_sites: tuple[int, ...]
+    ee_bodies: tuple[int, ...]
+    limits: tuple[np.ndarray, ...]
+    robot_geoms: np.ndarray
+
+
+def _quat_about_z(angle: float) -> list[float]:
+    return [float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2))]
+
+
+def arm_spec(robot: Robot, folder: Path | None = None) -> Any:
+    """The clean arm model of a robot folder with servo-friendly dynamics."""
+    import mujoco
+
+    folder = folder or ROBOTS_FOLDER / robot.model
+    path = folder / "arm.xml"
+    if not path.is_file():
+        raise DataError(
+            "Robot model not found",
+            where=path,
+            next_step="write it with: uv run worldline_core/recorder/import_robots.py artifacts/shipped/robots",
+        )
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.meshdir = ""
+    for mesh in spec.meshes:
+        mesh.file = str(folder / "meshes" / Path(mesh.file).name)
+        # Cut meshes are not watertight; their inertia is not used (bodies carry their own).
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    colours = {tuple(source): drawn for source, drawn in robot.colours}
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
+            drawn = colours.get(tuple(np.round(np.asarray(geom.rgba[:3]), 3)))
+            if drawn is not None:
+                geom.rgba = [*drawn, 1.0]
+    finger_bodies = {"finger_a", "finger_b", "jaw"}
+    for body in spec.bodies:
+        if body.name == "world":
+            continue
+        body.gravcomp = 1.0
+        body.explicitinertial = True
+        body.mass = 0.05 if body.name in finger_bodies else 0.5 * robot.scale
+        body.inertia = [1e-4] * 3 if body.name in finger_bodies else [2e-3] * 3
+    for joint in spec.joints:
+        finger = joint.name in finger_bodies
+        joint.armature = (0.002 if robot.jaw else 0.05) if finger else 0.4
+        gain, damping = ((12.0, 0.3) if robot.jaw else (500.0, 15.0)) if finger else (1600.0, 55.0)
+        limit = ((-1.2, 1.2) if robot.jaw else (-14.0, 14.0)) if finger else (-4000.0, 4000.0)
+        actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        actuator.gainprm[0] = gain
+        actuator.biasprm[1], actuator.biasprm[2] = -gain, -damping
+        actuator.forcerange = limit
+        actuator.forcelimited = True
+    return spec
+
+
+def _add_objects(spec: Any, scale: float) -> None:
+    import mujoco
+
+    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    world = spec.worldbody
+    world.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[6, 6, 1], pos=[0, 0, -0.8], contype=0, conaffinity=0
+    )
+    world.add_geom(name="wall", type=box, size=[0.05, 6, 4], pos=[2.6, 0, 0], contype=0, conaffinity=0)
+    world.add_geom(
+        name="table", type=box, size=[0.75, 1.0, 0.03], pos=[0.35, 0, -0.03], friction=[0.9, 0.02, 0.001], condim=4
+    )
+    half = CUBE_HALF * scale
+    for name in ("cube", "other"):
+        body = world.add_body(name=name, pos=PARKED)
+        body.add_freejoint(name=name)
+        body.add_geom(
+            name=name, type=box, size=[half] * 3, mass=0.06, condim=4, friction=[1.0, 0.02, 0.001], solref=[0.01, 1.0]
+        )
+    pad = world.add_body(name="pad", pos=PARKED)
+    pad.add_geom(name="pad", type=cylinder, size=[PAD_RADIUS * scale, 0.0015, 0], contype=0, conaffinity=0)
+    cabinet = world.add_body(name="cabinet", pos=PARKED)
+    deep, wide, high = (value * scale for value in DRAWER_HALF)
+    wall = 0.008 * scale
+    # The cabinet is a hollow shell around the drawer's closed place (origin: centre of the closed drawer's front).
+    shell = {
+        "top": ([deep, wide + wall, wall], [deep + wall, 0, 2 * high + 2 * wall]),
+        "left": ([deep, wall, high + wall], [deep + wall, wide + 2 * wall, high + wall]),
+        "right": ([deep, wall, high + wall], [deep + wall, -wide - 2 * wall, high + wall]),
+        "back": ([wall, wide + 2 * wall, high + wall], [2 * deep + wall, 0, high + wall]),
+    }
+    for name, (size, pos) in shell.items():
+        cabinet.add_geom(name=f"cabinet_{name}", type=box, size=size, pos=pos, contype=0, conaffinity=0)
+    drawer = cabinet.add_body(name="drawer", pos=[0, 0, 0], gravcomp=1.0)
+    slide = drawer.add_joint(
+        name="drawer",
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=[-1, 0, 0],
+        range=[0, DRAWER_TRAVEL * scale],
+        limited=True,
+        frictionloss=0.8,
+        armature=0.3,
+    )
+    # Newer MuJoCo versions hold three damping coefficients (linear first), older ones a number.
+    slide.damping = [6.0, 0.0, 0.0] if np.ndim(slide.damping) else 6.0
+    drawer.add_geom(name="drawer", type=box, size=[deep, wide, high], pos=[deep, 0, high + wall], mass=0.3, condim=3)
+    drawer.add_geom(
+        name="drawer_front", type=box, size=[wall, wide + wall, high + wall], pos=[-wall, 0, high + wall], mass=0.05
+    )
+
+
+def build_scene_model(robot: Robot) -> SceneModel:
+    """Compile the embodiment's model; cameras ``head`` and ``<arm>_wrist`` are placed per episode."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 384, 256
+    # Clipping distances are relative to the extent, which parked objects would otherwise blow up.
+    spec.stat.extent = 1.0
+    spec.visual.map.znear = 0.005
+    spec.visual.map.zfar = 20.0
+    spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 3], dir=[0, 0, -1])
+    spec.worldbody.add_camera(name="head", fovy=robot.head.fovy_deg)
+    _add_objects(spec, robot.scale)
+    for arm in robot.arms:
+        child = arm_spec(robot)
+        child.body("ee").add_camera(name="wrist", fovy=robot.wrist.fovy_deg)
+        frame = spec.worldbody.add_frame(pos=list(arm.base_xyz), quat=_quat_about_z(arm.yaw))
+        spec.attach(child, prefix=f"{arm.name}/", frame=frame)
+    model = spec.compile()
+    qpos, dofs, actuators, finger_qpos, finger_actuators, sites, bodies, limits = [], [], [], [], [], [], [], []
+    prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
+    for prefix in prefixes:
+        names = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name.startswith(prefix)]
+        fingers = [n for n in names if n.split("/")[1] in ("finger_a", "finger_b", "jaw")]
+        joints = [n for n in names if n not in fingers]
+        qpos.append(np.array([model.joint(n).qposadr[0] for n in joints]))
+        dofs.append(np.array([model.joint(n).dofadr[0] for n in joints]))
+        actuators.append(np.array([model.actuator(n).id for n in joints]))
+        finger_qpos.append(np.array([model.joint(n).qposadr[0] for n in fingers]))
+        finger_actuators.append(np.array([model.actuator(n).id for n in fingers]))
+        limits.append(np.array([model.joint(n).range for n in joints]))
+        sites.append(model.site(f"{prefix}tool").id)
+        bodies.append(model.body(f"{prefix}ee").id)
+    robot_geoms = np.array(
+        [model.body(int(model.geom_bodyid[g])).name.startswith(prefixes) for g in range(model.ngeom)], dtype=bool
+    )
+    return SceneModel(
+        robot=robot,
+        model=model,
+        joint_qpos=tuple(qpos),
+        joint_dofs=tuple(dofs),
+        arm_actuators=tuple(actuators),
+        finger_qpos=tuple(finger_qpos),
+        finger_actuators=tuple(finger_actuators),
+        tool_sites=tuple(sites),
+        ee_bodies=tuple(bodies),
+        limits=tuple(limits),
+        robot_geoms=robot_geoms,
+    )
