@@ -1,0 +1,89 @@
+"""Stage III, step 2: four-step trajectory regression (appendix, "Four-Step Trajectory Regression").
+
+    L_traj = lambda_next sum_k ||z^(k+1) - z_T^(k+1)||^2 + lambda_terminal ||z^clean - z_T^clean||^2 + L_aux
+
+The student stands at a node of the teacher's trajectory, takes one Euler step to the next node, and its clean
+prediction is compared with the teacher's clean end. A node is drawn for every block of every clip, so the sum over
+nodes is taken in expectation (times K); all blocks are trained in one teacher-forcing pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights, PerceptualDistance, auxiliary_losses
+from worldline_core.distillation.causal_teacher_forcing import frame_sigmas
+from worldline_core.distillation.teacher_trajectories import NODES, node_of_each_block, with_observed_frame
+from worldline_core.model.world_model import WorldModel
+from worldline_core.training.flow_matching import broadcast_sigma
+
+
+@dataclass(frozen=True)
+class TrajectoryLoss:
+    """The weighted total and its parts."""
+
+    total: Tensor
+    terms: dict[str, Tensor]
+
+
+def draw_nodes(clips: int, blocks: int, generator: torch.Generator) -> Int[Tensor, "b blocks"]:
+    """A noisy node, 0 (pure noise) to K - 1, for every block, all equally likely."""
+    return torch.randint(len(NODES) - 1, (clips, blocks), generator=generator, device=generator.device)
+
+
+def trajectory_regression_loss(
+    student: WorldModel,
+    nodes: Float[Tensor, "b k v c u h w"],
+    clean: Float[Tensor, "b v c t h w"],
+    action_maps: Float[Tensor, "b v a t h w"] | None,
+    index: Int[Tensor, "b blocks"],
+    *,
+    mask: Float[Tensor, "b v t h w"] | None,
+    views: Sequence[str],
+    block_size: int,
+    next_weight: float,
+    terminal_weight: float,
+    auxiliary: AuxiliaryWeights,
+    perceptual: PerceptualDistance | None = None,
+) -> TrajectoryLoss:
+    """Regression of the next node and of the clean end, plus the auxiliaries against the teacher's clean end.
+
+    Args:
+        nodes: the teacher's states, observed frame left out.
+        clean: the history that the teacher saw, observed frame included.
+        index: node of each block, see :func:`draw_nodes`.
+        mask: robot masks at latent resolution, or None where no robot term is wanted.
+    """
+    first = clean[..., :1, :, :]
+    levels = torch.tensor(NODES, device=nodes.device, dtype=nodes.dtype)
+    state = with_observed_frame(first, node_of_each_block(nodes, index, block_size))
+    following = with_observed_frame(first, node_of_each_block(nodes, index + 1, block_size))
+    end = with_observed_frame(first, nodes[:, -1])
+    sigma, sigma_next = levels[index], levels[index + 1]
+    velocity = student.forward_teacher_forcing(
+        state, clean, sigma, action_maps=action_maps, block_size=block_size, views=views
+    ).float()
+    here = broadcast_sigma(frame_sigmas(sigma, block_size))
+    there = broadcast_sigma(frame_sigmas(sigma_next, block_size))
+    stepped = state + (there - here) * velocity
+    predicted = state - here * velocity
+    # Frame 0 is the observation in both: it adds nothing and is left out of the means.
+    intervals = len(NODES) - 1
+    next_loss = intervals * ((stepped - following)[..., 1:, :, :] ** 2).mean()
+    terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
+    extra = auxiliary_losses(
+        predicted,
+        end,
+        mask=mask,
+        views=views,
+        block_size=block_size,
+        weights=auxiliary,
+        perceptual=perceptual,
+    )
+    total = next_weight * next_loss + terminal_weight * terminal_loss + extra.total
+    return TrajectoryLoss(total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **extra.terms})
