@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ class SmallWorld:
     outcomes: dict[str, str]
 
 
-def film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def make_film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Frames by view, exact head masks, tool points of one attempt to lift the red cube."""
     generator = np.random.default_rng(seed)
     column = int(generator.integers(20, 50))
@@ -75,7 +76,7 @@ def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) 
     index = []
     with EpisodeSetWriter(episodes, fps=FPS, image_size=(HEIGHT, WIDTH), pixel_format="yuv444p") as writer:
         for number, (episode_id, success) in enumerate(cases.items()):
-            frames, masks, points = film(success, seed=0 if bank else number)
+            frames, masks, points = make_film(success, seed=0 if bank else number)
             state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
             episode = Episode(
                 episode_id=episode_id, source="test", embodiment="box_arm", scene=f"scene_{number % 2}",
@@ -87,7 +88,9 @@ def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) 
             writer.add(episode, frames, {"head": masks})
             index += write_shard(tracks, number, [_tracks(episode_id, points)])
             writers["good"].add(episode_id, 0, frames)
-            writers["copy"].add(episode_id, 0, {view: np.repeat(video[:1], NUM_FRAMES, 0) for view, video in frames.items()})
+            writers["copy"].add(
+                episode_id, 0, {view: np.repeat(video[:1], NUM_FRAMES, 0) for view, video in frames.items()}
+            )
     write_index(tracks, index)
     for rollout in writers.values():
         rollout.close()
@@ -108,3 +111,9 @@ def bank(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     """One bank of six candidates, the fifth one alone succeeds; labels are sealed nowhere yet."""
     cases = {f"cand-{number}": number == 4 for number in range(6)}
     return _write(tmp_path_factory.mktemp("bank"), cases, split="bank", bank="bank-0")
+
+
+@pytest.fixture
+def film() -> Callable[[bool, int], tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
+    """Makes frames by view, exact head masks and tool points of a successful or a failed lift."""
+    return make_film

@@ -133,7 +133,9 @@ def test_vlm_selector_reads_labels_and_scores():
     model = ScriptedModel('Sure: {"selected_labels": ["b", "D"], "reason": "held"}')
     assert VLMSelector(model).compare("lift it", videos, 2) == Comparison(("B", "D"), "held", True)
     assert "exactly 2 candidate" in model.parts[0][-1].text
-    answer = VLMSelector(ScriptedModel('{"task_completed": true, "score": 85, "final_state": "up", "failure_reason": ""}'))
+    answer = VLMSelector(
+        ScriptedModel('{"task_completed": true, "score": 85, "final_state": "up", "failure_reason": ""}')
+    )
     assert answer.score("lift it", videos[0]).score == 85.0
 
 

@@ -20,7 +20,7 @@ from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 
 VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
 POLICY = PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100)
-PLANNING = PlanningConfig(segmenter="colour", budgets=(2, 4, 6, 32), resamples=100)
+PLANNING = PlanningConfig(segmenter="colour", budgets=(2, 4, 6, 32), runs=2, resamples=100)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -115,7 +115,13 @@ def test_planning_chooses_by_predicted_videos(sealed, tmp_path):
     assert result["direct_execution"] == pytest.approx(1 / 6)
     budgets = summary["methods"]["good"]["budgets"]
     assert set(budgets) == {"2", "4", "6"}  # 32 is more than the bank has
-    assert [budgets[n]["success"]["mean"] for n in ("2", "4", "6")] == [0.0, 0.0, 1.0]
+    choices = pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist()
+    recorded_order = {c["budget"]: c["episode_id"] for c in choices if (c["method"], c["run"]) == ("good", 0)}
+    assert recorded_order[2] in ("cand-0", "cand-1")  # prefixes of the recorded order
+    assert recorded_order[4] in ("cand-0", "cand-1", "cand-2", "cand-3")
+    assert recorded_order[6] == "cand-4"
+    assert budgets["6"]["success"]["mean"] == 1.0
+    assert budgets["6"]["success"]["std_over_runs"] == 0.0
     assert budgets["6"]["gain"]["mean"] == pytest.approx(5 / 6)
     assert summary["methods"]["true"]["budgets"]["6"]["success"]["mean"] == 1.0
     assert summary["oracle"]["mean"] == 1.0

@@ -47,7 +47,9 @@ def test_state_change_truth_tables_of_all_passes(done, wrong):
     assert establishes_success(evidence) == ((done, wrong) == (True, False))
     overturned = done is True and wrong is not True
     assert motion_establishes_success(MotionEvidence(task_effect_completed=done), evidence) == overturned
-    assert reconciliation_establishes_success(Reconciliation(observations_prove_completion=done), evidence) == overturned
+    assert (
+        reconciliation_establishes_success(Reconciliation(observations_prove_completion=done), evidence) == overturned
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,7 +71,9 @@ def test_routing(instruction, family):
     assert route(instruction) == family
 
 
-WELL_FORMED = '{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false, "observations": "x", "confidence": 80}'
+WELL_FORMED = (
+    '{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false, "observations": "x", "confidence": 80}'
+)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +171,9 @@ def test_unsuccessful_state_change_goes_through_every_pass():
     assert judge.asked[1:] == [("extract", 6, 480), ("reconcile", "two", "one", "two"), ("motion", 12, "two")]
 
 
-@pytest.mark.parametrize(("reconciliation", "motion", "decided_by"), [(True, None, "reconciliation"), (None, True, "motion")])
+@pytest.mark.parametrize(
+    ("reconciliation", "motion", "decided_by"), [(True, None, "reconciliation"), (None, True, "motion")]
+)
 def test_later_passes_can_establish_success(reconciliation, motion, decided_by):
     judge = ScriptedJudge([_state(None), _state(None)], reconciliation, motion)
     result = judge_trajectory(judge, _trajectory("press the bell"))

@@ -1,0 +1,178 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.errors import ArtifactError, DataError, UnavailableError
+from worldline_core.evaluation.segmenters import train
+from worldline_core.evaluation.segmenters.augmentation import augment
+from worldline_core.evaluation.segmenters.base import open_segmenter
+from worldline_core.evaluation.segmenters.colour import ColourSegmenter
+from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
+from worldline_core.evaluation.segmenters.train import SegmenterConfig, train_segmenter
+from worldline_core.evaluation.segmenters.unet import UNet
+from worldline_core.evaluation.video.robot_iou import video_iou
+
+CONFIG = SegmenterConfig(
+    widths=(8, 16), steps=6, batch_size=4, checkpoint_every=2, evaluate_splits=("test",), frame_stride=4
+)
+
+
+@pytest.fixture
+def training(recordings, monkeypatch) -> Path:
+    """The small recordings, with every episode taken for a training one."""
+    from worldline_core.data.episode_set import EpisodeSet
+
+    select = EpisodeSet.select
+    monkeypatch.setattr(EpisodeSet, "select", lambda self, **values: select(self))
+    return recordings.inputs["episodes"]
+
+
+def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeypatch):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    result = train_segmenter(CONFIG, {"episodes": training}, whole)
+    assert result["videos"] == 4
+    save = train._save_state
+
+    def killed(path, step, *rest):
+        save(path, step, *rest)
+        if step == 4:
+            raise KeyboardInterrupt("killed")
+
+    monkeypatch.setattr(train, "_save_state", killed)
+    with pytest.raises(KeyboardInterrupt, match="killed"):
+        train_segmenter(CONFIG, {"episodes": training}, resumed)
+    monkeypatch.setattr(train, "_save_state", save)
+    train_segmenter(CONFIG, {"episodes": training}, resumed)
+    for name in ("model.safetensors", "segmenter.json", "losses.parquet"):
+        assert (whole / name).read_bytes() == (resumed / name).read_bytes()
+    description = json.loads((whole / "segmenter.json").read_text())
+    assert set(description["metrics"]["test"]) == {"iou", "iou_degraded", "videos"}
+    masks = LearnedSegmenter.load(whole).segment(np.zeros((2, 30, 50, 3), np.uint8))
+    assert (masks.shape, masks.dtype) == ((2, 30, 50), bool)
+
+
+def test_the_network_learns_a_mask():
+    """A few dozen steps on one frame pair suffice for a dark block on grey."""
+    torch.manual_seed(0)
+    frames = torch.full((2, 3, 16, 24), 0.6)
+    masks = torch.zeros(2, 16, 24)
+    masks[0, 4:12, 4:12] = masks[1, 6:14, 12:20] = 1
+    frames[masks[:, None].expand_as(frames) > 0] = 0.1
+    network = UNet((8, 16))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    for _ in range(40):
+        loss = train._loss(network(frames), masks)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    video = (frames * 255).round().byte().permute(0, 2, 3, 1).numpy()
+    assert (video_iou(masks.numpy() > 0, LearnedSegmenter(network).segment(video)) or 0) > 0.9
+
+
+def test_shipped_default_is_small():
+    assert sum(parameter.numel() for parameter in UNet().parameters()) <= 500_000
+
+
+def test_augmentation_moves_masks_with_frames_and_is_seeded():
+    masks = torch.zeros(8, 32, 48)
+    masks[:, 10:22, 18:34] = 1
+    frames = masks[:, None].repeat(1, 3, 1, 1) * 0.8 + 0.1
+    moved, moved_masks = augment(frames, frames, masks, torch.Generator().manual_seed(0))
+    again, _ = augment(frames, frames, masks, torch.Generator().manual_seed(0))
+    assert torch.equal(moved, again)
+    assert not torch.equal(moved_masks, masks)
+    inside = (moved.mean(1) * moved_masks).sum((1, 2)) / moved_masks.sum((1, 2))
+    outside = (moved.mean(1) * (1 - moved_masks)).sum((1, 2)) / (1 - moved_masks).sum((1, 2))
+    assert bool((inside > outside + 0.05).all())
+    assert float(moved.min()) >= 0
+    assert float(moved.max()) <= 1
+
+
+def test_colour_segmenter_finds_the_robot_from_points_of_the_first_frame(film):
+    frames, masks, points = film(True, seed=1)
+    later_unknown = points.copy()
+    later_unknown[1:] = np.nan
+    predicted = ColourSegmenter().segment(frames["head"], later_unknown)
+    assert (video_iou(masks, predicted) or 0) > 0.8
+    assert np.array_equal(predicted, ColourSegmenter().segment(frames["head"], points))
+    assert not ColourSegmenter().segment(frames["head"], None).any()
+    assert not ColourSegmenter().segment(frames["head"], np.full_like(points, np.nan)).any()
+
+
+def test_missing_weights_are_named(tmp_path, training):
+    with pytest.raises(ArtifactError, match="no weights"):
+        open_segmenter("learned", learned=None, sam3=None)
+    with pytest.raises(ArtifactError, match="Not a trained segmenter"):
+        open_segmenter("learned", learned=tmp_path, sam3=None)
+    with pytest.raises(UnavailableError, match="needs local weights"):
+        open_segmenter("sam3", learned=None, sam3=None)
+    with pytest.raises(UnavailableError, match="weights not found"):
+        open_segmenter("sam3", learned=None, sam3=tmp_path)
+    (tmp_path / "segmenter.json").write_text("{")
+    (tmp_path / "model.safetensors").write_bytes(b"x")
+    with pytest.raises(ArtifactError, match="cannot be read"):
+        open_segmenter("learned", learned=tmp_path, sam3=None)
+
+
+def test_training_needs_masks(training, tmp_path, monkeypatch):
+    from worldline_core.data.episode_set import EpisodeSet
+
+    monkeypatch.setattr(EpisodeSet, "robot_masks", lambda self, index, view: None)
+    with pytest.raises(DataError, match="exact robot masks"):
+        train_segmenter(CONFIG, {"episodes": training}, tmp_path)
+
+
+@pytest.mark.slow
+def test_sam3_classes_at_small_random_size(tmp_path):
+    """The real tracker and processor classes, random weights: shapes, prompts, loading."""
+    sam3 = pytest.importorskip("transformers.models.sam3_tracker_video")
+    from transformers import Sam3ImageProcessor
+    from transformers.models.sam2_video.video_processing_sam2_video import Sam2VideoVideoProcessor
+
+    from worldline_core.evaluation.segmenters.sam3 import Sam3Segmenter
+
+    size = 112
+    vision = {
+        "model_type": "sam3_vision_model",
+        "fpn_hidden_size": 128,
+        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
+        "backbone_config": {
+            "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,
+            "num_attention_heads": 2, "image_size": size, "patch_size": 14, "window_size": 4,
+            "global_attn_indexes": [1], "pretrain_image_size": size,
+        },
+    }  # fmt: skip
+    config = sam3.Sam3TrackerVideoConfig(
+        vision_config=vision,
+        prompt_encoder_config={"hidden_size": 128, "image_size": size},
+        mask_decoder_config={"hidden_size": 128, "mlp_dim": 64, "num_attention_heads": 2, "iou_head_hidden_dim": 64},
+        memory_attention_hidden_size=128,
+        memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=64,
+        memory_encoder_hidden_size=128,
+        memory_encoder_output_channels=64,
+        mask_downsampler_embed_dim=128,
+        memory_fuser_embed_dim=128,
+        memory_fuser_intermediate_dim=64,
+        image_size=size,
+    )
+    torch.manual_seed(0)
+    square = {"height": size, "width": size}
+    processor = sam3.Sam3TrackerVideoProcessor(
+        Sam3ImageProcessor(size=square, mask_size={"height": 32, "width": 32}), Sam2VideoVideoProcessor(size=square)
+    )
+    segmenter = Sam3Segmenter(sam3.Sam3TrackerVideoModel(config), processor)
+    video = np.random.default_rng(0).integers(0, 256, (4, 64, 96, 3), dtype=np.uint8)
+    points = np.full((4, 2, 2), np.nan)
+    assert not segmenter.segment(video, points).any()
+    points[:, 0] = (30, 30)
+    one = segmenter.segment(video, points)
+    assert (one.shape, one.dtype) == ((4, 64, 96), bool)
+    points[0, 1] = (200, 30)  # outside of the frame: ignored
+    assert np.array_equal(segmenter.segment(video, points), one)
+    segmenter.model.save_pretrained(tmp_path)
+    processor.save_pretrained(tmp_path)
+    assert np.array_equal(Sam3Segmenter.load(tmp_path).segment(video, points), one)

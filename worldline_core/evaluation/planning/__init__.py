@@ -1,0 +1,1 @@
+"""Planning: choose one of N candidate control sequences by their predicted videos."""

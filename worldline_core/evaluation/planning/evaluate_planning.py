@@ -1,0 +1,210 @@
+"""The step evaluate_planning: is the candidate chosen by its predicted video better than one taken blindly?
+
+Every method's videos of the same banks go through the same brackets. Labels stay sealed: they are opened once all
+choices of all methods are on disk. The recorded videos are chosen from too (method ``true``): that is the selector's
+own ceiling.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from worldline_core.config.base import StrictModel
+from worldline_core.data.episode import VIEWS
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.vlm.config import VLMConfig
+from worldline_core.store.atomic import write_json_atomic
+
+if TYPE_CHECKING:
+    from worldline_core.data.episode_set import EpisodeRow
+    from worldline_core.evaluation.planning.selector import CandidateVideo, Selector
+    from worldline_core.evaluation.recordings import Recordings
+
+CHOICES_FILE = "choices.parquet"
+SEALED_FILE = "sealed_outcomes.parquet"
+
+
+class PlanningConfig(StrictModel):
+    """Who selects, and among how many."""
+
+    selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
+    vlm: VLMConfig = VLMConfig()
+    segmenter: Literal["learned", "colour", "sam3"] = Field(
+        default="learned", description="used by the measured selector"
+    )
+    sam3_weights: Path | None = None
+    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
+    runs: int = Field(
+        default=5, ge=1, description="orders of each bank's candidates; smaller budgets are prefixes of an order"
+    )
+    resamples: int = Field(default=2000, ge=100)
+    seed: int = Field(default=42, ge=0)
+
+
+def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """Choose in every bank, for every method and budget; then open the labels.
+
+    Inputs: banks, rollouts.<method>; tracks and segmenter where the selector uses them.
+    Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json.
+    """
+    from tqdm import tqdm
+
+    from worldline_core.evaluation.planning.outcomes import read_outcomes, write_results
+    from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
+
+    recordings = Recordings.open(inputs["banks"])
+    rollouts = open_rollouts(inputs)
+    banks = list_banks(recordings.episodes.rows)
+    selector = open_selector(config, inputs.get("segmenter"))
+    choices: list[dict[str, Any]] = []
+    for method in (TRUE_METHOD, *rollouts):
+        for bank, rows in tqdm(banks.items(), desc=f"evaluate_planning {method}", unit="bank", disable=None):
+            part = output / "run" / "parts" / method / f"{bank}.json"
+            if not part.exists():
+                load = _Loader(config, recordings, inputs.get("tracks"), rollouts.get(method), method, rows)
+                write_json_atomic(part, _choose_in_bank(config, selector, bank, rows, load))
+            choices += [{"method": method, "bank": bank, **choice} for choice in json.loads(part.read_text())]
+    _write_choices(output, choices)
+    # Only now: nothing above has read, or could read, how any candidate ended.
+    outcomes = read_outcomes(
+        inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
+    )
+    return write_results(config, selector.name, banks, choices, outcomes, output)
+
+
+def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
+    """Candidates of each bank in their order.
+
+    Raises: DataError when rows are no candidates, or a bank has two with one number or two instructions.
+    """
+    banks: dict[str, list[EpisodeRow]] = defaultdict(list)
+    for row in rows:
+        if row.bank is None or row.candidate is None:
+            raise DataError(
+                "An episode of the banks is no candidate",
+                where=row.episode_id,
+                expected="bank and candidate in the index",
+                next_step="give candidate banks, not ordinary recordings",
+            )
+        banks[row.bank].append(row)
+    ordered = {bank: sorted(members, key=lambda row: row.candidate or 0) for bank, members in sorted(banks.items())}
+    for bank, members in ordered.items():
+        if len({row.candidate for row in members}) != len(members) or len({row.instruction for row in members}) != 1:
+            raise DataError("A bank's candidates need distinct numbers and one instruction", where=bank)
+    return ordered
+
+
+def open_selector(config: PlanningConfig, segmenter: Path | None) -> Selector:
+    """The selector that the config names."""
+    if config.selector == "measured":
+        from worldline_core.evaluation.planning.measured_selector import MeasuredSelector
+        from worldline_core.evaluation.segmenters.base import open_segmenter
+
+        return MeasuredSelector(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
+    from worldline_core.evaluation.planning.vlm_selector import VLMSelector
+    from worldline_core.evaluation.vlm.config import open_vlm
+
+    return VLMSelector(open_vlm(config.selector, config.vlm))
+
+
+def _choose_in_bank(
+    config: PlanningConfig, selector: Selector, bank: str, rows: list[EpisodeRow], load: _Loader
+) -> list[dict[str, Any]]:
+    """One choice a run and budget; budgets larger than the bank are left out.
+
+    The paper samples a new bank for every run. Here a run is another order of the same bank (the first one is the
+    recorded order), which changes what the smaller budgets contain.
+    """
+    from worldline_core.evaluation.planning.bracket import choose, describe, shown_order
+
+    results = []
+    for run in range(config.runs):
+        numbers = list(range(len(rows)))
+        order = numbers if run == 0 else shown_order(numbers, f"{bank} run {run}", config.seed)
+        for budget in sorted({budget for budget in config.budgets if budget <= len(rows)}):
+            scene = f"{bank} {run} {budget}"
+            choice = choose(selector, rows[0].instruction, order[:budget], load, scene=scene, seed=config.seed)
+            episode_id = rows[choice.candidate].episode_id
+            results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": describe(choice)})
+    return results
+
+
+class _Loader:
+    """Videos of one bank's candidates, decoded once."""
+
+    def __init__(
+        self,
+        config: PlanningConfig,
+        recordings: Recordings,
+        tracks: Path | None,
+        rollout: Any | None,
+        method: str,
+        rows: list[EpisodeRow],
+    ) -> None:
+        from worldline_core.evaluation.recordings import open_tracks
+
+        self.config, self.recordings, self.rollout, self.method, self.rows = config, recordings, rollout, method, rows
+        self.tracks = open_tracks(tracks)
+        self.kept: dict[int, CandidateVideo] = {}
+        if rollout is not None:
+            missing = [row.episode_id for row in rows if row.episode_id not in rollout.episode_ids]
+            if missing:
+                raise ArtifactError(
+                    "A method has not predicted every candidate of a bank",
+                    where=f"method {method}, bank {rows[0].bank}",
+                    got=f"{len(missing)} missing, for example {missing[0]}",
+                    next_step="roll out all candidates with this method",
+                )
+
+    def __call__(self, candidate: int) -> CandidateVideo:
+        from worldline_core.evaluation.planning.selector import CandidateVideo, planning_indices
+        from worldline_core.evaluation.recordings import tool_points
+
+        if candidate not in self.kept:
+            row = self.rows[candidate]
+            videos = {
+                view: (
+                    self.recordings.frames(row.episode_id, view)
+                    if self.rollout is None
+                    else self.rollout.frames(row.episode_id, view, self.rollout.seeds(row.episode_id)[0])
+                )
+                for view in self.recordings.views(row.episode_id, self.config.views)
+            }
+            count = min(len(video) for video in videos.values())
+            indices = planning_indices(count)
+            points = None if self.tracks is None else tool_points(self.tracks, row.episode_id, "head", count)
+            self.kept[candidate] = CandidateVideo(
+                label="",
+                frames={view: video[list(indices)] for view, video in videos.items()},
+                indices=indices,
+                fps=row.fps,
+                total_frames=count,
+                points=None if points is None else points[list(indices)],
+            )
+        return self.kept[candidate]
+
+
+def _write_choices(output: Path, choices: list[dict[str, Any]]) -> None:
+    import pyarrow as pa
+
+    from worldline_core.evaluation.scores import write_table
+
+    schema = pa.schema(
+        [
+            ("method", pa.string()),
+            ("bank", pa.string()),
+            ("run", pa.int32()),
+            ("budget", pa.int32()),
+            ("episode_id", pa.string()),
+            ("trace", pa.string()),
+        ]
+    )
+    rows = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
+    write_table(output / CHOICES_FILE, rows, schema)

@@ -1,0 +1,1 @@
+"""Policy evaluation: evidence from videos, deterministic rules, accuracy against recorded outcomes."""

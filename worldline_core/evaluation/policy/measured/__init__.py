@@ -1,0 +1,1 @@
+"""Evidence measured by colour tracking: no language model, only things that an instruction names by colour."""

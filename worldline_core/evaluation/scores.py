@@ -1,0 +1,116 @@
+"""Scores: one tidy table, one value a row, and a summary with intervals.
+
+A row's ``value`` is already the mean over time of one trajectory, view and seed. Summaries weight trajectory-view
+pairs equally and resample trajectories.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from worldline_core.evaluation.statistics import bootstrap_mean, paired_difference
+from worldline_core.store.atomic import atomic_path
+
+SCORES_FILE = "scores.parquet"
+SUMMARY_FILE = "summary.json"
+
+
+@dataclass(frozen=True, order=True)
+class Score:
+    """One measured value of one predicted (or recorded) trajectory."""
+
+    method: str
+    episode_id: str
+    embodiment: str
+    split: str
+    view: str
+    seed: int
+    metric: str
+    value: float
+    scene: str = ""
+    task_family: str = ""
+    outcome: str = ""
+
+
+_TYPES = {"seed": pa.int32(), "value": pa.float64()}
+SCORE_SCHEMA = pa.schema([(field.name, _TYPES.get(field.name, pa.string())) for field in fields(Score)])
+
+
+def write_scores(folder: Path, scores: Iterable[Score]) -> None:
+    """Write ``scores.parquet``, sorted, so that equal scores give equal bytes."""
+    write_table(folder / SCORES_FILE, [asdict(score) for score in sorted(scores)], SCORE_SCHEMA)
+
+
+def read_scores(folder: Path) -> list[Score]:
+    """The scores of a finished Scores artifact."""
+    return [Score(**row) for row in pq.read_table(folder / SCORES_FILE).to_pylist()]
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+    """Write rows as Parquet, whole or not at all."""
+    with atomic_path(path) as temporary:
+        pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema), temporary)
+
+
+def group_names(score: Score) -> tuple[str, ...]:
+    """The groups a score is reported in: its split, and within it its embodiment and outcome."""
+    names = [score.split, f"{score.split}/{score.embodiment}"]
+    if score.outcome in ("success", "failure"):
+        names.append(f"{score.split}/{score.outcome}")
+    return tuple(names)
+
+
+def summarise(
+    scores: Sequence[Score],
+    *,
+    comparisons: Sequence[tuple[str, str]] | None,
+    resamples: int,
+    seed: int,
+    by_view: bool = False,
+) -> dict[str, Any]:
+    """Means with 95 % intervals over trajectories, and paired differences between methods.
+
+    Args:
+        comparisons: pairs (first, second), reported as first - second; None takes every pair of methods.
+        by_view: also give every metric per view, as ``metric@view``.
+
+    Returns:
+        {"metrics": {group: {method: {metric: interval}}},
+         "differences": {group: [{"first", "second", "metric", mean, low, high, count}]}}
+    """
+    values: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for score in sorted(scores):
+        names = [score.metric] + ([f"{score.metric}@{score.view}"] if by_view and score.view else [])
+        for group in group_names(score):
+            for name in names:
+                values[group, score.method, name][score.episode_id].append(score.value)
+
+    metrics: dict[str, dict[str, dict[str, Any]]] = defaultdict(lambda: defaultdict(dict))
+    means: dict[tuple[str, str], dict[str, dict[str, float]]] = defaultdict(dict)
+    for (group, method, metric), by_episode in values.items():
+        episode_means = {name: sum(items) / len(items) for name, items in by_episode.items()}
+        means[group, metric][method] = episode_means
+        weights = [len(items) for items in by_episode.values()]
+        interval = bootstrap_mean(list(episode_means.values()), weights=weights, resamples=resamples, seed=seed)
+        metrics[group][method][metric] = interval.as_json()
+
+    differences: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for (group, metric), by_method in means.items():
+        methods = sorted(by_method)
+        pairs = comparisons
+        if pairs is None:
+            pairs = [(a, b) for index, a in enumerate(methods) for b in methods[index + 1 :]]
+        for first, second in pairs:
+            if first not in by_method or second not in by_method:
+                continue
+            interval = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
+            if interval is not None:
+                differences[group].append({"first": first, "second": second, "metric": metric, **interval.as_json()})
+    return {"metrics": metrics, "differences": differences}

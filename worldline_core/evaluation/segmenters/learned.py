@@ -1,0 +1,92 @@
+"""The learned segmenter: a small U-Net on single frames.
+
+It sees neither points nor other frames, so it cannot know where the robot ought to be: what it marks in a predicted
+video is what that video shows.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from worldline_core.errors import ArtifactError
+from worldline_core.evaluation.segmenters.unet import UNet
+from worldline_core.evaluation.video.metrics import frames_to_unit
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+
+WEIGHTS_FILE = "model.safetensors"
+DESCRIPTION_FILE = "segmenter.json"
+_BATCH = 64
+
+
+class LearnedSegmenter:
+    """A trained U-Net; a pixel whose probability exceeds ``threshold`` is robot."""
+
+    name = "learned"
+    follows = False
+
+    def __init__(self, network: UNet, threshold: float = 0.5) -> None:
+        self.network = network.eval().requires_grad_(False)
+        self.threshold = threshold
+
+    @property
+    def description(self) -> str:
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        return f"U-Net on single frames, {count / 1e6:.2f} M parameters, trained on exact masks of training recordings"
+
+    @torch.no_grad()
+    def segment(self, video: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """Bool masks (n, h, w) of uint8 frames (n, h, w, 3); ``points`` are not used."""
+        device = next(self.network.parameters()).device
+        masks = []
+        for start in range(0, len(video), _BATCH):
+            frames = torch.from_numpy(np.ascontiguousarray(video[start : start + _BATCH])).to(device)
+            frames = frames_to_unit(frames)
+            with torch.autocast(device.type, dtype=torch.bfloat16):
+                logits = self.network(frames)
+            masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
+        return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
+
+    @classmethod
+    def load(cls, folder: Path) -> LearnedSegmenter:
+        """Open a trained segmenter.
+
+        Raises: ArtifactError for a missing or damaged folder, or weights of another network.
+        """
+        description_path, weights_path = folder / DESCRIPTION_FILE, folder / WEIGHTS_FILE
+        missing = [path.name for path in (description_path, weights_path) if not path.is_file()]
+        if missing:
+            raise ArtifactError(
+                "Not a trained segmenter",
+                where=folder,
+                expected=f"{DESCRIPTION_FILE} and {WEIGHTS_FILE}",
+                got=f"missing {missing}",
+                next_step="run train_segmenter, or use artifacts/shipped/segmenter",
+            )
+        try:
+            description = json.loads(description_path.read_text())
+            network = UNet(tuple(description["widths"]))
+            threshold = float(description["threshold"])
+            state = {name: value.float() for name, value in load_file(weights_path).items()}
+            network.load_state_dict(state)
+        except (json.JSONDecodeError, KeyError, TypeError, SafetensorError, RuntimeError) as error:
+            raise ArtifactError(
+                "The segmenter cannot be read", where=folder, got=str(error), next_step="train it again"
+            ) from error
+        return cls(network, threshold)
+
+
+def save_segmenter(
+    folder: Path, widths: tuple[int, ...], state: dict[str, Tensor], description: dict[str, Any]
+) -> None:
+    """Write a segmenter in half precision; ``description`` needs a threshold."""
+    halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in state.items()}
+    write_bytes_atomic(folder / WEIGHTS_FILE, save(halves))
+    write_json_atomic(folder / DESCRIPTION_FILE, {"kind": "learned", "widths": list(widths), **description})

@@ -1,0 +1,1 @@
+"""Full-frame and robot-mask agreement between predicted and recorded videos."""
