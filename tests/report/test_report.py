@@ -134,7 +134,7 @@ def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:
     assert "selector&#x27;s ceiling" in section(text, "planning")
     assert "median of 3 on held-out scenes" in section(text, "videos")
     assert "truncated_video" in section(text, "filters")
-    assert "quarantine_static.jpg" in section(text, "filters")
+    assert "refused_static.jpg" in section(text, "filters")
 
 
 def test_split_is_checked_not_assumed(full_report: Path) -> None:

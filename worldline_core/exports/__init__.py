@@ -1,0 +1,5 @@
+"""Exports: labelled pictures, browser videos, Rerun recordings and MCAP files.
+
+Axes: frames are `n h w 3` uint8 RGB; views follow the project's fixed order (head, left wrist, right wrist).
+Import from the submodules: `contact_sheet`, `side_by_side`, `overlays`, `rerun_recording`, `mcap_recording`, `rollout`.
+"""

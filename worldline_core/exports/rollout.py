@@ -1,0 +1,117 @@
+"""Export of one episode with its predictions: a Rerun recording, MCAP files, or side-by-side videos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from worldline_core.data.episode import VIEWS
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.exports.rerun_recording import RecordingContent, TrackSignals, write_rerun_recording
+from worldline_core.exports.side_by_side import write_side_by_side
+
+if TYPE_CHECKING:
+    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.rollout.rollout_set import RolloutSet
+
+Format = Literal["mp4", "rrd", "mcap"]
+FORMATS: tuple[str, ...] = ("mp4", "rrd", "mcap")
+
+
+def export_rollout(
+    rollout_sets: RolloutSet | Mapping[str, RolloutSet],
+    episode_set: EpisodeSet,
+    tracks: ActionTracks | None,
+    episode_id: str,
+    output: Path,
+    formats: Sequence[str] = FORMATS,
+    *,
+    name: str | None = None,
+) -> list[Path]:
+    """Writes an episode's predictions below `output` and returns the files.
+
+    Args:
+        rollout_sets: one set, or several by method name.
+        tracks: action tracks for tool poses and heat maps; left out when None.
+        formats: `mp4` (one side-by-side video a view), `rrd` (one recording with everything), `mcap` (one a method).
+        name: beginning of the file names (default: the episode's id).
+
+    Raises:
+        ConfigError: an unknown format.
+        DataError: no set predicted this episode, or the set does not hold it.
+    """
+    unknown = [wanted for wanted in formats if wanted not in FORMATS]
+    if unknown:
+        raise ConfigError("Unknown export format", expected=", ".join(FORMATS), got=", ".join(unknown))
+    sets = dict(rollout_sets) if isinstance(rollout_sets, Mapping) else {rollout_sets.method: rollout_sets}
+    having = {method: item for method, item in sets.items() if episode_id in item.episode_ids}
+    if not having:
+        raise DataError(
+            "No prediction of this episode", where=episode_id, expected="an episode of the RolloutSet",
+            got=", ".join(sets) or "no RolloutSet", next_step="list what was predicted with `worldline inspect <folder>`",
+        )  # fmt: skip
+    content = recording_content(having, episode_set, tracks, episode_id)
+    stem = name or safe_stem(episode_id)
+    output.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    if "mp4" in formats:
+        written += write_videos(content, output, stem)
+    if "rrd" in formats:
+        path = output / f"{stem}.rrd"
+        write_rerun_recording(path, content)
+        written.append(path)
+    if "mcap" in formats:
+        from worldline_core.exports.mcap_recording import write_mcap_recordings
+
+        written += write_mcap_recordings(content, output, stem)
+    return written
+
+
+def recording_content(
+    rollouts: Mapping[str, RolloutSet], episode_set: EpisodeSet, tracks: ActionTracks | None, episode_id: str
+) -> RecordingContent:
+    """Gathers the frames, predictions and tracks of one episode."""
+    index = episode_set.position(episode_id)
+    episode = episode_set.episode(index)
+    views = [view for view in VIEWS if view in episode_set.rows[index].views]
+    predicted: dict[str, dict[str, np.ndarray]] = {}
+    for method, rollout in rollouts.items():
+        seed = rollout.seeds(episode_id)[0]
+        predicted[method] = {view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views}
+    true_frames = {view: np.asarray(episode_set.frames(index, view)) for view in views}
+    signals = None if tracks is None else track_signals(tracks, episode_id)
+    return RecordingContent(episode, true_frames, predicted, signals, episode.state_names or ())
+
+
+def track_signals(tracks: ActionTracks, episode_id: str) -> TrackSignals:
+    """One episode's tracks as the recording shows them."""
+    found = tracks.tracks(episode_id)
+    return TrackSignals(
+        uv=np.asarray(found.uv, dtype=np.float64),
+        valid=np.asarray(found.valid, dtype=bool),
+        gripper=np.asarray(found.gripper[:, 0], dtype=np.float64),
+        T_base_tool=np.asarray(found.T_base_tool, dtype=np.float64),
+        views=found.views,
+        arms=found.arms,
+    )
+
+
+def write_videos(content: RecordingContent, output: Path, stem: str) -> list[Path]:
+    """One side-by-side video a view: truth, then every method."""
+    written: list[Path] = []
+    for view, frames in content.true_frames.items():
+        columns = {"true": frames} | {
+            method: views[view] for method, views in content.predicted_frames.items() if view in views
+        }
+        made = write_side_by_side(output / f"{stem}_{view}.mp4", columns, content.episode.fps)
+        written += [made.video, made.poster]
+    return written
+
+
+def safe_stem(episode_id: str) -> str:
+    """An episode's id as the beginning of a file name."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in episode_id)

@@ -1,0 +1,89 @@
+"""What every section of the report is given, and what it gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldline_core.exports.pictures import jpeg_bytes, png_bytes
+from worldline_core.report.artifacts import ReportInputs
+from worldline_core.report.config import ReportConfig
+from worldline_core.report.markup import Child, Html, element
+from worldline_core.report.video_scores import VideoScores
+from worldline_core.store.atomic import write_bytes_atomic
+
+if TYPE_CHECKING:
+    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.exports.labels import Picture
+    from worldline_core.rollout.rollout_set import RolloutSet
+
+
+@dataclass(frozen=True)
+class Section:
+    """One section: its anchor, title, one sentence of introduction, and its content; or why it is missing."""
+
+    anchor: str
+    title: str
+    lead: Child = None
+    body: Child = None
+    missing: str | None = None
+
+
+@dataclass
+class ReportContext:
+    """The configuration, the inputs, and the folder that media go to.
+
+    `run_parts` collects what is not reproducible (times, devices, versions): it is written to `run/run.js`, outside
+    the digested page, and put into the page's slots when it is opened.
+    """
+
+    config: ReportConfig
+    inputs: ReportInputs
+    output: Path
+    run_parts: dict[str, Html] = field(default_factory=dict)
+
+    @cached_property
+    def media(self) -> Path:
+        folder = self.output / "media"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @cached_property
+    def video_scores(self) -> VideoScores:
+        """Scores of every video evaluation."""
+        return VideoScores.read(self.inputs.variants("evaluate_video"))
+
+    @cached_property
+    def rollouts(self) -> dict[str, RolloutSet]:
+        """Predicted videos by method, those of candidate banks apart."""
+        from worldline_core.rollout.rollout_set import RolloutSet
+
+        return {name: RolloutSet.open(path) for name, path in self.inputs.variants("rollout").items()}
+
+    @cached_property
+    def episodes(self) -> EpisodeSet | None:
+        """The filtered episodes, or the curated ones when there are no filtered ones."""
+        from worldline_core.data.episode_set import EpisodeSet
+
+        folder = self.inputs.get("filter") or self.inputs.get("curate") or self.inputs.get("episodes")
+        return None if folder is None else EpisodeSet.open(folder)
+
+    def picture(self, name: str, picture: Picture, *, alt: str, photo: bool = False) -> Html:
+        """Writes a picture and returns the element that shows it; photographs become JPEG, drawings PNG."""
+        path = self.media / f"{name}.{'jpg' if photo else 'png'}"
+        write_bytes_atomic(path, jpeg_bytes(picture) if photo else png_bytes(picture))
+        height, width = picture.shape[:2]
+        return element("img", src=f"media/{path.name}", alt=alt, width=width, height=height, loading="lazy")
+
+    def slot(
+        self, name: str, content: Html, fallback: str | None = "Recorded when the report was made; see run/run.js."
+    ) -> Html:
+        """A place in the page that is filled from `run/run.js`."""
+        self.run_parts[name] = content
+        return element("div", element("p", fallback, class_="muted") if fallback else None, data_run=name)
+
+
+SectionMaker = Callable[[ReportContext], Section]

@@ -1,0 +1,109 @@
+"""Video scores of one or several evaluations, as the sections of the report read them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from worldline_core.report.artifacts import JsonObject, read_json, read_rows
+from worldline_core.report.methods import Method, in_order
+
+SPLIT_ORDER = ("test", "ood_test", "validation", "train", "bank")
+SPLIT_LABELS = {
+    "test": "held-out scenes",
+    "ood_test": "held-out embodiment",
+    "validation": "validation",
+    "train": "training scenes",
+    "bank": "candidate banks",
+}
+IOU_METRICS = ("robot_iou_exact", "robot_iou")
+"""In order of preference: against the recording's exact masks, or against the segmenter's own masks of the truth."""
+
+
+@dataclass(frozen=True)
+class VideoScores:
+    """Summaries and tidy rows of `evaluate_video` artifacts, merged. Rows of the method `true` rate the segmenter."""
+
+    summaries: Sequence[JsonObject]
+    rows: Sequence[JsonObject]
+    by_frame: Sequence[JsonObject]
+
+    @classmethod
+    def read(cls, folders: Mapping[str, Path]) -> VideoScores:
+        """Reads every folder's summary.json, scores.parquet and by_frame.parquet (absent files count as empty)."""
+        paths = list(folders.values())
+        return cls(
+            [summary for path in paths if (summary := read_json(path / "summary.json"))],
+            [row for path in paths for row in read_rows(path / "scores.parquet")],
+            [row for path in paths for row in read_rows(path / "by_frame.parquet")],
+        )
+
+    @cached_property
+    def groups(self) -> list[str]:
+        """Splits that have scores, the held-out ones first."""
+        found = {g for s in self.summaries for g in s.get("metrics", {}) if "/" not in g}
+        return sorted(found, key=lambda g: (SPLIT_ORDER.index(g) if g in SPLIT_ORDER else 99, g))
+
+    def subgroups(self, split: str) -> list[str]:
+        """Groups within a split: embodiments and outcomes."""
+        return sorted({g for s in self.summaries for g in s.get("metrics", {}) if g.startswith(f"{split}/")})
+
+    def methods(self, group: str) -> list[Method]:
+        """Methods scored in a group, in the report's order."""
+        return in_order(sorted({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})}))
+
+    def value(self, group: str, method: str, metric: str) -> JsonObject | None:
+        """`{"mean", "low", "high", "count"}` of a metric (`psnr`, `psnr@head`, ...), or None."""
+        for summary in self.summaries:
+            found = summary.get("metrics", {}).get(group, {}).get(method, {}).get(metric)
+            if found is not None:
+                return found
+        return None
+
+    def difference(self, group: str, first: str, second: str, metric: str) -> JsonObject | None:
+        """Paired difference `first - second` over the trajectories that both have, or None."""
+        for summary in self.summaries:
+            for row in summary.get("differences", {}).get(group, []):
+                if row["metric"] != metric:
+                    continue
+                if (row["first"], row["second"]) == (first, second):
+                    return row
+                if (row["first"], row["second"]) == (second, first):
+                    return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
+        return None
+
+    @cached_property
+    def unavailable(self) -> dict[str, str]:
+        """Metrics that could not be measured, with the reason."""
+        return {name: reason for summary in self.summaries for name, reason in summary.get("unavailable", {}).items()}
+
+    @cached_property
+    def segmenters(self) -> list[dict[str, Any]]:
+        """The segmenters used, each with its own accuracy on true frames."""
+        found: dict[str, dict[str, Any]] = {}
+        for summary in self.summaries:
+            for segmenter in summary.get("segmenters", []):
+                found.setdefault(segmenter["name"], segmenter)
+        return list(found.values())
+
+    def iou_metric(self, group: str, method: str) -> str | None:
+        """The most trustworthy IoU that a method has."""
+        return next((metric for metric in IOU_METRICS if self.value(group, method, f"{metric}@head")), None)
+
+    def per_episode(self, method: str, metric: str, view: str, split: str) -> dict[str, float]:
+        """Mean over seeds of a metric, by episode."""
+        values: dict[str, list[float]] = defaultdict(list)
+        for row in self.rows:
+            if (row["method"], row["metric"], row["view"], row["split"]) == (method, metric, view, split):
+                values[row["episode_id"]].append(row["value"])
+        return {name: sum(items) / len(items) for name, items in sorted(values.items())}
+
+    def primary(self, group: str, configured: str | None = None) -> Method | None:
+        """The method whose results head the page: the configured one, or the first that a model made."""
+        methods = self.methods(group)
+        named = next((m for m in methods if m.name == configured), None)
+        return named or next((m for m in methods if m.kind == "stage2"), methods[0] if methods else None)
