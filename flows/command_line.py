@@ -68,7 +68,8 @@ def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
 def _use_local_prefect_storage(artifacts: Path) -> None:
     """Prefect's cache records belong to the artifacts that they speak of. Must happen before Prefect is imported."""
     os.environ.setdefault("PREFECT_LOCAL_STORAGE_PATH", str((artifacts / "prefect").resolve()))
-    os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "90")
+    os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+    os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
 
 
 def _pipeline(arguments: argparse.Namespace) -> None:

@@ -87,9 +87,19 @@ def print_artifact(artifact: Artifact) -> None:
 
 def exit_with_clear_errors(action: Callable[[], object]) -> None:
     """Run a command; a WorldLineError is printed without a traceback and ends it with status 1."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    _log_to_stderr()
     try:
         action()
     except WorldLineError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error
+
+
+def _log_to_stderr() -> None:
+    """Show this project's messages; Prefect and the libraries keep their own handlers."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s | %(levelname)-7s | %(message)s", datefmt="%H:%M:%S"))
+    for name in ("worldline_core", "tasks", "flows"):
+        project_logger = logging.getLogger(name)
+        project_logger.handlers = [handler]
+        project_logger.setLevel(logging.INFO)

@@ -120,7 +120,6 @@ def test_interrupted_work_continues_to_the_same_bytes(rendered, episode_set, tmp
     render_actions(CONFIG, {"episodes": episode_set}, again)
     (again / "index.parquet").unlink()
     (again / "tracks-00001.safetensors").unlink()
-    (again / "run" / "shard-00001.json").unlink()
     (again / "previews" / "so101-0.mp4").unlink()
     (again / "previews" / "so101-0.png").write_bytes((output / "previews" / "so101-0.png").read_bytes())
     untouched = (again / "tracks-00000.safetensors").stat().st_mtime_ns

@@ -17,7 +17,7 @@ from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.overlay import contact_sheet, overlay_frames
-from worldline_core.actions.tracks import ActionTracks, write_index, write_shard
+from worldline_core.actions.tracks import ActionTracks, shard_name, write_index, write_shard
 from worldline_core.config import StrictModel
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_index import QuarantineRow, write_quarantine
@@ -131,7 +131,7 @@ def _shard(
 ) -> dict[str, Any]:
     """Tracks of some episodes into one shard: index rows, rejected episodes, counts (remembered for a restart)."""
     done = output / "run" / f"shard-{number:05d}.json"
-    if done.is_file():
+    if done.is_file() and (output / shard_name(number)).is_file():
         return json.loads(done.read_text(encoding="utf-8"))
     tracks: list[EpisodeTracks] = []
     rejected: list[dict[str, str]] = []
@@ -202,7 +202,12 @@ def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionT
         moments = np.unique(np.linspace(0, len(overlay) - 1, config.preview_rows).round().astype(int)).tolist()
         sheet = contact_sheet(overlay, moments, f"{row.episode_id}  {row.embodiment}  {row.instruction}")
         with atomic_path(video_path) as temporary:
-            encode_video(temporary, overlay[:, : overlay.shape[1] // 2 * 2, : overlay.shape[2] // 2 * 2], row.fps)
+            encode_video(
+                temporary,
+                overlay[:, : overlay.shape[1] // 2 * 2, : overlay.shape[2] // 2 * 2],
+                row.fps,
+                preset="veryfast",
+            )
         encoded, png = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
         if not encoded:
             raise DataError("Contact sheet cannot be encoded", where=row.episode_id, got=str(sheet.shape))

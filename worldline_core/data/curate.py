@@ -132,7 +132,7 @@ def _list_inputs(config: CurateConfig, inputs: Mapping[str, Path]) -> list[_Inpu
     for number, source_config in enumerate(config.sources):
         root = inputs.get(f"source.{number}", source_config.path)
         source = open_source(source_config, root)
-        for episode_id in source.episode_ids():
+        for episode_id in filter(source_config.includes, source.episode_ids()):
             repeated = episode_id in seen
             identity = f"{episode_id}#source.{number}" if repeated else episode_id
             seen.add(identity)

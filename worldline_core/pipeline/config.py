@@ -16,6 +16,7 @@ from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationCon
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.filters.filter import FilterConfig
 from worldline_core.report.report import ReportConfig
+from worldline_core.model.import_backbone import ImportBackboneConfig
 from worldline_core.rollout.rollout import RolloutConfig
 from worldline_core.training.encode_latents import EncodeLatentsConfig
 from worldline_core.training.stage1 import Stage1Config
@@ -50,6 +51,7 @@ class PipelineConfig(StrictModel):
     """Everything that `worldline pipeline` does."""
 
     models: ModelPaths
+    import_backbone: ImportBackboneConfig | None = Field(default=None, description="only for `task import_backbone`")
     curate: CurateConfig
     curate_banks: CurateConfig | None = None
     filter: FilterConfig

@@ -123,7 +123,7 @@ def find_artifacts(nodes: list[Node], store: ArtifactStore) -> dict[str, Artifac
     found: dict[str, Artifact] = {}
     for node in nodes:
         inputs = _resolve(node, found)
-        if inputs is None:
+        if inputs is None or not all(path.is_dir() for path in inputs.values()):
             continue
         digests = {name: store.input_digest(path) for name, path in sorted(inputs.items())}
         step = get_step(node.step)

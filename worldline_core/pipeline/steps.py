@@ -97,6 +97,15 @@ _STEPS = (
         summary="cache the video tokenizer's latents",
     ),
     Step(
+        "import_backbone",
+        1,
+        "worldline_core.model.import_backbone",
+        "import_backbone",
+        "ImportBackboneConfig",
+        ("diffusers",),
+        summary="turn pretrained Cosmos3 weights into the base checkpoint",
+    ),
+    Step(
         "train_tokenizer",
         1,
         "worldline_core.model.tokenizer.train",

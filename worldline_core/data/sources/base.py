@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Protocol
 
@@ -43,10 +44,15 @@ class SourceConfigBase(StrictModel):
 
     path: Path = Field(description="folder of the recordings")
     name: str | None = Field(None, description="name of the source in the index; default: the folder's name")
+    include: tuple[str, ...] | None = Field(None, description="shell patterns of the episode ids to read; null: all")
 
     @property
     def label(self) -> str:
         return self.name or self.path.name
+
+    def includes(self, episode_id: str) -> bool:
+        """Whether the configuration asks for this episode."""
+        return self.include is None or any(fnmatchcase(episode_id, pattern) for pattern in self.include)
 
 
 class ForeignSourceConfig(SourceConfigBase):

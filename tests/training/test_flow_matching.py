@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from worldline_core.errors import ConfigError
+from worldline_core.training.flow_matching import (
+    LossWeighting,
+    SigmaSampling,
+    add_noise,
+    flow_matching_loss,
+    sample_sigmas,
+    velocity_target,
+)
+
+
+@pytest.fixture
+def clip() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    latents, noise = torch.randn(2, 2, 3, 4, 5, 2, 2, generator=generator)
+    return latents, noise, torch.tensor([0.3, 0.8])
+
+
+def test_noise_is_a_straight_line_and_spares_the_first_frame(clip: tuple[torch.Tensor, ...]) -> None:
+    latents, noise, sigma = clip
+    noisy = add_noise(latents, noise, sigma)
+    assert torch.equal(noisy[:, :, :, 0], latents[:, :, :, 0])
+    torch.testing.assert_close(noisy[1, :, :, 2], 0.2 * latents[1, :, :, 2] + 0.8 * noise[1, :, :, 2])
+    # z = z_sigma - sigma v
+    recovered = noisy[1] - 0.8 * velocity_target(latents, noise)[1]
+    torch.testing.assert_close(recovered[:, :, 1:], latents[1, :, :, 1:])
+
+
+@pytest.mark.parametrize("weighting", [LossWeighting(), LossWeighting(kind="sample", motion=2.0)])
+def test_first_frame_carries_no_loss(clip: tuple[torch.Tensor, ...], weighting: LossWeighting) -> None:
+    latents, noise, sigma = clip
+    velocity = velocity_target(latents, noise)
+    wrong_first = velocity.clone()
+    wrong_first[:, :, :, 0] += 100
+    assert flow_matching_loss(wrong_first, latents, noise, sigma, weighting).item() == 0.0
+    wrong_later = velocity.clone()
+    wrong_later[:, :, :, 1] += 1
+    assert flow_matching_loss(wrong_later, latents, noise, sigma, weighting).item() > 0.01
+
+
+def test_loss_is_the_mean_over_noisy_frames(clip: tuple[torch.Tensor, ...]) -> None:
+    latents, noise, sigma = clip
+    velocity = velocity_target(latents, noise) + 2.0
+    assert flow_matching_loss(velocity, latents, noise, sigma, LossWeighting()).item() == pytest.approx(4.0, rel=1e-5)
+    weighted = flow_matching_loss(velocity, latents, noise, sigma, LossWeighting(kind="sample"))
+    assert weighted.item() == pytest.approx(4.0 * (0.3**2 + 0.8**2) / 2, rel=1e-5)
+
+
+def test_motion_weights_favour_what_moves_and_keep_the_mean(clip: tuple[torch.Tensor, ...]) -> None:
+    latents, noise, sigma = clip
+    latents = latents[:, :, :, :1].repeat(1, 1, 1, 5, 1, 1)
+    latents[..., 0, 0] += torch.arange(5.0)
+    weighting = LossWeighting(motion=4.0)
+    uniform = flow_matching_loss(velocity_target(latents, noise) + 1.0, latents, noise, sigma, weighting)
+    assert uniform.item() == pytest.approx(1.0, rel=1e-4)
+    still, moving = (velocity_target(latents, noise) for _ in range(2))
+    still[..., 1, 1] += 1.0
+    moving[..., 0, 0] += 1.0
+    losses = [flow_matching_loss(value, latents, noise, sigma, weighting).item() for value in (still, moving)]
+    assert losses[1] > 3 * losses[0]
+
+
+@pytest.mark.parametrize("kind", ["uniform", "logit_normal", "mode"])
+def test_sigmas_are_levels_and_shift_moves_them_up(kind: str) -> None:
+    plain, shifted = (
+        sample_sigmas(
+            SigmaSampling.model_validate({"kind": kind, "shift": shift}), 4000, torch.Generator().manual_seed(1)
+        )
+        for shift in (1.0, 5.0)
+    )
+    assert 0 < plain.min() and plain.max() <= 1
+    assert shifted.mean() > plain.mean() + 0.15
+
+
+def test_wrong_sigma_shape_is_named(clip: tuple[torch.Tensor, ...]) -> None:
+    with pytest.raises(ConfigError, match="Noise levels have an unexpected shape"):
+        add_noise(clip[0], clip[1], torch.ones(2, 3, 4))

@@ -1,0 +1,242 @@
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, TrainingError
+from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.training import trainer as trainer_module
+from worldline_core.training.metrics_log import read_metrics
+from worldline_core.training.objective import FlowMatchingObjective
+from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
+from worldline_core.training.stage2 import Stage2Config, stage2_groups, train_stage2
+from worldline_core.training.teacher import TeacherConfig, train_teacher
+
+MakeConfig = Callable[..., WorldModelConfig]
+
+
+def trainer_values(steps: int, **changes: Any) -> dict[str, Any]:
+    values = {
+        "steps": steps,
+        "batch_size": 4,
+        "precision": "fp32",
+        "log_every": 3,
+        "validation_batches": 1,
+        "save_every_seconds": 1000.0,
+        "save_every_steps": 4,
+        "optimizer": {"learning_rate": 3e-3, "warmup_steps": 2},
+    }
+    return values | changes
+
+
+def stage2(steps: int, **changes: Any) -> Stage2Config:
+    values = {
+        "trainer": trainer_values(steps),
+        "clips": {"lengths": [9, 17]},
+        "sigma_px_ref": 60.0,
+        "action_multiplier": 3.0,
+        "action_dropout": 0.1,
+        "relational": None,
+    }
+    return Stage2Config.model_validate(values | changes)
+
+
+@pytest.fixture(scope="module")
+def teacher(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("teacher")
+    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
+    config = TeacherConfig.model_validate(
+        {"shape": shape, "trainer": trainer_values(20), "clip_frames": 9, "held_out_episodes": 1}
+    )
+    train_teacher(config, {"episodes": world.episodes}, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stage1_folder(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from .conftest import TINY_MODEL  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("stage1")
+    config = Stage1Config.model_validate(
+        {"model": TINY_MODEL, "trainer": trainer_values(6), "clips": {"lengths": [9], "view_weights": {"primary": 1}}}
+    )
+    train_stage1(config, world.inputs, folder)
+    return folder
+
+
+class Killed(Exception):
+    pass
+
+
+def digested(folder: Path) -> dict[str, bytes]:
+    """Everything that belongs to the artifact: all but run/."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.relative_to(folder).parts[0] != "run"
+    }
+
+
+def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    inner, calls = trainer_module._step, [0]
+
+    def step(*arguments: Any) -> Any:
+        if calls[0] == steps:
+            raise Killed
+        calls[0] += 1
+        return inner(*arguments)
+
+    monkeypatch.setattr(trainer_module, "_step", step)
+
+
+def test_a_killed_run_ends_with_the_same_bytes(
+    world: Any, stage1_folder: Path, teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = stage2(14, relational={"ramp_steps": 5})
+    inputs = {**world.inputs, "stage1": stage1_folder, "teacher": teacher}
+    train_stage2(config, inputs, tmp_path / "whole")
+    for steps in (7, 6):
+        with monkeypatch.context() as patch:
+            kill_after(patch, steps)
+            with pytest.raises(Killed, match=""):
+                train_stage2(config, inputs, tmp_path / "parts")
+    # The second part began at the state saved after step 4: it repeated three steps and their log lines.
+    torch.rand(5)
+    train_stage2(config, inputs, tmp_path / "parts")
+    assert digested(tmp_path / "parts") == digested(tmp_path / "whole")
+    rows = [row for row in read_metrics(tmp_path / "parts" / "metrics.jsonl") if "loss" in row]
+    assert [row["step"] for row in rows] == [3, 6, 9, 12, 14]
+    assert all(row["relational_intra"] > 0 for row in rows)
+
+
+def test_a_state_of_another_run_is_refused(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2), inputs, tmp_path)
+    with pytest.raises(ArtifactError, match="belongs to another run"):
+        train_stage2(stage2(3), inputs, tmp_path)
+
+
+def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeConfig, tmp_path: Path) -> None:
+    base = WorldModel(model_config())
+    base.initialise(torch.Generator().manual_seed(0))
+    save_checkpoint(tmp_path / "base", base, kind="base", action_contract={})
+    config = stage2(
+        250, trainer=trainer_values(250, batch_size=8, ema_decay=0.95), weighting={"kind": "sample"}, action_dropout=0.0
+    )
+    result = train_stage2(config, {**world.inputs, "stage1": tmp_path / "base"}, tmp_path / "run")
+    losses = [row["loss"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl") if "loss" in row]
+    assert losses[-1] < 0.4 * losses[0]
+    assert result["validation/sample_error"] < 0.8 * result["validation/sample_error_shuffled_actions"]
+    _, info = load_checkpoint(tmp_path / "run", expect_kind="stage2")
+    assert info.action_contract["sigma_px_ref"] == 60.0
+    assert info.metadata["step"] == 250
+
+
+def test_stage1_trains_both_towers_on_text_and_leaves_the_action_branch(stage1_folder: Path) -> None:
+    model, info = load_checkpoint(stage1_folder, expect_kind="stage1", towers="both")
+    fresh = WorldModel(model.config)
+    fresh.initialise(torch.Generator().manual_seed(0))
+    before = dict(fresh.named_parameters())
+    changed = {name for name, value in model.named_parameters() if not torch.allclose(value, before[name], atol=2e-3)}
+    assert any(".to_k." in name for name in changed)
+    assert any(".add_q_proj." in name for name in changed)
+    assert not any(name.startswith("action_encoder") for name in changed)
+    assert info.metadata["sources"] == {"synthetic": 6}
+
+
+def test_what_stage2_trains(model_config: MakeConfig) -> None:
+    model = WorldModel(model_config())
+    generation, action = stage2_groups(model, 66.0)
+    assert action.multiplier == 66.0
+    assert set(action.parameters) == {name for name, _ in model.named_parameters() if name.startswith("action_encoder.")}
+    names = set(generation.parameters)
+    # Filtering by "moe_gen" alone would leave the generation tower's attention frozen.
+    for part in ("add_q_proj", "add_k_proj", "add_v_proj", "to_add_out", "norm_added_q", "norm_added_k", "mlp_moe_gen"):
+        assert any(part in name for name in names), part
+    for part in ("time_embedder", "proj_in", "proj_out", "norm_moe_gen"):
+        assert any(name.startswith(part) for name in names), part
+    for frozen in ("embed_tokens", ".to_q.", ".to_k.", ".to_v.", ".to_out.", ".mlp.", "action_encoder"):
+        assert not any(frozen in name for name in names), frozen
+    both = [set(group.parameters) for group in stage1_groups(model)]
+    assert both[0] | both[1] | set(action.parameters) == {name for name, _ in model.named_parameters()}
+
+
+def test_outcomes_do_not_reach_the_model(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
+    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
+    flipped = tmp_path / "flipped"
+    shutil.copytree(world.episodes, flipped)
+    table = pq.read_table(flipped / "index.parquet")
+    column = table.column_names.index("outcome")
+    outcomes = ["failure" if value == "success" else "success" for value in table["outcome"].to_pylist()]
+    pq.write_table(table.set_column(column, "outcome", pa.array(outcomes)), flipped / "index.parquet")
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2), inputs, tmp_path / "one")
+    train_stage2(stage2(2), inputs | {"episodes": flipped}, tmp_path / "two")
+    assert digested(tmp_path / "one") == digested(tmp_path / "two")
+
+
+def test_wrong_checkpoint_and_missing_teacher_are_named(
+    world: Any, model_config: MakeConfig, stage1_folder: Path, tmp_path: Path
+) -> None:
+    model = WorldModel(model_config(towers="generation"))
+    model.initialise(torch.Generator().manual_seed(0))
+    save_checkpoint(tmp_path / "causal", model, kind="causal", action_contract={})
+    with pytest.raises(CheckpointError, match="wrong kind"):
+        train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "causal"}, tmp_path / "out")
+    with pytest.raises(CheckpointError, match="wrong kind"):
+        train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": stage1_folder}, tmp_path / "out")
+    with pytest.raises(ConfigError, match="need a teacher"):
+        train_stage2(stage2(2, relational={}), {**world.inputs, "stage1": stage1_folder}, tmp_path / "out")
+    with pytest.raises(CheckpointError, match="holds no relational teacher"):
+        inputs = {**world.inputs, "stage1": stage1_folder, "teacher": tmp_path}
+        train_stage2(stage2(2, relational={}), inputs, tmp_path / "out")
+
+
+def test_latents_and_losses_that_are_not_finite_stop_the_run(
+    world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = tmp_path / "latents"
+    shutil.copytree(world.latents, damaged)
+    tensors = load_file(damaged / "00000.safetensors")
+    save_file({name: torch.full_like(value, float("nan")) for name, value in tensors.items()}, damaged / "00000.safetensors")
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    with pytest.raises(DataError, match="values that are not finite"):
+        train_stage2(stage2(2), inputs | {"latents": damaged}, tmp_path / "a")
+
+    inner = FlowMatchingObjective.loss
+
+    def broken(self: FlowMatchingObjective, batch: Any, generator: torch.Generator, step: int) -> Any:
+        loss, values = inner(self, batch, generator, step)
+        return (loss * float("inf") if step == 1 else loss), values
+
+    monkeypatch.setattr(FlowMatchingObjective, "loss", broken)
+    with pytest.raises(TrainingError, match=r"loss is not finite[\s\S]*step 1, clips episode"):
+        train_stage2(stage2(3), inputs, tmp_path / "b")
+
+
+def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
+    from worldline_core.training.clip_sampler import Clip  # noqa: PLC0415
+    from worldline_core.training.video_teacher import TeacherFeatures, load_teacher  # noqa: PLC0415
+
+    description = json.loads((teacher / "teacher.json").read_text())
+    assert description["metrics"]["validation/loss"] > 0
+    loaded = load_teacher(teacher)
+    features = TeacherFeatures(loaded, world.episodes, cached_clips=4)
+    clip = Clip("episode-003", 0, 9, 1)
+    first = features.features((clip,), ("head", "left_wrist"))
+    assert first.shape == (1, 2, 3, 4, 4, 64)
+    assert torch.equal(features.features((clip,), ("head", "left_wrist")), first)
+    later = features.features((replace(clip, start=8),), ("head", "left_wrist"))
+    assert not torch.equal(later, first)
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())  # type: ignore[attr-defined]
