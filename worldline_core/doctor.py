@@ -35,7 +35,7 @@ def format_findings(findings: list[dict[str, Any]]) -> str:
     width = max(len(finding["name"]) for finding in findings)
     lines = [f"{marks[finding['status']]} {finding['name']:<{width}}  {finding['found']}" for finding in findings]
     advice = [f"  {finding['name']}: {finding['next_step']}" for finding in findings if finding["next_step"]]
-    return "\n".join(lines + (["", "What you can do:"] + advice if advice else []))
+    return "\n".join(lines + (["", "What you can do:", *advice] if advice else []))
 
 
 def _finding(name: str, status: str, found: str, next_step: str = "") -> dict[str, Any]:

@@ -15,9 +15,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import CurateConfig, curate, resize_masks
+from worldline_core.data.curate import CurateConfig, curate
 from worldline_core.data.episode_index import read_index, write_index
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.resize import resize_masks
 from worldline_core.data.video import encode_video
 from worldline_core.errors import DataError
 

@@ -28,7 +28,7 @@ class Clip:
 
 @pytest.fixture
 def make_model() -> Callable[..., WorldModel]:
-    def make(seed: int = 0, prediction: str = "velocity") -> WorldModel:
+    def make(seed: int = 0, **changes: object) -> WorldModel:
         config = WorldModelConfig(
             latent_channels=4,
             hidden_size=24,
@@ -39,7 +39,7 @@ def make_model() -> Callable[..., WorldModel]:
             intermediate_size=32,
             rope_sections=(2, 2, 2),
             towers="generation",
-            prediction=prediction,
+            **changes,
         )
         generator = torch.Generator().manual_seed(seed)
         model = WorldModel(config)

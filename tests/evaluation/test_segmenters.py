@@ -16,7 +16,7 @@ from worldline_core.evaluation.segmenters.unet import UNet
 from worldline_core.evaluation.video.robot_iou import video_iou
 
 CONFIG = SegmenterConfig(
-    widths=(8, 16), steps=6, batch_size=4, checkpoint_every=2, evaluate_splits=("test",), frame_stride=4
+    widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, evaluate_splits=("test",), frame_stride=4
 )
 
 
@@ -38,7 +38,7 @@ def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeyp
 
     def killed(path, step, *rest):
         save(path, step, *rest)
-        if step == 4:
+        if step == 2:
             raise KeyboardInterrupt("killed")
 
     monkeypatch.setattr(train, "_save_state", killed)

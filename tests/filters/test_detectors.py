@@ -269,7 +269,7 @@ def test_motion_must_be_where_the_tool_is_projected() -> None:
     right = detect_projection(gray, uv[:, None], inside[:, None], config)
     assert right.passed
     assert right.numbers["motion_contrast"] > 3  # type: ignore[operator]
-    shifted = uv + [0, 25]
+    shifted = uv + np.array([0.0, 25.0])
     wrong = detect_projection(gray, shifted[:, None], inside_image(shifted, depth, 96, 64)[:, None], config)
     assert not wrong.passed
     outside = detect_projection(gray, uv[:, None] + 500, np.zeros((33, 1), bool), config)

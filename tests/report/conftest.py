@@ -159,6 +159,7 @@ def write_video_scores(folder: Path) -> None:
                     values |= {
                         "robot_iou": base + wobble + 0.02,
                         "robot_iou_exact": base + wobble,
+                        "robot_iou[colour]": base + wobble - 0.1,
                         "end_effector_error_px": 9 * (1 - base),
                     }
                 for metric, value in values.items():
@@ -186,7 +187,7 @@ def write_video_scores(folder: Path) -> None:
         **predicted,
         "methods": sorted(quality),
         "unavailable": {"lpips": "no weights in the configured folder"},
-        "segmenters": [segmenter],
+        "segmenters": [segmenter, {"name": "colour", "suffix": "[colour]", "description": "colour model of the arms"}],
     }
     write_json_atomic(folder / "summary.json", summary)
 

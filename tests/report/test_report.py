@@ -108,6 +108,9 @@ def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: P
     assert {name: value for name, value in again.items() if name != "index.html"} == {
         n: v for n, v in before.items() if n != "index.html"
     }
+    # A killed call leaves half-written files; they must not enter the digest of the next one.
+    (tmp_path / "media" / ".episode0.123.tmp.mp4").write_bytes(b"half")
+    (tmp_path / ".index.123.tmp.html").write_bytes(b"half")
     report(ReportConfig(tile_height=64, rerun=False, mcap=False), run_artifacts, tmp_path)
     assert digest(tmp_path) == again
 
@@ -131,6 +134,7 @@ def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:
     assert "lpips" in section(text, "video")
     assert "no weights in the configured folder" in section(text, "video")
     assert "0.930" in section(text, "video")  # the segmenter's own accuracy
+    assert "by a second segmenter, colour" in section(text, "video")
     assert "selector&#x27;s ceiling" in section(text, "planning")
     assert "median of 3 on held-out scenes" in section(text, "videos")
     assert "truncated_video" in section(text, "filters")

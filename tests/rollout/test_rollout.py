@@ -183,6 +183,10 @@ def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path
     save_checkpoint(tmp_path / "c", model, kind="causal", action_contract={"fps": 10.0, "grid_size": [4, 6]})
     with pytest.raises(CheckpointError, match="action contract differs"):
         rollout(CONFIG, inputs | {"checkpoint": tmp_path / "c"}, tmp_path / "out")
+    contract = {"fps": 8.0, "grid_size": [4, 6], "tokenizer": "0123456789abcdef"}
+    save_checkpoint(tmp_path / "d", model, kind="causal", action_contract=contract)
+    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tokenizer"):
+        rollout(CONFIG, inputs | {"checkpoint": tmp_path / "d"}, tmp_path / "out")
     with pytest.raises(DataError, match="No episode to predict"):
         rollout(CONFIG.model_copy(update={"splits": ("bank",)}), inputs, tmp_path / "out")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
@@ -63,7 +65,7 @@ def test_nodes_of_the_samplers() -> None:
 def test_euler_reaches_the_sample_of_a_constant_velocity() -> None:
     clean, noise = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0))
     latents = noise
-    for sigma, next_sigma in zip(CAUSAL_SIGMAS[:-1], CAUSAL_SIGMAS[1:], strict=True):
+    for sigma, next_sigma in itertools.pairwise(CAUSAL_SIGMAS):
         latents = euler_step(latents, noise - clean, sigma, next_sigma)
     torch.testing.assert_close(latents, clean)
 

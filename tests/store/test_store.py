@@ -155,9 +155,13 @@ def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_atomic_write_leaves_nothing_behind_on_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no"), atomic_path(tmp_path / "x.txt") as temporary:
-        temporary.write_text("half")
-        raise ConfigError("no")
+    def fail_halfway() -> None:
+        with atomic_path(tmp_path / "x.txt") as temporary:
+            temporary.write_text("half")
+            raise ConfigError("no space")
+
+    with pytest.raises(ConfigError, match="no space"):
+        fail_halfway()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,3 +172,12 @@ def test_json_is_canonical(tmp_path: Path) -> None:
     assert digest_value({"b": 1, "a": 2}) == digest_value({"a": 2, "b": 1})
     with pytest.raises(ValueError, match="JSON compliant"):
         write_json_atomic(tmp_path / "c.json", {"a": float("nan")})
+
+
+def test_what_a_kill_left_unfinished_does_not_reach_the_artifact(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path / "killed")
+    partial = store.root / "count" / f"{store.key('count', 1, CountConfig(), {})}.partial"
+    (partial / "videos").mkdir(parents=True)
+    (partial / "videos" / ".head.123.tmp.mp4").write_bytes(b"half")
+    killed = store.run("count", 1, count, CountConfig(), {})
+    assert killed.digest == ArtifactStore(tmp_path / "other").run("count", 1, count, CountConfig(), {}).digest

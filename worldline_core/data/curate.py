@@ -9,7 +9,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from pydantic import Field
 from tqdm import tqdm
@@ -21,6 +20,7 @@ from worldline_core.data.episode_index import read_index, read_quarantine
 from worldline_core.data.episode_parts import part_name
 from worldline_core.data.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.resize import resize_frames, resize_masks
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
@@ -45,21 +45,28 @@ class CurateConfig(StrictModel):
     """What to read and what every kept episode will look like."""
 
     sources: tuple[SourceConfig, ...] = Field(min_length=1)
-    image_size: tuple[int, int] | None = Field(None, description="(height, width) of all images; null keeps each size")
-    fps: float | None = Field(None, gt=0, description="rate of all episodes; null keeps each rate")
-    views: tuple[str, ...] | None = Field(None, description="views to keep, in this order; null keeps all")
-    primary_view: str | None = Field(
-        None, description="task-facing view for single-view training; null keeps the source's"
+    image_size: tuple[int, int] | None = Field(
+        default=None, description="(height, width) of all images; null keeps each size"
     )
-    splits: dict[str, Split] = Field({}, description="scene name pattern -> split, first match wins; else the source's")
-    require_calibration: bool = Field(False, description="quarantine episodes with an uncalibrated view")
-    min_frames: int = Field(2, ge=1)
-    joint_tolerance_rad: float = Field(0.05, ge=0)
-    time_tolerance_frames: float = Field(0.25, gt=0, description="largest distance of a frame from its rate's grid")
-    video_crf: int = Field(10, ge=0, le=51)
+    fps: float | None = Field(default=None, gt=0, description="rate of all episodes; null keeps each rate")
+    views: tuple[str, ...] | None = Field(default=None, description="views to keep, in this order; null keeps all")
+    primary_view: str | None = Field(
+        default=None, description="task-facing view for single-view training; null keeps the source's"
+    )
+    splits: dict[str, Split] = Field(
+        default={}, description="scene name pattern -> split, first match wins; else the source's"
+    )
+    require_calibration: bool = Field(default=False, description="quarantine episodes with an uncalibrated view")
+    min_frames: int = Field(default=2, ge=1)
+    joint_tolerance_rad: float = Field(default=0.05, ge=0)
+    time_tolerance_frames: float = Field(
+        default=0.25, gt=0, description="largest distance of a frame from its rate's grid"
+    )
+    video_crf: int = Field(default=10, ge=0, le=51)
     video_preset: str = "veryfast"
     pixel_format: PixelFormat = Field(
-        "yuv444p", description="full colour: at 64x96 yuv420p costs 9 dB at the same file size; few browsers play it"
+        default="yuv444p",
+        description="full colour: at 64x96 yuv420p costs 9 dB at the same file size; few browsers play it",
     )
 
 
@@ -246,25 +253,6 @@ def _prepare(
         primary_view=config.primary_view or episode.primary_view,
     )
     return prepared, frames, masks, fingerprint
-
-
-def resize_frames(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """uint8 (N, H, W, 3) at (height, width): area averages when shrinking, linear when enlarging."""
-    if size is None or tuple(frames.shape[1:3]) == tuple(size):
-        return frames
-    height, width = size
-    shrinking = height <= frames.shape[1] and width <= frames.shape[2]
-    method = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    return np.stack([cv2.resize(frame, (width, height), interpolation=method) for frame in frames])
-
-
-def resize_masks(masks: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """bool (N, H, W) at (height, width): True where at least half of a pixel's area was."""
-    if size is None or tuple(masks.shape[1:]) == tuple(size):
-        return masks
-    height, width = size
-    areas = [cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) for mask in masks]
-    return np.stack(areas) >= 0.5
 
 
 def _fingerprint(episode: Episode, frames: Mapping[str, np.ndarray]) -> str:

@@ -159,11 +159,11 @@ class EpisodeSetWriter:
         """
         parts, rejected = self.kept(), self.rejected()
         if not parts:
-            reasons = sorted({row.reason for row in rejected})
+            named = sorted({row.reason for row in rejected})
             raise DataError(
                 "No episode was kept",
                 where=str(self.root),
-                got=f"{len(rejected)} quarantined: {', '.join(reasons) or 'none'}",
+                got=f"{len(rejected)} quarantined: {', '.join(named) or 'none'}",
             )
         groups: dict[tuple[Any, ...], list[Part]] = {}
         for part in parts:

@@ -173,7 +173,7 @@ class Sidecar:
             return None
         row = rows[0]
         num_frames, num_arms = row["num_frames"], row["num_arms"]
-        result = {
+        result: dict[str, np.ndarray] = {
             "state": np.asarray(row["state"], np.float32).reshape(num_frames, -1),
             "action": np.asarray(row["action"], np.float32).reshape(num_frames, -1),
         }

@@ -10,6 +10,7 @@ presentation order equals file order: clips can be joined without encoding again
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -19,6 +20,7 @@ import av.error
 import cv2
 import numpy as np
 from av.bitstream import BitStreamFilterContext
+from av.codec.context import Flags
 
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.errors import DataError
@@ -100,7 +102,7 @@ def encode_video(
         context = stream.codec_context
         context.thread_count = 1
         context.time_base = 1 / rate
-        context.flags |= int(av.codec.context.Flags.bitexact)
+        context.flags |= int(Flags.bitexact)
         stream.options = {
             "crf": str(crf),
             "preset": preset,
@@ -131,6 +133,7 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
         stream = None
         first_frame = 0
         for part, expected in parts:
+            count = 0
             with av.open(str(part)) as source:
                 template = source.streams.video[0]
                 if stream is None:
@@ -139,7 +142,6 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
                 ticks = 1 / (rate * (template.time_base or 1 / rate))
                 # The encoder's own message (a kilobyte of settings) would otherwise repeat for each clip.
                 without_message = BitStreamFilterContext("filter_units=remove_types=6", template)
-                count = 0
                 for packet in _filtered(source.demux(template), without_message):
                     packet.pts = packet.dts = round((first_frame + count) * ticks)
                     packet.stream = stream
@@ -283,7 +285,7 @@ def video_size(path: Path) -> tuple[int, int, float]:
             next_step="restore the file or drop the episode",
         )
     try:
-        with av.open(str(path)) as container:
+        with closing(av.open(str(path))) as container:
             if not container.streams.video:
                 raise RejectedInputError(
                     "unreadable",

@@ -12,16 +12,18 @@ from worldline_core.filters.verdict import Verdict
 class CalibrationConfig(StrictModel):
     """Lengths in metres, angles in degrees."""
 
-    min_field_of_view_deg: float = Field(15.0, gt=0)
-    max_field_of_view_deg: float = Field(150.0, lt=180)
-    max_principal_point_offset: float = Field(0.25, gt=0, description="from the image centre, share of the image side")
-    max_rotation_residual: float = Field(1e-3, gt=0, description="largest entry of R R^T - I")
-    max_hand_eye_m: float = Field(
-        0.012, gt=0, description="deviation of a wrist camera from its mount (95th percentile)"
+    min_field_of_view_deg: float = Field(default=15.0, gt=0)
+    max_field_of_view_deg: float = Field(default=150.0, lt=180)
+    max_principal_point_offset: float = Field(
+        default=0.25, gt=0, description="from the image centre, share of the image side"
     )
-    max_hand_eye_deg: float = Field(6.0, gt=0)
-    max_mount_offset_m: float = Field(0.08, gt=0, description="from the mount that the embodiment states")
-    max_mount_offset_deg: float = Field(20.0, gt=0)
+    max_rotation_residual: float = Field(default=1e-3, gt=0, description="largest entry of R R^T - I")
+    max_hand_eye_m: float = Field(
+        default=0.012, gt=0, description="deviation of a wrist camera from its mount (95th percentile)"
+    )
+    max_hand_eye_deg: float = Field(default=6.0, gt=0)
+    max_mount_offset_m: float = Field(default=0.08, gt=0, description="from the mount that the embodiment states")
+    max_mount_offset_deg: float = Field(default=20.0, gt=0)
 
 
 def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:

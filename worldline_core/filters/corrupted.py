@@ -12,19 +12,21 @@ from worldline_core.filters.verdict import Verdict, runs
 class CorruptedConfig(StrictModel):
     """Grey levels are of 255."""
 
-    min_contrast: float = Field(4.0, gt=0, description="standard deviation over the image; less is a blank frame")
-    min_neighbour_correlation: float = Field(0.5, gt=0, lt=1, description="of adjacent pixels; less is noise")
+    min_contrast: float = Field(
+        default=4.0, gt=0, description="standard deviation over the image; less is a blank frame"
+    )
+    min_neighbour_correlation: float = Field(default=0.5, gt=0, lt=1, description="of adjacent pixels; less is noise")
     max_frozen_change: float = Field(
-        0.02,
+        default=0.02,
         ge=0,
         description="mean absolute change below which frames are the same; a camera over a plain table shows 0.05",
     )
-    min_frozen_motion_m: float = Field(0.05, gt=0, description="tool travel during a freeze that makes it one")
+    min_frozen_motion_m: float = Field(default=0.05, gt=0, description="tool travel during a freeze that makes it one")
     min_frozen_motion_wrist_m: float = Field(
-        0.2, gt=0, description="the same for a wrist camera, which may pass over a plain table without change"
+        default=0.2, gt=0, description="the same for a wrist camera, which may pass over a plain table without change"
     )
-    min_frozen_frames: int = Field(4, ge=2)
-    max_bad_share: float = Field(0.5, gt=0, le=1, description="more bad frames condemn the episode")
+    min_frozen_frames: int = Field(default=4, ge=2)
+    max_bad_share: float = Field(default=0.5, gt=0, le=1, description="more bad frames condemn the episode")
 
 
 def blank_frames(gray: np.ndarray, min_contrast: float) -> np.ndarray:

@@ -43,9 +43,9 @@ class FilterConfig(StrictModel):
     """Thresholds of all detectors."""
 
     required_views: tuple[str, ...] | None = Field(
-        None, description="views that Stage II needs; null: head and one wrist view for each arm"
+        default=None, description="views that Stage II needs; null: head and one wrist view for each arm"
     )
-    min_segment_frames: int = Field(17, ge=2, description="shorter stretches are dropped")
+    min_segment_frames: int = Field(default=17, ge=2, description="shorter stretches are dropped")
     static: StaticConfig = StaticConfig()
     reset: ResetConfig = ResetConfig()
     corrupted: CorruptedConfig = CorruptedConfig()

@@ -14,12 +14,14 @@ class ProjectionConfig(StrictModel):
     """Lengths in shares of the image width, so that they hold at any resolution."""
 
     min_inside_share: float = Field(
-        0.5, gt=0, le=1, description="frames in which some arm's tool is in the task-facing view"
+        default=0.5, gt=0, le=1, description="frames in which some arm's tool is in the task-facing view"
     )
-    radius: float = Field(0.07, gt=0, description="disc around the tool in which change is looked for")
-    min_step: float = Field(0.012, gt=0, description="projected motion a frame that must be visible")
-    min_moving_frames: int = Field(5, ge=1, description="fewer prove nothing")
-    min_contrast: float = Field(1.6, gt=0, description="change near the tool over change in the whole picture (median)")
+    radius: float = Field(default=0.07, gt=0, description="disc around the tool in which change is looked for")
+    min_step: float = Field(default=0.012, gt=0, description="projected motion a frame that must be visible")
+    min_moving_frames: int = Field(default=5, ge=1, description="fewer prove nothing")
+    min_contrast: float = Field(
+        default=1.6, gt=0, description="change near the tool over change in the whole picture (median)"
+    )
 
 
 def project_points(points: np.ndarray, K: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

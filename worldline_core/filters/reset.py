@@ -12,12 +12,12 @@ from worldline_core.filters.verdict import Verdict
 class ResetConfig(StrictModel):
     """A reset covers most of the way back to the first pose within one frame, faster than the episode moves otherwise."""
 
-    min_jump_rad: float = Field(0.15, gt=0, description="smaller steps are jitter")
+    min_jump_rad: float = Field(default=0.15, gt=0, description="smaller steps are jitter")
     home_share: float = Field(
-        0.2, gt=0, lt=1, description="distance to the first pose after, relative to before the jump"
+        default=0.2, gt=0, lt=1, description="distance to the first pose after, relative to before the jump"
     )
     min_relative_step: float = Field(
-        1.15, ge=1, description="jump relative to the episode's other steps (90th percentile)"
+        default=1.15, ge=1, description="jump relative to the episode's other steps (90th percentile)"
     )
 
 

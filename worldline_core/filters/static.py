@@ -12,10 +12,10 @@ from worldline_core.filters.verdict import Verdict, runs
 class StaticConfig(StrictModel):
     """A stretch is static when all three stay below their thresholds."""
 
-    max_joint_speed_rad_s: float = Field(0.03, gt=0)
-    max_gripper_speed_per_s: float = Field(0.05, gt=0)
-    max_image_change: float = Field(0.6, gt=0, description="mean absolute change a frame, of 255")
-    min_run_s: float = Field(1.5, gt=0, description="shorter pauses are part of manipulation")
+    max_joint_speed_rad_s: float = Field(default=0.03, gt=0)
+    max_gripper_speed_per_s: float = Field(default=0.05, gt=0)
+    max_image_change: float = Field(default=0.6, gt=0, description="mean absolute change a frame, of 255")
+    min_run_s: float = Field(default=1.5, gt=0, description="shorter pauses are part of manipulation")
 
 
 def detect_static(

@@ -17,13 +17,19 @@ from worldline_core.filters.verdict import Verdict
 class TimeAlignmentConfig(StrictModel):
     """Lags in seconds; positive means that the images come after the states."""
 
-    max_lag_s: float = Field(0.19, gt=0, description="a larger lag condemns")
-    search_s: float = Field(0.8, gt=0)
-    min_correlation: float = Field(0.75, gt=0, lt=1, description="at the best lag; less proves nothing")
-    min_gain: float = Field(0.12, ge=0, description="of the correlation at the best lag over that at lag 0")
-    max_pose_lag_s: float = Field(0.1, gt=0, description="larger shift between camera poses and states condemns")
-    min_pose_gain_m: float = Field(0.004, ge=0, description="smaller gains of the hand-eye residual prove no shift")
-    max_rigid_residual_m: float = Field(0.012, gt=0, description="hand-eye residual at the best shift, to trust it")
+    max_lag_s: float = Field(default=0.19, gt=0, description="a larger lag condemns")
+    search_s: float = Field(default=0.8, gt=0)
+    min_correlation: float = Field(default=0.75, gt=0, lt=1, description="at the best lag; less proves nothing")
+    min_gain: float = Field(default=0.12, ge=0, description="of the correlation at the best lag over that at lag 0")
+    max_pose_lag_s: float = Field(
+        default=0.1, gt=0, description="larger shift between camera poses and states condemns"
+    )
+    min_pose_gain_m: float = Field(
+        default=0.004, ge=0, description="smaller gains of the hand-eye residual prove no shift"
+    )
+    max_rigid_residual_m: float = Field(
+        default=0.012, gt=0, description="hand-eye residual at the best shift, to trust it"
+    )
 
 
 def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> tuple[float, float, float]:

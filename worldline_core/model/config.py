@@ -57,6 +57,11 @@ class WorldModelConfig(StrictModel):
     """What the head emits. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
     ``first_frame_residual``: the clean latents less those of the clean first frame, so that what stands still is free
     (for tokenizers that code a still group like its first frame)."""
+    first_frame_std: float | None = Field(None, gt=0)
+    """With ``first_frame_residual``: the expected deviation s of later latents from the first frame. The head then
+    corrects, in units of the remaining uncertainty, the best guess that the noisy latents and the first frame allow
+    under z ~ N(z_first, s^2) (the preconditioning of EDM, centred on the first frame). Without it, a small model has to
+    copy its noisy input through all layers to do well at low noise."""
     minimum_sigma: float = Field(0.05, gt=0, le=1)
     """Lower bound of the divisor where clean latents are emitted."""
 

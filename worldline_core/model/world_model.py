@@ -47,6 +47,18 @@ def is_text_parameter(name: str) -> bool:
     return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
 
 
+def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor, std: float) -> Tensor:
+    """Velocity of the posterior mean under z ~ N(reference, std^2), corrected by ``emitted`` posterior deviations.
+
+    With D = (1 - sigma)^2 std^2 + sigma^2 the posterior of z given the noisy latents has the mean
+    ``reference + (1 - sigma) std^2 / D (noisy - (1 - sigma) reference)`` and the deviation ``sigma std / sqrt(D)``.
+    ``(noisy - z) / sigma`` then has no division by sigma left.
+    """
+    spread = (1 - sigma) ** 2 * std**2 + sigma**2
+    mean = ((sigma - (1 - sigma) * std**2) * noisy - sigma * reference) / spread
+    return mean - std * emitted * spread.rsqrt()
+
+
 @dataclass(frozen=True)
 class TextContext:
     """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once."""
@@ -339,12 +351,18 @@ class WorldModel(nn.Module):
             p=size,
             q=size,
         )
-        if self.config.prediction != "velocity":
-            if self.config.prediction == "first_frame_residual":
-                if reference is None:
-                    raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
-                emitted = emitted.float() + reference.float()
-            per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
-            divisor = rearrange(per_frame.float().clamp_min(self.config.minimum_sigma), "b t -> b 1 1 t 1 1")
-            emitted = (latents.float() - emitted.float()) / divisor
+        if self.config.prediction == "velocity":
+            return emitted.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)
+        per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
+        level = rearrange(per_frame.float(), "b t -> b 1 1 t 1 1")
+        emitted = emitted.float()
+        if self.config.prediction == "first_frame_residual":
+            if reference is None:
+                raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
+            if self.config.first_frame_std is not None:
+                std = self.config.first_frame_std
+                velocity = preconditioned_velocity(emitted, latents.float(), level, reference.float(), std)
+                return velocity.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)
+            emitted = emitted + reference.float()
+        emitted = (latents.float() - emitted) / level.clamp_min(self.config.minimum_sigma)
         return emitted.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)

@@ -130,6 +130,7 @@ _STEPS = (
         "train_segmenter",
         "SegmenterConfig",
         ("episodes",),
+        ("evaluation",),
         summary="train the small robot segmenter of the embedded default",
     ),
     Step(

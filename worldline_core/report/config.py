@@ -13,8 +13,8 @@ class ReportConfig(StrictModel):
     """What the report shows."""
 
     title: str = Field(default="WorldLine: from robot recordings to an action-driven simulator", min_length=1)
-    subtitle: str = Field(
-        default="What this run recorded, kept, trained, predicted and chose, measured on scenes that no model has seen.",
+    subtitle: str = (
+        "What was recorded, kept, trained, predicted and chosen in this run, and how well: measured, with intervals."
     )
     primary_method: str | None = Field(
         default=None,

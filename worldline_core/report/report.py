@@ -7,6 +7,7 @@ The page and its media are reproducible. What is not (wall times, device, versio
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     from worldline_core.report.sections.trend import trend_section
     from worldline_core.report.sections.video import video_section
 
+    remove_unfinished(output)
     makers = [
         summary_section, rollouts_section, video_section, policy_section, planning_section, efficiency_section,
         data_section, filters_section, actions_section, training_section, models_section, provenance_section,
@@ -62,3 +64,10 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     logger.info("report: %d sections, missing: %s", len(sections) - len(missing), ", ".join(missing) or "none")
     media = sorted(path.name for path in (output / "media").iterdir()) if (output / "media").is_dir() else []
     return {"sections": len(sections) - len(missing), "missing": missing, "media": len(media)}
+
+
+def remove_unfinished(output: Path) -> None:
+    """Removes what an earlier, killed call left behind: the page is made anew, and nothing stale may enter the digest."""
+    shutil.rmtree(output / "media", ignore_errors=True)
+    for path in output.glob(".*.tmp*"):
+        path.unlink()

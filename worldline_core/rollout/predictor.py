@@ -62,6 +62,9 @@ class Predictor:
             rows, columns = contract["grid_size"]
             space = self.tokenizer.spatial_compression
             self.image_size = (rows * space, columns * space)
+        coder = getattr(self.tokenizer, "encoder_digest", None)
+        if isinstance(coder, str) and "tokenizer" in contract:
+            wanted["tokenizer"] = coder[: len(contract["tokenizer"])]
         check_action_contract(contract, wanted, where=folder)
         if info.config.latent_channels != self.tokenizer.latent_channels:
             raise DataError(

@@ -36,3 +36,10 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
 def write_json_atomic(path: Path, value: Any) -> None:
     """Write JSON with sorted keys (equal values give equal bytes); NaN and infinities are refused."""
     write_bytes_atomic(path, (json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n").encode())
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the temporary files that a killed process left anywhere below ``folder``."""
+    for path in folder.rglob(".*.tmp*"):
+        if path.is_file():
+            path.unlink()

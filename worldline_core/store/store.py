@@ -22,7 +22,7 @@ from typing import Any
 
 from worldline_core.config.base import StrictModel
 from worldline_core.errors import ArtifactError
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
 from worldline_core.store.lock import exclusive_lock
 
@@ -110,6 +110,7 @@ class ArtifactStore:
                 shutil.rmtree(folder)
             resumed = partial.exists()
             partial.mkdir(parents=True, exist_ok=True)
+            remove_unfinished(partial)
             logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
             started = time.time()
             metrics = function(config, {name: path.resolve() for name, path in inputs.items()}, partial)

@@ -43,8 +43,10 @@ class SourceConfigBase(StrictModel):
     """Fields of every source."""
 
     path: Path = Field(description="folder of the recordings")
-    name: str | None = Field(None, description="name of the source in the index; default: the folder's name")
-    include: tuple[str, ...] | None = Field(None, description="shell patterns of the episode ids to read; null: all")
+    name: str | None = Field(default=None, description="name of the source in the index; default: the folder's name")
+    include: tuple[str, ...] | None = Field(
+        default=None, description="shell patterns of the episode ids to read; null: all"
+    )
 
     @property
     def label(self) -> str:
@@ -58,8 +60,8 @@ class SourceConfigBase(StrictModel):
 class ForeignSourceConfig(SourceConfigBase):
     """What foreign recordings do not say about themselves and the user therefore declares."""
 
-    split: Split = Field("test", description="never train without saying so")
-    scene: str | None = Field(None, description="scene of all episodes; default: one scene an episode folder")
+    split: Split = Field(default="test", description="never train without saying so")
+    scene: str | None = Field(default=None, description="scene of all episodes; default: one scene an episode folder")
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
 

@@ -31,8 +31,10 @@ class DroidAnnotationSourceConfig(ForeignSourceConfig):
     kind: Literal["droid_annotation"] = "droid_annotation"
     embodiment: str = "droid_franka"
     views: tuple[str | None, ...] = ("head", "exterior_2", "right_wrist")
-    tool_offset_m: float = Field(0.155, description="flange to fingertips along the flange's +z")
-    fps: float | None = Field(None, gt=0, description="rate that the videos must have; default: what they state")
+    tool_offset_m: float = Field(default=0.155, description="flange to fingertips along the flange's +z")
+    fps: float | None = Field(
+        default=None, gt=0, description="rate that the videos must have; default: what they state"
+    )
 
 
 class DroidAnnotationSource:

@@ -30,7 +30,9 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     angle_unit: Literal["rad", "deg"] = Field(description="unit of the joint columns")
     views: dict[str, str] = Field(description="video key of the dataset -> view, for example {...cam_high: head}")
     primary_view: str = "head"
-    grippers: dict[str, GripperRange] = Field({}, description="state column -> its readings when closed and open")
+    grippers: dict[str, GripperRange] = Field(
+        default={}, description="state column -> its readings when closed and open"
+    )
 
 
 class LeRobotSource:

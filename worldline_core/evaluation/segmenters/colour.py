@@ -1,7 +1,7 @@
 """The classical segmenter: colour models of robot and background, started from projected points, and GrabCut.
 
-Independent of anything learned. The first frame's colours around the projected tool centres say what the robot looks
-like; GrabCut (Rother et al. 2004) grows from there. Later frames start from the mask of the frame before, with the
+Independent of anything learned. What is unlike the table around the projected tool centres of the first frame says what
+the robot looks like; GrabCut (Rother et al. 2004) grows from there. Later frames start from the mask of the frame before, with the
 colour models of the first frame, so the points are used once only.
 """
 
@@ -10,8 +10,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-SEED_FRACTION = 0.045  # radius of the sure disc around a point, of the frame height
-REACH_FRACTION = 0.75  # the robot is looked for within this distance of a point, of the frame height
+SEED_FRACTION = 0.10  # the robot is surely within this distance of a point, of the frame height
+TABLE_DISTANCE = 28.0  # from the frame's median colour, in 8-bit Lab units: farther is no table
+REACH_FRACTION = 1.0  # the robot is looked for within this distance of a point, of the frame height
 CARRY_FRACTION = 0.12  # how far the robot may move between two frames, of the frame height
 _BINS = 12
 
@@ -43,7 +44,7 @@ class ColourSegmenter:
         foreground, background = np.zeros((1, 65)), np.zeros((1, 65))
         lab = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2LAB) for frame in video])
         labels = self._first_labels(lab[0], start)
-        colours = colour_ratio(lab[0], labels == cv2.GC_FGD)
+        colours = colour_ratio(lab[0], np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)))
         for index in range(len(video)):
             if index > 0:
                 labels = self._carried_labels(masks[index - 1], robot_likely(lab[index], colours))
@@ -62,15 +63,23 @@ class ColourSegmenter:
         return masks
 
     def _first_labels(self, lab: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Sure robot at the points, likely robot where colours resemble them, sure background out of reach."""
+        """Sure robot: what is unlike the table near the points. Likely robot: what hangs together with it.
+
+        A tool centre lies between the fingers, so the pixel at the point itself often shows the table.
+        """
         height, width = lab.shape[:2]
         rows, columns = np.mgrid[:height, :width]
         distance = np.min([np.hypot(columns - u, rows - v) for u, v in points], axis=0)
-        seeds = distance <= max(1.5, SEED_FRACTION * height)
-        alike = colour_ratio(lab, seeds)
+        table = np.median(lab.reshape(-1, 3), axis=0)
+        unlike = np.linalg.norm(lab.astype(np.float64) - table, axis=-1) > TABLE_DISTANCE
+        seeds = unlike & (distance <= SEED_FRACTION * height)
+        if not seeds.any():
+            seeds = distance <= max(1.5, 0.4 * SEED_FRACTION * height)
+        _, components = cv2.connectedComponents((unlike | seeds).astype(np.uint8))
+        robot = np.isin(components, np.unique(components[seeds])) & (distance < REACH_FRACTION * height)
         labels = np.full((height, width), cv2.GC_PR_BGD, dtype=np.uint8)
-        labels[robot_likely(lab, alike) & (distance < REACH_FRACTION * height)] = cv2.GC_PR_FGD
-        labels[distance > REACH_FRACTION * height] = cv2.GC_BGD
+        labels[distance >= REACH_FRACTION * height] = cv2.GC_BGD
+        labels[robot] = cv2.GC_PR_FGD
         labels[seeds] = cv2.GC_FGD
         return labels
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -164,7 +165,7 @@ def train_decoder(tokenizer: PatchTokenizer, videos: list[Tensor], config: Token
     for step in progress:
         warm = min(1.0, (step + 1) / max(config.warmup_steps, 1))
         for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * warm * 0.5 * (1 + np.cos(np.pi * step / config.steps))
+            group["lr"] = config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
         loss = decoder_loss(tokenizer, decoder_batch(videos, config, step), config, step)
         if not bool(torch.isfinite(loss)):
             raise TrainingError(
@@ -215,7 +216,8 @@ def _fitted(config: TokenizerConfig, videos: list[Tensor], folder: Path) -> Patc
 def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Fit, train and measure a patch tokenizer on ``inputs["episodes"]`` (an episode set).
 
-    It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. Writes ``tokenizer.safetensors``, ``tokenizer.json`` and ``metrics.json`` into ``output``; an interrupted call goes
+    It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. With
+    ``inputs["start"]``, a tokenizer, its bases are kept (latents stay valid) and its decoder is trained further. Writes ``tokenizer.safetensors``, ``tokenizer.json`` and ``metrics.json`` into ``output``; an interrupted call goes
     on where it stopped and ends with the same bytes.
 
     Returns:
@@ -226,9 +228,14 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     episodes = EpisodeSet.open(inputs["episodes"])
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
     videos = load_views(episodes, chosen, config.image_size, 5)
-    tokenizer = _fitted(config, videos, output / BASES)
-    torch.manual_seed(config.seed)
-    tokenizer.refinement = Refinement(tokenizer.temporal_compression, config.refinement_width, config.refinement_depth)
+    if "start" in inputs:
+        tokenizer = PatchTokenizer.load(Path(inputs["start"]))
+    else:
+        tokenizer = _fitted(config, videos, output / BASES)
+        torch.manual_seed(config.seed)
+        tokenizer.refinement = Refinement(
+            tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
+        )
     train_decoder(tokenizer, videos, config, output)
     metadata = {
         "config": config.model_dump(mode="json"),

@@ -28,6 +28,8 @@ from worldline_core.report.refusals import (
 TITLE = "Filters"
 MOMENTS = 5
 NUMBERS_SHOWN = 5
+UNITS = {"_rad_s": " rad/s", "_deg": "°", "_rad": " rad", "_px": " px", "_s": " s", "_m": " m"}
+"""Longest suffixes first."""
 
 
 def filters_section(context: ReportContext) -> Section:
@@ -172,8 +174,15 @@ def with_tools(
 def numbers_note(item: Refusal) -> Html:
     """The numbers of the evidence in small type."""
     facts = [
-        f"{key.replace('_', ' ')} {value:.3g}" if isinstance(value, float) else f"{key.replace('_', ' ')} {value}"
+        with_unit(key, value)
         for key, value in sorted(item.numbers.items())
-        if key != "picture" and not isinstance(value, (dict, list)) and value is not None
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
     ]
     return element("div", " · ".join(facts[:NUMBERS_SHOWN]), class_="muted") if facts else Html("")
+
+
+def with_unit(key: str, value: float) -> str:
+    """`longest_still_s: 2.1` as `longest still 2.1 s`: names end in their unit."""
+    suffix, unit = next(((end, unit) for end, unit in UNITS.items() if key.endswith(end)), ("", ""))
+    shown = f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{key.removesuffix(suffix).replace('_', ' ')} {shown}{unit}"

@@ -38,9 +38,13 @@ def rollouts_section(context: ReportContext) -> Section:
     chosen = chosen_episodes(context)
     if not chosen:
         return Section("videos", TITLE, missing="no RolloutSet holds an episode of the given EpisodeSet.")
-    lead = (
-        "Every column starts from the same first frame; from there on a model sees only the controls. The episodes are not"
-        " chosen by hand: they are the median, the best and the worst by the robot IoU of the first model's prediction."
+    ranked = any(item.score is not None for item in chosen)
+    lead = join(
+        "Every column starts from the same first frame; from there on a model sees only the controls. ",
+        "The episodes are not chosen by hand: they are the median, the best and the worst by the robot IoU of the first"
+        " model's prediction."
+        if ranked
+        else None,
     )
     slow = element("button", "Slow motion", type="button", data_speed="slow", aria_pressed="false")
     cards = [card(context, item, number) for number, item in enumerate(chosen)]

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from worldline_core.report.charts import Dot, Series, interval_chart, line_chart
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, code, element, interval, join, notice, paragraph, table
-from worldline_core.report.methods import Method
 from worldline_core.report.video_scores import IOU_METRICS, SPLIT_LABELS, VideoScores
 
 TITLE = "Video quality"
@@ -35,7 +34,7 @@ def video_section(context: ReportContext) -> Section:
     parts: list[Html] = [segmenter_note(scores)]
     for group in scores.groups:
         parts.append(element("h3", SPLIT_LABELS.get(group, group).capitalize()))
-        parts.append(metric_table(scores, group, "head"))
+        parts += [metric_table(scores, group, "head"), second_segmenters(scores, group)]
         iou = next((m for m in IOU_METRICS if any(row["metric"] == m for row in scores.by_frame)), None)
         charts = [*difference_charts(context, scores, group), over_time(scores, group, iou, "Robot IoU")]
         parts.append(element("div", charts, class_="grid2") if any(charts) else Html(""))
@@ -72,21 +71,19 @@ def segmenter_note(scores: VideoScores) -> Html:
     return join(parts)
 
 
-def metric_table(scores: VideoScores, group: str, view: str, methods: Sequence[Method] | None = None) -> Html:
-    """Methods in rows, metrics of one view in columns; the best of each column stands out."""
-    methods = scores.methods(group) if methods is None else methods
-    shown = [
-        (m, label, digits)
-        for m, label, digits in METRICS
-        if any(scores.value(group, x.name, f"{m}@{view}") for x in methods)
-    ]
-    if not shown or not methods:
+def metric_table(
+    scores: VideoScores, group: str, view: str, metrics: Sequence[tuple[str, str, int]] = METRICS, title: str = ""
+) -> Html:
+    """Methods in rows, metrics (name, heading, digits) of one view in columns; the best of each column stands out."""
+    methods = scores.methods(group)
+    shown = [item for item in metrics if any(scores.value(group, m.name, f"{item[0]}@{view}") for m in methods)]
+    if not shown:
         return Html("")
-    best = {}
+    best: dict[str, str] = {}
     for metric, _, _ in shown:
         values = {m.name: found["mean"] for m in methods if (found := scores.value(group, m.name, f"{metric}@{view}"))}
         best[metric] = (min if metric in LOWER_IS_BETTER else max)(values, key=lambda name: values[name])
-    rows = []
+    rows: list[list[object]] = []
     for method in methods:
         cells: list[Html | None] = []
         for metric, _, digits in shown:
@@ -94,13 +91,24 @@ def metric_table(scores: VideoScores, group: str, view: str, methods: Sequence[M
             cell = interval(found["mean"], found["low"], found["high"], digits) if found else None
             cells.append(element("strong", cell) if cell is not None and best[metric] == method.name else cell)
         rows.append([method.long_label, *cells])
-    count = max(found["count"] for m in methods if (found := scores.value(group, m.name, f"{shown[0][0]}@{view}")))
+    counts = [found["count"] for m in methods if (found := scores.value(group, m.name, f"{shown[0][0]}@{view}"))]
     columns = [Column("Method"), *[Column(label, numeric=True) for _, label, _ in shown]]
-    return table(
-        columns,
-        rows,
-        caption=f"{view.replace('_', ' ').capitalize()} view, {count} trajectories. Best of each column in bold.",
-    )
+    heading = title or f"{view.replace('_', ' ').capitalize()} view"
+    return table(columns, rows, caption=f"{heading}; trajectories: {max(counts)}. Best of each column in bold.")
+
+
+def second_segmenters(scores: VideoScores, group: str) -> Html:
+    """Robot IoU by every further segmenter: does the order of methods depend on the instrument?"""
+    tables = []
+    for segmenter in scores.segmenters:
+        if suffix := segmenter.get("suffix"):
+            metrics = tuple(
+                (f"{name}{suffix}", label, digits) for name, label, digits in METRICS if name in IOU_METRICS
+            )
+            tables.append(
+                metric_table(scores, group, "head", metrics, f"Head view by a second segmenter, {segmenter['name']}")
+            )
+    return join(tables)
 
 
 def difference_charts(context: ReportContext, scores: VideoScores, group: str) -> list[Html]:
@@ -108,30 +116,23 @@ def difference_charts(context: ReportContext, scores: VideoScores, group: str) -
     primary = scores.primary(group, context.config.primary_method)
     if primary is None:
         return []
+    wanted = [("robot_iou_exact", "robot IoU (exact masks)"), ("robot_iou", "robot IoU (segmenter on both)")]
+    wanted += [
+        (f"robot_iou{segmenter['suffix']}", f"robot IoU ({segmenter['name']} segmenter on both)")
+        for segmenter in scores.segmenters
+        if segmenter.get("suffix")
+    ]
     charts: list[Html] = []
-    for metric, label in (*((m, "robot IoU") for m in IOU_METRICS), ("ssim", "SSIM")):
-        dots = []
+    for metric, label in (*wanted, ("ssim", "SSIM")):
+        dots: list[Dot] = []
         for other in scores.methods(group):
-            found = (
-                scores.difference(group, primary.name, other.name, f"{metric}@head")
-                if other.name != primary.name
-                else None
-            )
+            found = scores.difference(group, primary.name, other.name, f"{metric}@head")
             if found is not None:
-                same = other.group == primary.group or other.group == "baseline"
-                dots.append(
-                    Dot(
-                        other.label if same else other.long_label,
-                        found["mean"],
-                        found["low"],
-                        found["high"],
-                        other.colour,
-                    )
-                )
+                name = other.label if other.group in (primary.group, "baseline") else other.long_label
+                dots.append(Dot(name, found["mean"], found["low"], found["high"], other.colour))
         if dots:
-            suffix = {"robot_iou_exact": " (exact masks)", "robot_iou": " (segmenter on both)"}.get(metric, "")
-            title = f"{primary.long_label} minus each other: {label}{suffix}"
-            value_label = f"paired difference in {label}, 95 % interval; right of zero, {primary.label} is better"
+            title = f"{primary.long_label} minus each other: {label}"
+            value_label = f"paired difference, 95 % interval; right of zero, {primary.label} is better"
             charts.append(interval_chart(dots, title=title, value_label=value_label, zero_line=True, signed=True))
     return charts
 

@@ -1,0 +1,111 @@
+"""Seconds a frame of the whole-clip and the causal sampler, and the cost of a block from the first to the fiftieth.
+
+    python benchmarks/rollout.py [--checkpoint FOLDER] [--tokenizer FOLDER] [--device cuda] [--blocks 50]
+
+Without folders the models have random weights: speed does not depend on them. Decoding is included, writing is not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from einops import rearrange
+
+from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
+from worldline_core.model.tokenizer.patch import PatchTokenizer
+from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.block_causal import BLOCK_SIZE, BlockCausalSimulator
+from worldline_core.rollout.euler import Noise
+from worldline_core.rollout.full_clip import rollout_full_clip
+
+GRID = (8, 12)
+
+
+def timed(work: Callable[[], object], device: str) -> float:
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    work()
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+@torch.no_grad()
+def measure(model: WorldModel, tokenizer: VideoTokenizer, options: argparse.Namespace) -> dict[str, object]:
+    device, views = options.device, model.config.views
+    channels, frames = model.config.latent_channels, 1 + 4 * BLOCK_SIZE * 2
+    latent_frames = 1 + (frames - 1) // 4
+    first = torch.randn(1, len(views), channels, *GRID, device=device)
+    maps = torch.randn(1, len(views), model.config.action_channels, latent_frames, *GRID, device=device)
+
+    def decode(latents: torch.Tensor) -> torch.Tensor:
+        with torch.autocast(device.split(":")[0], torch.bfloat16):
+            return tokenizer.decode(rearrange(latents, "b v c t h w -> (b v) c t h w"))
+
+    def full() -> None:
+        decode(rollout_full_clip(model, first, maps, noise=Noise([42]), steps=35, views=views, bfloat16=True))
+
+    def causal(blocks: int = 2) -> list[float]:
+        simulator = BlockCausalSimulator(
+            model, noise=Noise([42]), views=views, recent_blocks=options.recent_blocks, bfloat16=True
+        )
+        simulator.start(first, maps[:, :, :, :1])
+        controls = maps[:, :, :, 1 : 1 + BLOCK_SIZE]
+        return [
+            timed(lambda: decode(torch.cat((first[:, :, :, None], simulator.step(controls)), dim=3)), device)
+            for _ in range(blocks)
+        ]
+
+    full(), causal()
+    full_seconds = statistics.median(timed(full, device) for _ in range(options.repeats))
+    causal_seconds = statistics.median(sum(causal()) for _ in range(options.repeats))
+    blocks = [causal(options.blocks) for _ in range(options.repeats)]
+    by_block = [statistics.median(times) for times in zip(*blocks, strict=True)]
+    # The first blocks run on a window that is not yet full.
+    settled = by_block[1 + options.recent_blocks]
+    return {
+        "frames": frames,
+        "full_clip_seconds_per_frame": full_seconds / frames,
+        "causal_seconds_per_frame": causal_seconds / frames,
+        "speed_up": full_seconds / causal_seconds,
+        "block_seconds": {"first": by_block[0], "settled": settled, "last": by_block[-1]},
+        "last_over_settled": by_block[-1] / settled,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--tokenizer", type=Path)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--blocks", type=int, default=50)
+    parser.add_argument("--recent-blocks", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--output", type=Path, help="also write the figures here, as JSON")
+    options = parser.parse_args()
+    if options.checkpoint is None:
+        model = WorldModel(WorldModelConfig(towers="generation"))
+        model.initialise(torch.Generator().manual_seed(0))
+    else:
+        model, _ = load_checkpoint(options.checkpoint, towers="generation")
+    tokenizer: VideoTokenizer = PatchTokenizer() if options.tokenizer is None else load_tokenizer(options.tokenizer)
+    if isinstance(tokenizer, torch.nn.Module):
+        tokenizer.to(options.device).eval().requires_grad_(False)
+    figures = measure(model.to(options.device).eval(), tokenizer, options)
+    text = json.dumps(figures, indent=1)
+    print(text)
+    if options.output is not None:
+        options.output.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
