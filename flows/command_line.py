@@ -85,7 +85,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
     _use_local_prefect_storage(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
 
-    preset = arguments.preset or (None if arguments.config else "nightly")
+    preset = arguments.preset or (None if arguments.config else "tiny")
     print(f"nightly: {nightly_evaluation(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)}")
 
 
@@ -96,9 +96,8 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from worldline_core.recorder.record import RecordConfig, record
-
     from worldline_core.config import load_config
+    from worldline_core.recorder.record import RecordConfig, record
 
     config = load_config(RecordConfig, path=arguments.config, overrides=arguments.overrides)
     print(record(config, {}, arguments.output))

@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from prefect import flow, task
-from worldline_core.report.nightly import compare_with_history
 
 from tasks.artifact_task import ArtifactReference, artifact_task
 from worldline_core.config import load_config
 from worldline_core.pipeline.config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
+from worldline_core.report.nightly import compare_with_history
 
 compare_nights = task(compare_with_history, name="compare_nights", persist_result=False)
 
 
 @flow(name="nightly-evaluation")
 def nightly_evaluation(
-    preset: str | None = "nightly",
+    preset: str | None = "tiny",
     config: Path | None = None,
     overrides: tuple[str, ...] = (),
     artifacts: Path = Path("artifacts"),

@@ -39,7 +39,7 @@ def test_keys_entrypoint_and_parameters(deployments: list[dict[str, Any]], index
     path, _, function = deployment["entrypoint"].partition(":")
     flow = getattr(importlib.import_module(path.removesuffix(".py").replace("/", ".")), function)
     assert isinstance(flow, Flow)
-    flow.validate_parameters({**{"config": None, "overrides": (), "artifacts": "artifacts"}, **deployment["parameters"]})
+    flow.validate_parameters({"config": None, "overrides": (), "artifacts": "artifacts", **deployment["parameters"]})
     assert deployment["parameters"]["preset"] in preset_names()
 
 

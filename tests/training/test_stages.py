@@ -63,7 +63,7 @@ def teacher(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def stage1_folder(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from .conftest import TINY_MODEL  # noqa: PLC0415
+    from .conftest import TINY_MODEL
 
     folder = tmp_path_factory.mktemp("stage1")
     config = Stage1Config.model_validate(
@@ -171,8 +171,8 @@ def test_what_stage2_trains(model_config: MakeConfig) -> None:
 
 
 def test_outcomes_do_not_reach_the_model(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
-    import pyarrow as pa  # noqa: PLC0415
-    import pyarrow.parquet as pq  # noqa: PLC0415
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
     flipped = tmp_path / "flipped"
     shutil.copytree(world.episodes, flipped)
@@ -226,8 +226,8 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
-    from worldline_core.training.clip_sampler import Clip  # noqa: PLC0415
-    from worldline_core.training.video_teacher import TeacherFeatures, load_teacher  # noqa: PLC0415
+    from worldline_core.training.clip_sampler import Clip
+    from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())
     assert description["metrics"]["validation/loss"] > 0

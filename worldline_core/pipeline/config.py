@@ -15,8 +15,8 @@ from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
 from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.filters.filter import FilterConfig
-from worldline_core.report.report import ReportConfig
 from worldline_core.model.import_backbone import ImportBackboneConfig
+from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig
 from worldline_core.training.encode_latents import EncodeLatentsConfig
 from worldline_core.training.stage1 import Stage1Config

@@ -217,7 +217,9 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     """Fit, train and measure a patch tokenizer on ``inputs["episodes"]`` (an episode set).
 
     It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. With
-    ``inputs["start"]``, a tokenizer, its bases are kept (latents stay valid) and its decoder is trained further. Writes ``tokenizer.safetensors``, ``tokenizer.json`` and ``metrics.json`` into ``output``; an interrupted call goes
+    ``inputs["start"]``, a tokenizer, its bases are kept (latents stay valid) and its decoder is trained further.
+
+    Writes ``tokenizer.safetensors``, ``tokenizer.json`` and ``metrics.json`` into ``output``; an interrupted call goes
     on where it stopped and ends with the same bytes.
 
     Returns:
