@@ -96,11 +96,11 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from worldline_core.config import load_config
-    from worldline_core.recorder.record import RecordConfig, record
+    from worldline_core.config import read_yaml
+    from worldline_core.recorder.record_command import record_command
 
-    config = load_config(RecordConfig, path=arguments.config, overrides=arguments.overrides)
-    print(record(config, {}, arguments.output))
+    kind = "banks" if "banks" in read_yaml(arguments.config) else "episodes"
+    print(record_command(kind, arguments.config, arguments.overrides, arguments.output))
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from einops import rearrange, repeat
@@ -21,42 +22,20 @@ from worldline_core.model.block_causal import FullAttention, TeacherForcingAtten
 from worldline_core.model.config import VIEWS, WorldModelConfig, cosmos3_nano_config
 from worldline_core.model.kv_cache import CachedAttention, KVCache
 from worldline_core.model.layers import GenerationAttention, MixtureLayer, RMSNorm
+from worldline_core.model.parameters import initialise, is_text_parameter
+from worldline_core.model.prediction import preconditioned_velocity, velocity_of
 from worldline_core.model.rope import rotation, text_positions, video_positions
 from worldline_core.model.time_embedding import TimeEmbedder
 
-__all__ = ["TextContext", "WorldModel", "WorldModelConfig", "WorldModelOutput", "cosmos3_nano_config"]
-
-TEXT_PARAMETERS = (
-    "embed_tokens.",
-    "norm.",
-    ".to_q.",
-    ".to_k.",
-    ".to_v.",
-    ".to_out.",
-    ".norm_q.",
-    ".norm_k.",
-    ".mlp.",
-    ".input_layernorm.",
-    ".post_attention_layernorm.",
-)
-"""Name parts of the understanding tower's parameters; everything else belongs to the generation tower."""
-
-
-def is_text_parameter(name: str) -> bool:
-    """Whether a parameter belongs to the understanding (text) tower."""
-    return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
-
-
-def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor, std: float) -> Tensor:
-    """Velocity of the posterior mean under z ~ N(reference, std^2), corrected by ``emitted`` posterior deviations.
-
-    With D = (1 - sigma)^2 std^2 + sigma^2 the posterior of z given the noisy latents has the mean
-    ``reference + (1 - sigma) std^2 / D (noisy - (1 - sigma) reference)`` and the deviation ``sigma std / sqrt(D)``.
-    ``(noisy - z) / sigma`` then has no division by sigma left.
-    """
-    spread = (1 - sigma) ** 2 * std**2 + sigma**2
-    mean = ((sigma - (1 - sigma) * std**2) * noisy - sigma * reference) / spread
-    return mean - std * emitted * spread.rsqrt()
+__all__ = [
+    "TextContext",
+    "WorldModel",
+    "WorldModelConfig",
+    "WorldModelOutput",
+    "cosmos3_nano_config",
+    "is_text_parameter",
+    "preconditioned_velocity",
+]
 
 
 @dataclass(frozen=True)
@@ -91,29 +70,14 @@ class WorldModel(nn.Module):
         self.proj_out = nn.Linear(config.hidden_size, config.patch_dim)
         self.time_embedder = TimeEmbedder(config.hidden_size)
         self.action_encoder = ActionEncoder(config.action_channels, config.patch_size, config.hidden_size)
-        self.view_embedding: nn.Parameter | None = None
-        if config.view_embedding:
-            self.view_embedding = nn.Parameter(torch.zeros(len(config.views), config.hidden_size))
+        self.view_embedding = (
+            nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
+        )
         self.gradient_checkpointing = False
 
     def initialise(self, generator: torch.Generator | None = None) -> None:
         """Weights for training from scratch: small normals, residual outputs scaled by depth, head and actions zero."""
-        residual = (2 * self.config.num_layers) ** -0.5
-        for name, parameter in self.named_parameters():
-            if parameter.ndim < 2:
-                value = 1.0 if "norm" in name else 0.0
-                nn.init.constant_(parameter, value)
-                continue
-            std = 0.02 if name.startswith("action_encoder.conv") else parameter[0].numel() ** (-0.5)
-            if name.endswith(("to_add_out.weight", "to_out.weight", "down_proj.weight")):
-                std *= residual
-            if name.startswith("embed_tokens"):
-                std = 0.02
-            nn.init.normal_(parameter, 0.0, std, generator=generator)
-        nn.init.zeros_(self.proj_out.weight)
-        self.action_encoder.reset_output()
-        if self.view_embedding is not None:
-            nn.init.zeros_(self.view_embedding)
+        initialise(self, self.config.num_layers, generator)
 
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """What Stage II trains besides the action branch (method.md section 4)."""
@@ -313,7 +277,7 @@ class WorldModel(nn.Module):
         time = self.time_embedder(sigma.float() * (1000.0 * self.config.timestep_scale))
         time = torch.where(clean[..., None], torch.zeros((), dtype=time.dtype, device=time.device), time)
         tokens = tokens + rearrange(time, "b t d -> b t 1 d").to(tokens.dtype)
-        if self.view_embedding is not None:
+        if isinstance(self.view_embedding, nn.Parameter):
             chosen = self.view_embedding[[self.config.views.index(view) for view in views]]
             chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
             tokens = tokens + chosen.to(tokens.dtype)
@@ -331,7 +295,8 @@ class WorldModel(nn.Module):
         for index, layer in enumerate(self.layers):
             context = None if text is None else text.layers[index]
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens, _, _ = checkpoint(layer, tokens, attend, index, text=context, use_reentrant=False)
+                advanced: Any = checkpoint(layer, tokens, attend, index, text=context, use_reentrant=False)
+                tokens = advanced[0]
             else:
                 tokens, _, _ = layer(tokens, attend, index, text=context)
             if features_at == index + 1:
@@ -351,18 +316,7 @@ class WorldModel(nn.Module):
             p=size,
             q=size,
         )
-        if self.config.prediction == "velocity":
-            return emitted.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)
         per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
         level = rearrange(per_frame.float(), "b t -> b 1 1 t 1 1")
-        emitted = emitted.float()
-        if self.config.prediction == "first_frame_residual":
-            if reference is None:
-                raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
-            if self.config.first_frame_std is not None:
-                std = self.config.first_frame_std
-                velocity = preconditioned_velocity(emitted, latents.float(), level, reference.float(), std)
-                return velocity.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)
-            emitted = emitted + reference.float()
-        emitted = (latents.float() - emitted) / level.clamp_min(self.config.minimum_sigma)
-        return emitted.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)
+        velocity = velocity_of(self.config, emitted, latents, level, reference)
+        return velocity.masked_fill(rearrange(clean, "b t -> b 1 1 t 1 1"), 0.0)

@@ -14,25 +14,25 @@ from worldline_core.rollout.controls import Controls
 class RolloutConfig(StrictModel):
     """Which episodes are predicted, and how."""
 
-    method: str = Field("worldline", min_length=1)
+    method: str = Field(default="worldline", min_length=1)
     """Name the predictions carry in scores and reports."""
     sampler: Literal["full_clip", "block_causal", "copy_first_frame"] = "block_causal"
-    steps: int | None = Field(None, ge=1)
+    steps: int | None = Field(default=None, ge=1)
     """Euler steps: 35 for a whole clip, 4 a block, unless given."""
     actions: Controls = "true"
-    seeds: tuple[int, ...] = Field((42,), min_length=1)
+    seeds: tuple[int, ...] = Field(default=(42,), min_length=1)
     splits: tuple[str, ...] = ("test",)
     banks: tuple[str, ...] | None = None
     """Only episodes of these candidate banks."""
     embodiments: tuple[str, ...] | None = None
-    max_episodes_per_embodiment: int | None = Field(None, ge=1)
-    num_frames: int = Field(33, ge=5)
+    max_episodes_per_embodiment: int | None = Field(default=None, ge=1)
+    num_frames: int = Field(default=33, ge=5)
     """Longest prediction; shorter episodes are predicted as far as whole blocks (or groups) go."""
-    batch_size: int = Field(8, ge=1)
-    sink_blocks: int = Field(1, ge=1)
-    recent_blocks: int | None = Field(None, ge=0)
+    batch_size: int = Field(default=8, ge=1)
+    sink_blocks: int = Field(default=1, ge=1)
+    recent_blocks: int | None = Field(default=None, ge=0)
     """Recent blocks in the cache; by default 3, or fewer where the model was trained on shorter clips."""
-    crf: int = Field(8, ge=0, le=51)
+    crf: int = Field(default=8, ge=0, le=51)
     bfloat16: bool = True
     device: str = "cpu"
 

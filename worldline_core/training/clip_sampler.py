@@ -13,6 +13,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.training.latent_store import LatentRow, LatentStore
 
 PRIMARY = "primary"
+JOINT = "joint"
 
 
 class ClipSampling(StrictModel):
@@ -20,8 +21,10 @@ class ClipSampling(StrictModel):
 
     ``lengths``: clip lengths in video frames (4 k + 1), drawn with ``length_weights`` (default: equal).
     ``strides``: temporal strides. ``source_weights``: weight of an episode by its source (default 1).
-    ``view_weights``: None trains all views jointly (Stage II); otherwise one view a step is drawn by these weights,
-    where "primary" is each episode's own task-facing view (Stage I).
+    ``view_weights``: None trains all views jointly (Stage II); otherwise what a step trains on is drawn by these
+    weights: the name of a view, "primary" (each episode's own task-facing view; Stage I), or "joint" (all views).
+    Steps on one view cost a fraction of joint ones and teach most of what controls look like: where compute is short,
+    a mixture learns faster. ``single_view_factor`` multiplies the batch of such steps.
     """
 
     lengths: tuple[int, ...] = Field(default=(33,), min_length=1)
@@ -29,6 +32,7 @@ class ClipSampling(StrictModel):
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
     source_weights: dict[str, float] = Field(default_factory=dict)
     view_weights: dict[str, float] | None = None
+    single_view_factor: int = Field(default=1, ge=1)
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class ClipSampler:
             )
         self.store = store
         self.batch_size = batch_size
+        self.single_view_factor = config.single_view_factor
         self.seed = seed
         self.rank = rank
         self.world_size = world_size
@@ -109,10 +114,12 @@ class ClipSampler:
         kind = int(random.choice(len(self._kinds), p=self._kind_weights))
         view = None
         if self._view_names:
-            view = self._view_names[int(random.choice(len(self._view_names), p=self._view_weights))]
+            name = self._view_names[int(random.choice(len(self._view_names), p=self._view_weights))]
+            view = None if name == JOINT else name
         length, stride = self._kinds[kind]
-        draws = random.random((self.batch_size * self.world_size, 2))
-        mine = draws[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
+        size = self.batch_size * (1 if view is None else self.single_view_factor)
+        draws = random.random((size * self.world_size, 2))
+        mine = draws[self.rank * size : (self.rank + 1) * size]
         return ClipBatch(tuple(self._clip(kind, length, stride, draw) for draw in mine), view)
 
     def _clip(self, kind: int, length: int, stride: int, draw: np.ndarray) -> Clip:

@@ -151,13 +151,15 @@ def train[BatchT: NamedClips](
     log = MetricsLog(output / "metrics.jsonl", first) if rank == 0 else None
     timings = MetricsLog(output / "run" / "timings.jsonl", first) if rank == 0 else None
     started = saved_at = time.monotonic()
+    seen = 0
     progress = tqdm(total=config.steps, initial=first, desc=title, unit="step", disable=None if rank == 0 else True)
     for step in range(first, config.steps):
         factor = learning_rate_factor(config.optimizer, step, config.steps)
         for slot, group in zip(optimizer.param_groups, groups, strict=True):
             slot["lr"] = config.optimizer.learning_rate * group.multiplier * factor
-        values, norm = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
+        values, norm, size = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
         average.update(step)
+        seen += size * world_size
         values["gradient_norm"] = norm
         sums = {key: sums.get(key, 0.0) + value for key, value in values.items()}
         count += 1
@@ -167,10 +169,9 @@ def train[BatchT: NamedClips](
             sums, count = {}, 0
             row = {"step": done, "learning_rate": config.optimizer.learning_rate * factor, **last}
             seconds = time.monotonic() - started
-            clips = (done - first) * config.batch_size * config.accumulation * world_size
             if log is not None and timings is not None:
                 log.add(row)
-                timings.add({"step": done, "seconds": seconds, "clips_per_second": clips / seconds})
+                timings.add({"step": done, "seconds": seconds, "clips_per_second": seen / seconds})
             progress.set_postfix(loss=f"{last['loss']:.4f}", refresh=False)
         due = config.validate_every and done % config.validate_every == 0
         if validate is not None and (due or done == config.steps):
@@ -228,13 +229,15 @@ def _step[BatchT: NamedClips](
     title: str,
     rank: int,
     world_size: int,
-) -> tuple[dict[str, float], float]:
-    """One optimiser step; returns the mean metrics of its micro-steps and the gradient norm before clipping."""
+) -> tuple[dict[str, float], float, int]:
+    """One optimiser step: mean metrics of its micro-steps, the gradient norm before clipping, clips of this rank."""
     optimizer.zero_grad(set_to_none=True)
     totals: dict[str, float] = {}
+    size = 0
     for part in range(config.accumulation):
         index = step * config.accumulation + part
         batch = load(index)
+        size += len(batch.clips)
         generator = step_generator(config.seed, index * world_size + rank, config.device)
         with autocast(config):
             loss, values = objective.loss(batch, generator, step)
@@ -263,4 +266,4 @@ def _step[BatchT: NamedClips](
             next_step="lower the learning rate or the clipping norm",
         )
     optimizer.step()
-    return totals, norm
+    return totals, norm, size

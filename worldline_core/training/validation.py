@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_sampler import JOINT, ClipSampler, ClipSampling
 from worldline_core.training.latent_store import LatentRow, LatentStore
 from worldline_core.training.objective import FlowMatchingObjective
 from worldline_core.training.trainer import TrainerConfig, autocast, step_generator
@@ -32,6 +32,9 @@ def validation_function(
         return None
     # At least two clips, so that "shuffled actions" are another clip's.
     size = max(2, trainer.batch_size)
+    # Where steps on one view are mixed in, it is still the joint prediction that counts.
+    if clips.view_weights is not None and JOINT in clips.view_weights:
+        clips = clips.model_copy(update={"view_weights": None})
     sampler = ClipSampler(store, clips, splits=splits, batch_size=size, seed=VALIDATION_SEED, rows=held_out)
 
     def validate() -> dict[str, float]:

@@ -23,7 +23,7 @@ from worldline_core.model.tokenizer.wan import WanTokenizer
 
 def small_wan(latent_channels: int = 32) -> WanTokenizer:
     """A Wan autoencoder of about two million parameters: 8 x 8 in space, 4 in time."""
-    from diffusers import AutoencoderKLWan
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
     vae = AutoencoderKLWan(
         base_dim=24,
@@ -38,7 +38,6 @@ def small_wan(latent_channels: int = 32) -> WanTokenizer:
         patch_size=2,
         scale_factor_spatial=8,
         scale_factor_temporal=4,
-        clip_output=False,
         latents_mean=[0.0] * latent_channels,
         latents_std=[1.0] * latent_channels,
     )
@@ -83,11 +82,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tokenizer", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--max-episodes", type=int, default=40)
+    parser.add_argument("--held-out-split", default="validation")
     options = parser.parse_args(arguments)
     config = TokenizerConfig(max_episodes=options.max_episodes, batch_size=1)
     episodes = EpisodeSet.open(options.episodes)
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
-    held_out = select_episodes(episodes, config.held_out_splits, 4, config.seed)
+    held_out = select_episodes(episodes, (options.held_out_split,), 4, config.seed)
     videos = load_views(episodes, chosen, config.image_size, 5)
     torch.manual_seed(config.seed)
     wan = small_wan()

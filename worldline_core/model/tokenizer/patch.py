@@ -39,12 +39,12 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 class PatchTokenizerConfig(StrictModel):
     """Layout of the codes and width of the decoder."""
 
-    static_channels: int = Field(24, ge=1)
-    motion_channels: int = Field(8, ge=0)
-    spatial_compression: int = Field(8, ge=2, multiple_of=4)
-    temporal_compression: int = Field(4, ge=1)
-    refinement_width: int = Field(48, ge=4)
-    refinement_depth: int = Field(2, ge=1)
+    static_channels: int = Field(default=24, ge=1)
+    motion_channels: int = Field(default=8, ge=0)
+    spatial_compression: int = Field(default=8, ge=2, multiple_of=4)
+    temporal_compression: int = Field(default=4, ge=1)
+    refinement_width: int = Field(default=48, ge=4)
+    refinement_depth: int = Field(default=2, ge=1)
 
 
 class PatchTokenizer(nn.Module):

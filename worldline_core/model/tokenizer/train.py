@@ -36,28 +36,28 @@ class TokenizerConfig(StrictModel):
     """Everything the shipped tokenizer depends on."""
 
     image_size: tuple[int, int] = (64, 96)
-    channels: int = Field(32, ge=1)
-    motion_weight: float = Field(4.0, ge=0)
-    whitening: float = Field(0.5, ge=0, le=1)
-    refinement_width: int = Field(48, ge=4)
-    refinement_depth: int = Field(2, ge=1)
+    channels: int = Field(default=32, ge=1)
+    motion_weight: float = Field(default=4.0, ge=0)
+    whitening: float = Field(default=0.5, ge=0, le=1)
+    refinement_width: int = Field(default=48, ge=4)
+    refinement_depth: int = Field(default=2, ge=1)
     splits: tuple[str, ...] = ("train",)
     held_out_splits: tuple[str, ...] = ("validation", "test")
-    max_episodes: int | None = Field(None, ge=1)
-    held_out_episodes: int = Field(12, ge=0)
-    clip_frames: int = Field(33, ge=5)
-    fit_clips: int = Field(600, ge=1)
-    steps: int = Field(4000, ge=0)
-    batch_size: int = Field(8, ge=1)
+    max_episodes: int | None = Field(default=None, ge=1)
+    held_out_episodes: int = Field(default=12, ge=0)
+    clip_frames: int = Field(default=33, ge=5)
+    fit_clips: int = Field(default=600, ge=1)
+    steps: int = Field(default=4000, ge=0)
+    batch_size: int = Field(default=8, ge=1)
     """Clips a step; each gives its first frame and three groups of four frames."""
-    learning_rate: float = Field(2e-3, gt=0)
-    warmup_steps: int = Field(100, ge=0)
-    average_decay: float = Field(0.998, ge=0, lt=1)
-    reference_dropout: float = Field(0.1, ge=0, le=1)
-    disturbance: float = Field(0.3, ge=0)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    average_decay: float = Field(default=0.998, ge=0, lt=1)
+    reference_dropout: float = Field(default=0.1, ge=0, le=1)
+    disturbance: float = Field(default=0.3, ge=0)
     """Largest standard deviation of the noise added to the codes of the groups (0 trains on exact codes only)."""
-    seed: int = Field(0, ge=0)
-    checkpoint_every: int = Field(500, ge=1)
+    seed: int = Field(default=0, ge=0)
+    checkpoint_every: int = Field(default=500, ge=1)
     bfloat16: bool = True
 
 
@@ -152,7 +152,7 @@ def train_decoder(tokenizer: PatchTokenizer, videos: list[Tensor], config: Token
     Raises:
         TrainingError: the loss is not finite.
     """
-    network = tokenizer.refinement.train().requires_grad_(True).to(memory_format=torch.channels_last)
+    network = tokenizer.refinement.train().requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4)
     average = {name: value.detach().clone() for name, value in network.state_dict().items()}
     start = 0

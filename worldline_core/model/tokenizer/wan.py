@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.tokenizer.base import check_latents, check_video
 
 if TYPE_CHECKING:
-    from diffusers import AutoencoderKLWan
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
 # fmt: off
 WAN22_MEAN = (
@@ -66,7 +67,7 @@ class WanTokenizer(nn.Module):
         check_video(self, video)
         # The autoencoder was trained without mixed precision; it runs in the dtype of its weights.
         with torch.autocast(device_type=video.device.type, enabled=False):
-            mode = self.vae.encode(video.to(self.vae.dtype)).latent_dist.mode()
+            mode = self.vae.encode(video.to(self.vae.dtype), return_dict=False)[0].mode()
         return ((mode.float() - self.mean) / self.std).to(video.dtype)
 
     def decode(
@@ -76,7 +77,7 @@ class WanTokenizer(nn.Module):
         check_latents(self, latents)
         with torch.autocast(device_type=latents.device.type, enabled=False):
             codes = (latents.float() * self.std + self.mean).to(self.vae.dtype)
-            return self.vae.decode(codes).sample.to(latents.dtype)
+            return self.vae.decode(codes, return_dict=False)[0].to(latents.dtype)
 
     @classmethod
     def load(cls, folder: Path, dtype: torch.dtype = torch.float32) -> WanTokenizer:
@@ -86,7 +87,7 @@ class WanTokenizer(nn.Module):
             UnavailableError: there is no such folder.
             CheckpointError: it is incomplete, damaged, or holds another autoencoder.
         """
-        from diffusers import AutoencoderKLWan
+        from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
 
         root = folder / "vae" if (folder / "vae").is_dir() else folder
         if not (root / "config.json").is_file():
@@ -96,7 +97,12 @@ class WanTokenizer(nn.Module):
                 expected="a diffusers folder with config.json and *.safetensors",
                 next_step="download Wan-AI/Wan2.2-TI2V-5B-Diffusers (subfolder vae) and give its folder",
             )
-        name = AutoencoderKLWan.load_config(str(root)).get("_class_name")
+        try:
+            name = json.loads((root / "config.json").read_text(encoding="utf-8")).get("_class_name")
+        except (json.JSONDecodeError, UnicodeDecodeError, AttributeError) as error:
+            raise CheckpointError(
+                "The autoencoder's config is not a JSON object", where=root, got=str(error)
+            ) from error
         if name != AutoencoderKLWan.__name__:
             raise CheckpointError("Not a Wan autoencoder", where=root, expected=AutoencoderKLWan.__name__, got=name)
         try:
