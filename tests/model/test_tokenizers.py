@@ -205,7 +205,7 @@ def wan_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     vae = AutoencoderKLWan(
         base_dim=8, decoder_base_dim=8, z_dim=48, dim_mult=[1, 1, 1, 1], num_res_blocks=1, is_residual=True,
-        in_channels=12, out_channels=12, patch_size=2, scale_factor_spatial=16, clip_output=False,
+        in_channels=12, out_channels=12, patch_size=2, scale_factor_spatial=16,
         temperal_downsample=[False, True, True], latents_mean=list(WAN22_MEAN), latents_std=list(WAN22_STD),
     )  # fmt: skip
     folder = tmp_path_factory.mktemp("wan")
@@ -237,4 +237,7 @@ def test_a_missing_or_damaged_wan_folder_is_named(wan_folder: Path, tmp_path: Pa
         WanTokenizer.load(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps(config | {"_class_name": "AutoencoderKL"}))
     with pytest.raises(CheckpointError, match="Not a Wan autoencoder"):
+        WanTokenizer.load(tmp_path)
+    (tmp_path / "config.json").write_text("[]")
+    with pytest.raises(CheckpointError, match="not a JSON object"):
         WanTokenizer.load(tmp_path)

@@ -27,7 +27,9 @@ def recorder() -> EpisodeRecorder:
     try:
         SceneRenderer(recorder.scene).close()
     except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
-        pytest.skip(f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri")
+        pytest.skip(
+            f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri"
+        )
     return recorder
 
 
@@ -84,7 +86,9 @@ def test_the_wrist_camera_moves_with_the_arm_and_the_head_stands(recording: Reco
     assert all(cameras[view].moving for view in ("left_wrist", "right_wrist"))
     for camera in cameras.values():
         rotation = camera.T_base_camera[:, :3, :3]
-        np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(len(rotation), 0), atol=1e-9)
+        np.testing.assert_allclose(
+            rotation @ rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(len(rotation), 0), atol=1e-9
+        )
         np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-9)
 
 
@@ -132,7 +136,8 @@ def test_defects_spoil_what_they_say(name: str, recording: Recording) -> None:
     spoiled = DEFECTS[name](recording, np.random.default_rng(0))
     episode, healthy = spoiled.episode, recording.episode
     changed = {
-        "static_lead_in": np.ptp(episode.state[:16], axis=0).max() == 0 and episode.num_frames == healthy.num_frames + 16,
+        "static_lead_in": np.ptp(episode.state[:16], axis=0).max() == 0
+        and episode.num_frames == healthy.num_frames + 16,
         "reset_segment": np.abs(np.diff(episode.state, axis=0)).max() > np.abs(np.diff(healthy.state, axis=0)).max(),
         "frozen_camera": np.ptp(spoiled.frames["head"][4:].astype(int), axis=0).max() == 0,
         "corrupted_frames": sum(frame.max() == 0 for frame in spoiled.frames["head"]) == 4,

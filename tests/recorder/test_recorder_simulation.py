@@ -185,7 +185,11 @@ def test_candidates_of_a_layout_start_at_the_same_pose() -> None:
 
 
 def test_waypoints_are_met_in_time_and_at_rest() -> None:
-    points = [Waypoint(0.0, (0, 0, 0), 0.0, 1.0), Waypoint(1.0, (1, 2, 3), 0.5, 0.0), Waypoint(2.0, (1, 2, 3), 0.5, 1.0)]
+    points = [
+        Waypoint(0.0, (0, 0, 0), 0.0, 1.0),
+        Waypoint(1.0, (1, 2, 3), 0.5, 0.0),
+        Waypoint(2.0, (1, 2, 3), 0.5, 1.0),
+    ]
     positions, yaw, _, opening = sample_waypoints(points, np.array([0.0, 0.5, 1.0, 1.01, 5.0]))
     np.testing.assert_allclose(positions, [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3], [1, 2, 3], [1, 2, 3]])
     np.testing.assert_allclose(yaw, [0, 0.25, 0.5, 0.5, 0.5])

@@ -78,7 +78,9 @@ def write_latents(root: Path, count: int, validation: int) -> None:
             LatentRow(name, "00000.safetensors", FRAMES, VIEWS, "synthetic", "square", split, f"move {number}", "head")
         )
     save_file(tensors, root / "00000.safetensors")
-    pq.write_table(pa.Table.from_pylist([{**vars(row), "views": list(row.views)} for row in rows]), root / "index.parquet")
+    pq.write_table(
+        pa.Table.from_pylist([{**vars(row), "views": list(row.views)} for row in rows]), root / "index.parquet"
+    )
     description = {
         "layout": "groups",
         "start_step": 4,

@@ -51,12 +51,9 @@ def test_ranks_share_the_global_batch(store: LatentStore) -> None:
 
 def test_sources_and_views_follow_their_weights(store: LatentStore) -> None:
     rows = [
-        dataclasses.replace(row, source="rare" if number % 2 else "common")
-        for number, row in enumerate(store.rows)
+        dataclasses.replace(row, source="rare" if number % 2 else "common") for number, row in enumerate(store.rows)
     ]
-    config = ClipSampling(
-        lengths=(5,), source_weights={"rare": 0.0}, view_weights={"primary": 3.0, "left_wrist": 1.0}
-    )
+    config = ClipSampling(lengths=(5,), source_weights={"rare": 0.0}, view_weights={"primary": 3.0, "left_wrist": 1.0})
     sampler = make(store, config, rows=rows)
     sources = {row.episode_id: row.source for row in rows}
     batches = [sampler.clips(index) for index in range(400)]
@@ -64,6 +61,18 @@ def test_sources_and_views_follow_their_weights(store: LatentStore) -> None:
     views = Counter(batch.view for batch in batches)
     assert 240 < views["primary"] < 360
     assert views["primary"] + views["left_wrist"] == 400
+
+
+def test_single_view_steps_take_larger_batches(store: LatentStore) -> None:
+    config = ClipSampling(lengths=(9,), view_weights={"joint": 0.5, "head": 0.5}, single_view_factor=3)
+    whole = make(store, config, batch_size=4)
+    parts = [make(store, config, batch_size=2, rank=rank, world_size=2) for rank in range(2)]
+    sizes = Counter()
+    for index in range(60):
+        batch = whole.clips(index)
+        sizes[batch.view, len(batch.clips)] += 1
+        assert batch.clips == parts[0].clips(index).clips + parts[1].clips(index).clips
+    assert set(sizes) == {(None, 4), ("head", 12)}
 
 
 def test_impossible_requests_are_named(store: LatentStore) -> None:

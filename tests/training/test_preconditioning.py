@@ -37,7 +37,13 @@ def test_the_cached_pass_sees_the_same_first_frame(model_config: Callable[..., W
     sigma = torch.full((1,), 0.6)
     clean = torch.zeros(1, 2, dtype=torch.bool)
     cache = KVCache(1, 3)
-    model(latents[:, :, :, :1], torch.zeros(1), clean_frames=torch.ones(1, 1, dtype=torch.bool), cache=cache, write_cache=True)
+    model(
+        latents[:, :, :, :1],
+        torch.zeros(1),
+        clean_frames=torch.ones(1, 1, dtype=torch.bool),
+        cache=cache,
+        write_cache=True,
+    )
     cached = model(latents[:, :, :, 1:], sigma, clean_frames=clean, cache=cache).velocity
     # The head of a fresh model is silent, so what remains is the preconditioning alone.
     whole = model(latents, sigma).velocity[:, :, :, 1:]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldline_core.errors import DataError
 from worldline_core.recorder.robots import Robot
 from worldline_core.recorder.scene_model import DRAWER_TRAVEL
 from worldline_core.recorder.task_layout import Layout, sample_tool, side
@@ -37,7 +38,8 @@ def _direction(random: np.random.Generator, low: float, high: float) -> np.ndarr
 def _pick(layout: Layout, robot: Robot, random: np.random.Generator) -> list[Waypoint]:
     """Waypoints of a lift or place; errors are drawn from a mixture of what goes wrong in practice."""
     scale = robot.scale
-    assert layout.cube is not None
+    if layout.cube is None:
+        raise DataError("The layout does not fit the task", where=layout.family, expected="a cube")
     placing = layout.family == "place"
     cube, yaw = np.array(layout.cube[:2]), layout.cube[2] + random.normal(0, 0.08)
     grasp_xy = cube + random.normal(0, 0.004 * scale, 2)
@@ -70,7 +72,8 @@ def _pick(layout: Layout, robot: Robot, random: np.random.Generator) -> list[Way
         points.append(_point(times[4], away, grasp_z + height, yaw, closed))
         points.append(_point(times[5], away, grasp_z + height + 0.01 * scale, yaw, end))
         return points
-    assert layout.pad is not None
+    if layout.pad is None:
+        raise DataError("The layout does not fit the task", where=layout.family, expected="a pad")
     pad = np.array(layout.pad) + random.normal(0, 0.007 * scale, 2)
     if kind == "misplace":
         pad = pad + _direction(random, 0.06 * scale, 0.12 * scale)
@@ -90,7 +93,8 @@ def _pick(layout: Layout, robot: Robot, random: np.random.Generator) -> list[Way
 def _push(layout: Layout, robot: Robot, random: np.random.Generator) -> list[Waypoint]:
     """Waypoints that push the drawer towards +x."""
     scale = robot.scale
-    assert layout.cabinet is not None
+    if layout.cabinet is None:
+        raise DataError("The layout does not fit the task", where=layout.family, expected="a cabinet")
     kind = str(random.choice(["none", "short", "beside", "above"], p=[0.5, 0.27, 0.13, 0.10]))
     x, y = layout.cabinet
     y += random.normal(0, 0.012 * scale)

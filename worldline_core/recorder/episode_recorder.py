@@ -24,6 +24,8 @@ REACH_TOLERANCE_M = 0.012
 
 @dataclass(frozen=True)
 class Recording:
+    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view."""
+
     episode: Episode
     frames: dict[str, np.ndarray]
     robot_masks: dict[str, np.ndarray]

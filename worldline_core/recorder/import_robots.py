@@ -289,7 +289,8 @@ def viperx(package: Path) -> Body:
     ee.children = [a, b]
     a.name, b.name = "finger_a", "finger_b"
     # The source's joint coordinate is the finger's distance from the middle (0.021 closed to 0.057 open).
-    a.pos, b.pos = a.pos + [0, 0.0195, 0], b.pos - [0, 0.0195, 0]
+    inwards = np.array([0.0, 0.0195, 0.0])
+    a.pos, b.pos = a.pos + inwards, b.pos - inwards
     a.joint, b.joint = slide("finger_a", [0, 1, 0], 0, 0.042), slide("finger_b", [0, -1, 0], 0, 0.042)
     # x out of the gripper in the source; the fingertips end 0.115 m before the mount.
     matrix = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=float)
@@ -368,7 +369,8 @@ def so101(package: Path) -> Body:
     bodies = extract(model, "base", visual)
     root, ee, jaw = bodies["base"], bodies["gripper"], bodies["moving_jaw_so101_v1"]
     ee.name, jaw.name = "ee", "jaw"
-    assert jaw.joint is not None
+    if jaw.joint is None:
+        raise ValueError("the jaw of SO-101 has no joint")
     jaw.joint = {**jaw.joint, "name": "jaw", "range": np.array([-0.1745, 1.2])}
     fixed = model.geom("fixed_jaw_pad")
     moving = model.geom("moving_jaw_pad")

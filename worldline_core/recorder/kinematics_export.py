@@ -19,13 +19,13 @@ from worldline_core.recorder.rendering import OPENCV_AXES, look_at
 from worldline_core.recorder.robots import ROBOTS, Robot
 from worldline_core.recorder.scene_model import SceneModel, build_scene_model
 
-# Capsule radii [m] of the kinematic robot masks: (links, gripper).
+# Capsule radii [m] of the kinematic robot masks (links, hand, fingers), fitted to the exact masks of recordings.
 RADII = {
-    "aloha_viperx": (0.045, 0.035),
-    "ur5e_pair": (0.060, 0.040),
-    "xarm7_pair": (0.060, 0.040),
-    "panda_pair": (0.070, 0.040),
-    "so101": (0.030, 0.025),
+    "aloha_viperx": (0.036, 0.045, 0.010),
+    "ur5e_pair": (0.050, 0.034, 0.026),
+    "xarm7_pair": (0.080, 0.020, 0.008),
+    "panda_pair": (0.075, 0.021, 0.013),
+    "so101": (0.027, 0.040, 0.012),
 }
 SOURCES = {
     "viperx": "gym-aloha (Apache-2.0)",
@@ -61,12 +61,12 @@ def kinematics_xml(scene: SceneModel) -> str:
                 f'{pad}  <joint name="{model.joint(joint).name}" type="{kind}" '
                 f'axis="{_numbers(model.jnt_axis[joint])}" range="{_numbers(model.jnt_range[joint])}"/>'
             )
-        for site in range(model.nsite):
-            if model.site_bodyid[site] == body:
-                lines.append(
-                    f'{pad}  <site name="{model.site(site).name}" pos="{_numbers(model.site_pos[site])}" '
-                    f'quat="{_numbers(model.site_quat[site])}"/>'
-                )
+        lines.extend(
+            f'{pad}  <site name="{model.site(site).name}" pos="{_numbers(model.site_pos[site])}" '
+            f'quat="{_numbers(model.site_quat[site])}"/>'
+            for site in range(model.nsite)
+            if model.site_bodyid[site] == body
+        )
         for child in range(body + 1, model.nbody):
             if model.body_parentid[child] == body:
                 emit(child, depth + 1)
@@ -99,7 +99,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
     model, robot = scene.model, scene.robot
     by_address = {int(model.joint(j).qposadr[0]): model.joint(j).name for j in range(model.njnt)}
     closed, opened = robot.finger_travel
-    link_radius, gripper_radius = RADII[robot.name]
+    link_radius, hand_radius, gripper_radius = RADII[robot.name]
     arms = []
     for number, arm in enumerate(robot.arms):
         site = scene.tool_sites[number]
@@ -130,6 +130,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
                     ],
                 },
                 "link_radius": link_radius,
+                "hand_radius": hand_radius,
                 "gripper_radius": gripper_radius,
             }
         )
@@ -147,6 +148,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
 
 
 def main() -> None:
+    """Write the kinematics and descriptions of all embodiments into a folder."""
     parser = argparse.ArgumentParser(description="Write the embodiments' kinematics and descriptions.")
     parser.add_argument("output", type=Path)
     output = parser.parse_args().output

@@ -6,8 +6,10 @@ bytes. Needs the optional dependency MuJoCo and an OpenGL library for off-screen
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +77,8 @@ class RecordConfig(StrictModel):
 
 @dataclass(frozen=True)
 class Job:
+    """One episode to record: what it is, and the seed of all its draws."""
+
     episode_id: str
     embodiment: str
     split: str
@@ -121,10 +125,11 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
 
 
 def prepare_rendering() -> None:
-    """Choose the off-screen OpenGL back end before MuJoCo is imported.
+    """Choose the off-screen OpenGL back end; ``MUJOCO_GL`` decides where it is set, otherwise EGL.
 
     Raises: UnavailableError when MuJoCo is not installed.
     """
+    chosen = "MUJOCO_GL" in os.environ
     os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         import mujoco  # noqa: F401
@@ -134,6 +139,11 @@ def prepare_rendering() -> None:
             got=str(error),
             next_step="install the extra: uv sync --extra sim; on Debian also libegl1 libegl-mesa0 libgl1-mesa-dri",
         ) from error
+    if not chosen:
+        # MuJoCo reads the variable once, at import: where it was imported earlier, it has settled on a window.
+        for name in ("mujoco.rendering.classic.gl_context", "mujoco.gl_context"):
+            if name in sys.modules:
+                importlib.reload(sys.modules[name])
 
 
 _RECORDERS: dict[str, Any] = {}

@@ -24,6 +24,8 @@ class ArmPlacement:
 
 @dataclass(frozen=True)
 class HeadCamera:
+    """Where the head camera stands and looks, metres in the base frame."""
+
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
     fovy_deg: float

@@ -125,7 +125,7 @@ def apply_layout(scene: SceneModel, data: Any, layout: Layout) -> None:
         model.geom_rgba[model.geom(name).id] = [*OBJECT_COLOURS[colour], 1.0]
         model.body_gravcomp[body] = 0.0 if pose is not None else 1.0
         if pose is None:
-            data.qpos[address : address + 7] = [*(PARKED + [0, number, 0]), 1, 0, 0, 0]
+            data.qpos[address : address + 7] = [*(PARKED + np.array([0.0, number, 0.0])), 1, 0, 0, 0]
         else:
             half_angle = pose[2] / 2
             place = [pose[0], pose[1], CUBE_HALF * scale + 0.0005]
