@@ -163,7 +163,12 @@ def config(**distribution_matching: object) -> DistillConfig:
         {
             "clips": {"lengths": [17]},
             "block_size": 2,
-            "teacher_forcing": {"trainer": trainer(3), "history_noise": 0.1},
+            "teacher_forcing": {
+                "trainer": trainer(3),
+                "history_noise": 0.1,
+                "view_weights": {"joint": 1.0, "head": 1.0},
+                "single_view_factor": 2,
+            },
             "trajectory_regression": {
                 "trainer": trainer(3),
                 "trajectories": {"clips": 4, "clips_per_shard": 2, "substeps": [1, 1, 1, 2]},
@@ -296,6 +301,12 @@ def test_clips_must_be_whole_blocks(inputs: dict[str, Path], tmp_path: Path) -> 
     broken = config().model_copy(update={"block_size": 4})
     with pytest.raises(ConfigError, match="one observed frame and whole blocks"):
         distill(broken.model_copy(update={"block_size": 3}), inputs, tmp_path / "out")
+
+
+def test_single_views_are_for_teacher_forcing_alone(inputs: dict[str, Path], tmp_path: Path) -> None:
+    clips = config().clips.model_copy(update={"view_weights": {"head": 1.0}})
+    with pytest.raises(ConfigError, match="hold all views"):
+        distill(config().model_copy(update={"clips": clips}), inputs, tmp_path / "out")
 
 
 def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -19,12 +19,20 @@ CYCLE = 6
 
 
 class TeacherForcingConfig(StrictModel):
-    """Step 1. ``history_noise``: standard deviation of noise on the clean blocks a block sees (0 in the paper)."""
+    """Step 1.
+
+    ``history_noise``: standard deviation of noise on the clean blocks a block sees (0 in the paper).
+    ``view_weights``: None trains all views jointly; otherwise what a step trains on is drawn by these weights ("joint"
+    or the name of a view), and a step on one view takes ``single_view_factor`` times the clips: cheap where compute is
+    short. The later steps are always joint.
+    """
 
     trainer: TrainerConfig = TrainerConfig(steps=2000, optimizer=OptimizerConfig(learning_rate=3e-4))
     sigma: SigmaSampling = SigmaSampling(shift=2.0)
     weighting: LossWeighting = LossWeighting()
     history_noise: float = Field(default=0.0, ge=0)
+    view_weights: dict[str, float] | None = None
+    single_view_factor: int = Field(default=1, ge=1)
 
 
 class TrajectoriesConfig(StrictModel):

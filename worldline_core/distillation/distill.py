@@ -59,7 +59,9 @@ def _teacher_forcing(stage: DistillationStage) -> dict[str, float]:
     settings = stage.config.teacher_forcing
     model, info = load_checkpoint(stage.stage2, expect_kind="stage2", towers="generation")
     _check_clips(stage.config)
-    sampler = stage.sampler(settings.trainer.batch_size, settings.trainer.seed, distributed=True)
+    views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
+    clips = stage.config.clips.model_copy(update=views)
+    sampler = stage.sampler(settings.trainer.batch_size, settings.trainer.seed, distributed=True, clips=clips)
     return stage.train_step(
         STEPS[0],
         settings.trainer,
@@ -153,6 +155,14 @@ def _trajectory_loader(stage: DistillationStage, store: TrajectoryStore, trainer
 
 def _check_clips(config: DistillConfig) -> None:
     span = TEMPORAL_COMPRESSION * config.block_size
+    if config.clips.view_weights is not None:
+        raise ConfigError(
+            "Distillation clips hold all views",
+            where="distill.clips.view_weights",
+            expected="null",
+            got=config.clips.view_weights,
+            next_step="set distill.teacher_forcing.view_weights for the first step alone",
+        )
     odd = [length for length in config.clips.lengths if length <= span or (length - 1) % span]
     if odd:
         raise ConfigError(

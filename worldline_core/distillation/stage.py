@@ -25,7 +25,7 @@ from worldline_core.model.tokenizer.base import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.latent_store import TEMPORAL_COMPRESSION, LatentRow, LatentStore
 from worldline_core.training.trainer import (
@@ -106,11 +106,13 @@ class DistillationStage:
             world_size=world_size,
         )
 
-    def sampler(self, batch_size: int, seed: int, *, distributed: bool) -> ClipSampler:
+    def sampler(
+        self, batch_size: int, seed: int, *, distributed: bool, clips: ClipSampling | None = None
+    ) -> ClipSampler:
         """Clips of the training splits; the same on every process unless `distributed`."""
         return ClipSampler(
             self.store,
-            self.config.clips,
+            self.config.clips if clips is None else clips,
             splits=self.config.splits,
             batch_size=batch_size,
             seed=seed,

@@ -48,9 +48,9 @@ class Refinement(nn.Module):
         frames: Float[Tensor, "b g 3 h w"],
         first: Float[Tensor, "b 3 h w"],
         reference: Float[Tensor, "b 3 h w"],
-        known: Float[Tensor, b],
+        known: Tensor,
     ) -> Float[Tensor, "b g 3 h w"]:
-        """Refined frames; ``known`` is 1 where ``reference`` is the observed frame, 0 where it only stands in."""
+        """Refined frames; ``known``, ``(b)``, is 1 where ``reference`` is the observed frame, 0 where it only stands in."""
         stacked = torch.cat((rearrange(frames, "b g c h w -> b (g c) h w"), first, reference), dim=1)
         folded = F.pixel_unshuffle(stacked, 2)
         flag = rearrange(known, "b -> b 1 1 1").expand(-1, 1, *folded.shape[-2:]).to(folded.dtype)
