@@ -12,7 +12,11 @@ from worldline_core.pipeline.config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
 from worldline_core.report.nightly import compare_with_history
 
-compare_nights = task(compare_with_history, name="compare_nights", persist_result=False)
+
+@task(name="compare_nights", persist_result=False)
+def compare_nights(scores: dict[str, Path], history: Path) -> Path:
+    """Append this night's scores to the history and write the comparison."""
+    return compare_with_history(scores, history)
 
 
 @flow(name="nightly-evaluation")

@@ -24,10 +24,13 @@ def write_tokenizer(folder: Path, *, vision: bool = True) -> None:
     special = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", *(["<|vision_start|>"] if vision else [])]
     words = f"{SYSTEM_PROMPT} system user assistant lift the red cube put it down .".replace(".", " . ").split()
     vocabulary = {word: index for index, word in enumerate(dict.fromkeys(["[UNK]", *special, *words]))}
-    tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token="[UNK]"))
+    tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token="[UNK]"))  # noqa: S106 - a token of text
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
     fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, unk_token="[UNK]", eos_token="<|im_end|>", additional_special_tokens=special
+        tokenizer_object=tokenizer,
+        unk_token="[UNK]",  # noqa: S106
+        eos_token="<|im_end|>",  # noqa: S106
+        additional_special_tokens=special,
     )
     fast.chat_template = TEMPLATE
     fast.save_pretrained(folder)
