@@ -126,7 +126,8 @@ class TeacherFeatures:
 
     def features(self, clips: Sequence[Clip], views: Sequence[str]) -> Float[Tensor, "b v t h w d"]:
         """Features of every clip and view."""
-        return torch.stack([self._clip(clip, tuple(views)) for clip in clips]).float()
+        # Half precision does not survive a stack under CPU autocast.
+        return torch.stack([self._clip(clip, tuple(views)).float() for clip in clips])
 
     def _clip(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v t h w d"]:
         key = (clip, views)
