@@ -4,13 +4,17 @@ SHELL := /bin/bash
 UV := $(shell command -v uv 2>/dev/null || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
 
-.PHONY: demo test lint install record clean
+.PHONY: demo test test-slow lint install record clean
 
 demo: install
 	$(RUN) worldline pipeline --preset tiny
 
 test: install
 	$(RUN) pytest
+
+# Deployment against a real server and worker, and the largest model classes: minutes.
+test-slow: install
+	$(RUN) pytest -m slow --timeout=600
 
 lint: install
 	$(RUN) ruff check .

@@ -65,6 +65,7 @@ def _prefect(environment: dict[str, str], cwd: Path, *arguments: str, timeout: i
     return result.stdout
 
 
+@pytest.mark.slow
 def test_deployed_pipeline_runs_on_a_worker(environment: dict[str, str], project_root: Path, tmp_path: Path) -> None:
     _prefect(environment, project_root, "work-pool", "create", "worldline", "--type", "process")
     _prefect(environment, project_root, "--no-prompt", "deploy", "--all")
