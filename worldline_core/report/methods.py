@@ -67,7 +67,8 @@ def method(name: str) -> Method:
         return Method(name, "copy", "baseline")
     base = "causal" if "causal" in words else "stage2" if words & {"stage2", "stageii"} else ""
     control = "_zero" if words & ZERO_WORDS else "_shuffled" if words & SHUFFLED_WORDS else ""
-    kind = f"{base}{control}" if base else "other"
+    # Another number of steps is another method: it must not stand under the label of the usual one.
+    kind = f"{base}{control}" if base and "steps" not in words else "other"
     return Method(name, kind, "shipped" if "shipped" in words else "run")
 
 
