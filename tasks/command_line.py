@@ -46,7 +46,7 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "tiny"
     from worldline_core.pipeline.sources import source_inputs
 
-    if arguments.inputs or not step.inputs:
+    if arguments.inputs or step_name == "curate":
         config = load_config(
             step.load_config(), preset=preset, path=arguments.config, overrides=arguments.overrides, section=step_name
         )
