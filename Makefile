@@ -1,7 +1,8 @@
 # `make demo` runs the whole pipeline with the tiny preset, `make test` the tests. Both install what they need.
 # Needs: Python 3.12 within reach (or the network, where uv can fetch one) and git.
 SHELL := /bin/bash
-UV := $(shell command -v uv 2>/dev/null || echo .bootstrap/bin/uv)
+# A uv on the path counts only where it runs: version managers leave shims that answer "not found".
+UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
 
 .PHONY: demo test test-slow lint install record clean
@@ -22,7 +23,7 @@ lint: install
 	$(RUN) lint-imports
 	$(RUN) pyright
 
-install: | $(UV)
+install: $(filter .bootstrap/bin/uv,$(UV))
 	$(UV) sync --frozen --extra sim
 
 .bootstrap/bin/uv:
