@@ -10,16 +10,11 @@ from worldline_core.filters.calibration import (
     detect_camera,
     detect_fixed_camera,
     detect_hand_eye,
-    hand_eye_residual,
-    mean_pose,
-    rigid_inverse,
 )
 from worldline_core.filters.corrupted import CorruptedConfig, detect_corrupted, neighbour_correlation
 from worldline_core.filters.projection import (
     ProjectionConfig,
     detect_projection,
-    inside_image,
-    project_points,
 )
 from worldline_core.filters.reset import ResetConfig, detect_reset
 from worldline_core.filters.static import StaticConfig, detect_static
@@ -30,6 +25,7 @@ from worldline_core.filters.time_alignment import (
     lag_by_correlation,
 )
 from worldline_core.filters.verdict import runs
+from worldline_core.geometry.rigid import hand_eye_residual, inside_image, mean_pose, project_points, rigid_inverse
 
 FPS = 8.0
 

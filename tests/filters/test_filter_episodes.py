@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.filters.calibration import rigid_inverse
 from worldline_core.filters.filter import FilterConfig, filter_episodes
+from worldline_core.geometry.rigid import rigid_inverse
 
 HEIGHT, WIDTH, FRAMES, FPS = 64, 96, 33, 8.0
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1.0]])

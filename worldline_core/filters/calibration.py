@@ -7,6 +7,7 @@ from pydantic import Field
 
 from worldline_core.config.base import StrictModel
 from worldline_core.filters.verdict import Verdict
+from worldline_core.geometry.rigid import hand_eye_residual, rotation_angle_deg
 
 
 class CalibrationConfig(StrictModel):
@@ -32,53 +33,6 @@ def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, f
         float(np.degrees(2 * np.arctan2(width, 2 * K[0, 0]))),
         float(np.degrees(2 * np.arctan2(height, 2 * K[1, 1]))),
     )
-
-
-def rotation_angle_deg(rotation: np.ndarray) -> np.ndarray:
-    """(...,) angle of rotations (..., 3, 3)."""
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2
-    sine = 0.5 * np.linalg.norm(
-        np.stack(
-            [
-                rotation[..., 2, 1] - rotation[..., 1, 2],
-                rotation[..., 0, 2] - rotation[..., 2, 0],
-                rotation[..., 1, 0] - rotation[..., 0, 1],
-            ],
-            axis=-1,
-        ),
-        axis=-1,
-    )
-    return np.degrees(np.arctan2(sine, cosine))
-
-
-def rigid_inverse(pose: np.ndarray) -> np.ndarray:
-    """Inverse of rigid transforms (..., 4, 4)."""
-    result = np.zeros_like(pose)
-    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result[..., :3, :3] = rotation
-    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
-
-
-def mean_pose(poses: np.ndarray) -> np.ndarray:
-    """(4, 4) with the median position and the chordal mean rotation of (n, 4, 4)."""
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, np.median(poses[:, :3, 3], axis=0)
-    return result
-
-
-def hand_eye_residual(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far a wrist camera is from being fixed to its tool.
-
-    Returns: mean T_tool_camera (4, 4); deviations (n,) [m] and (n,) [deg] from it.
-    """
-    T_tool_camera = rigid_inverse(T_base_tool) @ T_base_camera
-    mount = mean_pose(T_tool_camera)
-    apart = rigid_inverse(mount)[None] @ T_tool_camera
-    return mount, np.linalg.norm(T_tool_camera[:, :3, 3] - mount[:3, 3], axis=1), rotation_angle_deg(apart[:, :3, :3])
 
 
 def detect_camera(

@@ -13,16 +13,15 @@ from worldline_core.filters.calibration import (
     detect_camera,
     detect_fixed_camera,
     detect_hand_eye,
-    rigid_inverse,
-    rotation_angle_deg,
 )
 from worldline_core.filters.corrupted import detect_corrupted
-from worldline_core.filters.projection import detect_projection, inside_image, project_points
+from worldline_core.filters.projection import detect_projection
 from worldline_core.filters.reset import detect_reset
 from worldline_core.filters.signals import Signals
 from worldline_core.filters.static import detect_static
 from worldline_core.filters.time_alignment import detect_image_lag, detect_pose_lag
 from worldline_core.filters.verdict import Verdict
+from worldline_core.geometry.rigid import inside_image, project_points, rigid_inverse, rotation_angle_deg
 
 if TYPE_CHECKING:
     from worldline_core.filters.filter import FilterConfig

@@ -6,7 +6,6 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.filters.calibration import rigid_inverse
 from worldline_core.filters.verdict import Verdict
 
 
@@ -22,22 +21,6 @@ class ProjectionConfig(StrictModel):
     min_contrast: float = Field(
         default=1.6, gt=0, description="change near the tool over change in the whole picture (median)"
     )
-
-
-def project_points(points: np.ndarray, K: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) and depth (n,) [m] of base points (n, 3); depth <= 0 lies behind the camera."""
-    T_camera_base = rigid_inverse(T_base_camera)
-    in_camera = (T_camera_base[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_camera_base[:, :3, 3]
-    depth = in_camera[:, 2]
-    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-    homogeneous = (in_camera / safe[:, None]) @ K.T
-    return homogeneous[:, :2], depth
-
-
-def inside_image(uv: np.ndarray, depth: np.ndarray, width: int, height: int) -> np.ndarray:
-    """bool (n,): in front of the camera and on a pixel."""
-    u, v = uv[:, 0], uv[:, 1]
-    return (depth > 0.01) & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
 def local_contrast(

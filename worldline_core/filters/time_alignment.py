@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.filters.calibration import hand_eye_residual
 from worldline_core.filters.verdict import Verdict
+from worldline_core.geometry.rigid import hand_eye_residual
 
 
 class TimeAlignmentConfig(StrictModel):
