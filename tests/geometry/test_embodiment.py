@@ -52,8 +52,11 @@ def test_unknown_key_is_an_error(tmp_path):
     [
         ({"limits": [[-1.0, 1.0]]}, "1 limits for 2 joints"),
         ({"limits": [[1.0, -1.0], [-2.0, 2.0]]}, "lower limit is not below"),
+        ({"limits": [[float("nan"), 1.0], [-2.0, 2.0]]}, "lower limit is not below its upper limit: pan"),
         ({"gripper": {"closed": 0.5, "open": 0.5}}, "closed and open are equal"),
         ({"T_link_tool": {"rotation_wxyz": [1.0, 1.0, 0.0, 0.0]}}, "rotation_wxyz has length"),
+        ({"T_link_tool": {"rotation_wxyz": [1.002, 0.0, 0.0, 0.0]}}, "rotation_wxyz has length 1.002"),
+        ({"T_link_tool": {"rotation_wxyz": [0.0, 0.0, 0.0, 0.0]}}, "zero quaternion"),
         ({"wrist_camera": {"link": "hand", "T_link_camera": [[1.0, 0.0], [0.0, 1.0]]}}, "not a 4x4 matrix"),
         (
             {"wrist_camera": {"link": "hand", "T_link_camera": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}},
@@ -65,6 +68,41 @@ def test_unknown_key_is_an_error(tmp_path):
 def test_what_cannot_be_is_refused(tmp_path, change, message):
     with pytest.raises(ConfigError, match=message):
         load_embodiment(write(tmp_path, arms=[{**ARM, **change}]))
+
+
+def test_quaternion_with_rounding_errors_is_normalised(tmp_path):
+    arm = {**ARM, "T_link_tool": {"rotation_wxyz": [0.7067, 0.0, 0.7067, 0.0]}}
+    T = load_embodiment(write(tmp_path, arms=[arm])).arms[0].T_link_tool.matrix()
+    np.testing.assert_allclose(T[:3, :3], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-12)
+
+
+def test_what_was_not_verified_says_why(tmp_path):
+    with pytest.raises(ConfigError, match="unverified_reason goes with verified: false"):
+        load_embodiment(write(tmp_path, verified=False))
+    with pytest.raises(ConfigError, match="unverified_reason goes with verified: false"):
+        load_embodiment(write(tmp_path, unverified_reason="guessed"))
+    assert not load_embodiment(write(tmp_path, verified=False, unverified_reason="guessed")).verified
+
+
+def test_the_robots_of_the_field_are_here():
+    names = set(embodiment_names())
+    assert len(names) >= 12
+    assert names >= {
+        "agibot_g1", "aloha_viperx", "arx_x5", "droid_franka", "fourier_gr1t2", "franka_panda", "galaxea_r1", "iiwa14",
+        "kinova_gen3", "piper_pair", "sawyer", "so101", "tienkung2_pro", "unitree_g1_29dof", "ur5e", "xarm7",
+        "yam_station",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", embodiment_names())
+def test_description_is_here_or_the_file_says_how_to_get_it(name, monkeypatch):
+    monkeypatch.delenv(f"WORLDLINE_DESCRIPTION_{name.upper()}", raising=False)
+    embodiment = load_embodiment(name)
+    if embodiment.description_path.is_file():
+        assert read_description(embodiment)
+    else:
+        with pytest.raises(UnavailableError, match=r"next step: (take .* from github.com|pip install)"):
+            read_description(embodiment)
 
 
 def test_wrong_length_of_the_joint_vector_names_the_columns(tmp_path):
@@ -84,6 +122,39 @@ def test_limits_are_checked_joint_by_joint_and_never_for_the_gripper(tmp_path):
     state = np.array([[0.0, 0.0, 9.0], [1.5, 0.0, 0.0], [0.0, -2.01, 0.0]])
     outside = load_embodiment(write(tmp_path)).outside_limits(state)
     assert outside.tolist() == [[False] * 3, [True, False, False], [False] * 3]
+
+
+def test_joint_without_limits_is_never_outside(tmp_path):
+    arm = {**ARM, "limits": [[float("-inf"), float("inf")], [-2.0, 2.0]]}
+    state = np.array([[50.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    assert load_embodiment(write(tmp_path, arms=[arm])).outside_limits(state).tolist() == [
+        [False] * 3,
+        [False, True, False],
+    ]
+
+
+def test_position_beyond_a_limit_is_named_with_its_limits(tmp_path):
+    embodiment = load_embodiment(write(tmp_path))
+    state = np.array([[0.0, 0.0, 0.0], [1.5, -2.1, 0.0], [1.2, 0.0, 0.0]])
+    violations = embodiment.limit_violations(state)
+    assert [(v.joint, v.frames, v.worst, v.worst_frame, v.lower, v.upper) for v in violations] == [
+        ("pan", 2, 1.5, 1, -1.0, 1.0),
+        ("lift", 1, -2.1, 1, -2.0, 2.0),
+    ]
+    with pytest.raises(
+        DataError,
+        match=r"beyond its limit[\s\S]*episode 3.*frame 1, pan[\s\S]*-1 to 1 rad[\s\S]*1\.5 rad; 2 of 3 frames",
+    ):
+        embodiment.check_limits(state, "episode 3")
+    embodiment.check_limits(state[:1], "episode 3")
+
+
+def test_limits_in_degrees_have_a_tolerance_in_degrees(tmp_path):
+    arm = {**ARM, "limits": [[-60.0, 60.0], [-90.0, 90.0]]}
+    embodiment = load_embodiment(write(tmp_path, arms=[arm], joint_units="deg"))
+    state = np.array([[61.0, 0.0, 0.0], [62.0, 0.0, 0.0]])
+    assert embodiment.outside_limits(state)[:, 0].tolist() == [False, True]
+    assert embodiment.limit_violations(state)[0].unit == "deg"
 
 
 def test_missing_description_says_how_to_get_it(monkeypatch, tmp_path):

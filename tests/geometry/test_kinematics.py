@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 import yaml
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.embodiment_check import random_states
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.mjcf import read_mjcf
-from worldline_core.geometry.se3 import is_rigid
+from worldline_core.geometry.se3 import is_rigid, rotation_angle
 
 # Everything that decides a pose: each way to write an orientation, joints off the body's origin, two joints on a
 # body, a slide, defaults by class and childclass, a site, an unnormalised axis and quaternion.
@@ -123,14 +125,61 @@ def test_hand_written_description_equals_mujoco(tmp_path):
     assert_equals_mujoco(toy(tmp_path), TOY, states)
 
 
-@pytest.mark.parametrize("name", embodiment_names())
-def test_shipped_descriptions_equal_mujoco(name):
+@pytest.mark.parametrize("name", ["panda_pair", "yam_station", "fourier_gr1t2", "unitree_g1_29dof", "ur5e"])
+def test_every_link_and_site_equals_mujoco(name):
+    """A few positions, but each body by name and to 1e-9 m; all embodiments and many positions: test_embodiment_check."""
     embodiment = load_embodiment(name)
-    if embodiment.description.format != "mjcf":
-        pytest.skip("a URDF of the user")
-    limits = np.concatenate([[*arm.limits, (0.0, 1.0)] for arm in embodiment.arms])
-    states = np.random.default_rng(1).uniform(limits[:, 0], limits[:, 1], (5, len(limits)))
+    states = random_states(embodiment, 5, seed=1)
     assert_equals_mujoco(ArmKinematics(embodiment), embodiment.description_path.read_text(), states)
+
+
+@pytest.mark.parametrize("name", ["panda_pair", "so101", "yam_station", "piper_pair", "unitree_g1_29dof"])
+def test_tools_and_cameras_have_the_same_bits_without_the_other_links(name):
+    kinematics = ArmKinematics(load_embodiment(name))
+    states = random_states(kinematics.embodiment, 33, seed=2)
+    links = kinematics.link_poses(states)
+    assert torch.equal(kinematics.tool_poses(states), kinematics.tools_of(links))
+    assert all(torch.equal(pose, links[name]) for name, pose in kinematics.arm_poses(states).items())
+    cameras = kinematics.wrist_cameras_of(links)
+    assert all(torch.equal(pose, cameras[view]) for view, pose in kinematics.wrist_camera_poses(states).items())
+    assert {pose.dtype for pose in links.values()} == {torch.float64}
+
+
+def test_mounts_place_one_description_twice():
+    pair, single = (ArmKinematics(load_embodiment(name)) for name in ("piper_pair", "piper"))
+    states = random_states(single.embodiment, 6, seed=3)
+    both = pair.tool_poses(np.concatenate([states, states[::-1]], axis=1))
+    alone = single.tool_poses(states)[:, 0].numpy()
+    left, right = (offset.matrix() for offset in pair.embodiment.description.mounts.values())
+    np.testing.assert_allclose(both[:, 0], left @ alone, atol=1e-12)
+    np.testing.assert_allclose(both[:, 1], right @ alone[::-1], atol=1e-12)
+
+
+def test_degrees_become_radians_and_slides_stay_metres(tmp_path):
+    arm = TOY_YAML["arms"][0]  # type: ignore[index]
+    state = np.array([[0.4, -0.9, 1.1, 0.2, 0.7]])
+    expected = toy(tmp_path).link_poses(state)
+    degrees = np.concatenate([np.rad2deg(state[:, :4]), state[:, 4:]], axis=1)
+    got = toy(tmp_path, joint_units="deg", arms=[{**arm, "limits": [[-170.0, 170.0]] * 4}]).link_poses(degrees)
+    for name in ("tip", "thumb"):
+        torch.testing.assert_close(got[name], expected[name], atol=1e-12, rtol=0)
+
+
+def test_posture_in_degrees(tmp_path):
+    arm = {**TOY_YAML["arms"][0], "joints": ["tilt", "elbow", "roll"], "limits": [[-3.0, 3.0]] * 3}  # type: ignore[index]
+    expected = toy(tmp_path, arms=[arm], posture={"pan": 0.5}).tool_poses(np.zeros((1, 4)))
+    got = toy(tmp_path, arms=[arm], posture={"pan": float(np.rad2deg(0.5))}, joint_units="deg").tool_poses(
+        np.zeros((1, 4))
+    )
+    torch.testing.assert_close(got, expected, atol=1e-12, rtol=0)
+
+
+def test_slide_in_an_arm_cannot_be_given_in_degrees(tmp_path):
+    arm = {**TOY_YAML["arms"][0], "joints": ["pan", "thumb"], "limits": [[-3.0, 3.0], [0.0, 0.04]]}  # type: ignore[index]
+    arm["gripper"] = {"closed": 0.0, "open": 1.0}
+    toy(tmp_path, arms=[arm])
+    with pytest.raises(ConfigError, match=r"slide cannot be given in degrees[\s\S]*thumb"):
+        toy(tmp_path, arms=[arm], joint_units="deg")
 
 
 def test_base_link_is_the_frame_of_everything(tmp_path):
@@ -190,6 +239,9 @@ def test_wrong_number_of_joints_is_refused(tmp_path):
         ("<body><joint ref='1'/></body>", "Joint is not supported"),
         ("<include file='x.xml'/>", "<include> is not supported"),
         ("<frame><body/></frame>", "<frame> is not supported"),
+        ("<body name='b' quat='0 0 0 0'/>", r"direction of length zero[\s\S]*body b"),
+        ("<body name='b' pos='0 0'/>", r"body b[\s\S]*3 finite numbers"),
+        ("<body><joint name='j' axis='0 0 0'/></body>", r"direction of length zero[\s\S]*joint j"),
     ],
 )
 def test_what_the_reader_does_not_know_is_refused(body, message):
@@ -233,3 +285,43 @@ def test_agibot_kinematics_reproduce_the_recorded_poses(shared_data, demo, kind)
         _, pitch, yaw = recorded[:, 7 * arm + 3 : 7 * arm + 6].T
         x_axis = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)], axis=1)
         np.testing.assert_allclose(poses[link][:, :3, 0].numpy(), x_axis, atol=1e-4)
+
+
+def droid_recordings(shared_data: Path) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Joints (N, 7) and cartesian_position (N, 6) of every real DROID episode that has both."""
+    found = []
+    for file in sorted((shared_data / "droid_ctrl_world").glob("*/annotation/*/*.json")):
+        record = json.loads(file.read_text())
+        if "joints" in record:
+            found.append((file.stem, np.asarray(record["joints"])[:, :7], np.asarray(record["states"])[:, :6]))
+        if "observation.state.joint_position" in record:
+            joints, pose = (record[f"observation.state.{key}_position"] for key in ("joint", "cartesian"))
+            found.append((file.stem, np.asarray(joints), np.asarray(pose)))
+    return found
+
+
+def about(axis: int, angle: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotations about a coordinate axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    R[:, i, i], R[:, i, j], R[:, j, i], R[:, j, j] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return R
+
+
+def test_droid_cartesian_position_is_the_flange_from_the_joints(shared_data):
+    recordings = droid_recordings(shared_data)
+    if not recordings:
+        pytest.skip("the DROID samples are not here")
+    kinematics = ArmKinematics(load_embodiment("droid_franka"))
+    for name, joints, recorded in recordings:
+        assert len(joints) == len(recorded), name
+        states = np.concatenate([joints, np.zeros((len(joints), 1))], axis=1)
+        assert not kinematics.embodiment.outside_limits(states).any(), name
+        flange = kinematics.link_poses(states)["panda_link8"].numpy()
+        error = np.linalg.norm(flange[:, :3, 3] - recorded[:, :3], axis=1)
+        assert error.max() <= 1e-4, f"{name}: {error.max() * 1e3:.4f} mm"
+        # Roll, pitch, yaw about fixed axes: R = Rz Ry Rx.
+        roll, pitch, yaw = recorded[:, 3:6].T
+        turn = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+        apart = rotation_angle(torch.from_numpy(np.swapaxes(turn, 1, 2) @ flange[:, :3, :3]))
+        assert float(apart.max()) <= 1e-4, f"{name}: {float(apart.max()):.1e} rad"

@@ -1,13 +1,13 @@
 """What a robot is made of, as far as this project needs: arms, joint order, tools, grippers, wrist cameras.
 
-One YAML file an embodiment in `configs/embodiments/`, beside it (or at the user) the kinematic description.
-`observation.state` and `action` hold, for each arm in order, its joint positions [rad or m], then its gripper.
+One YAML file an embodiment in `configs/embodiments/`, beside it (or in a Python package, or at the user) the kinematic
+description. `observation.state` and `action` hold, for each arm in order, its joint positions, then its gripper.
 """
 
 from __future__ import annotations
 
 import difflib
-import os
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,45 +16,35 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel, read_yaml, validate
 from worldline_core.config.loader import CONFIG_ROOT
-from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.description import (
+    Description,
+    description_variable,
+    locate_description,
+    read_description_file,
+)
+from worldline_core.geometry.joint_limits import LimitViolation, limit_violations
+from worldline_core.geometry.rigid_offset import RigidOffset
+
+__all__ = [
+    "EMBODIMENT_ROOT",
+    "Arm",
+    "Description",
+    "Embodiment",
+    "FingerJoint",
+    "Gripper",
+    "RigidOffset",
+    "WristCamera",
+    "description_variable",
+    "embodiment_names",
+    "load_embodiment",
+    "read_description",
+]
 
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
 
-Limits = Annotated[tuple[float, float], Field(description="lower, upper")]
-
-
-class Description(StrictModel):
-    """The kinematic description: where it is and, where it may not be shipped, how to get it."""
-
-    format: Literal["mjcf", "urdf"]
-    file: str = Field(min_length=1)
-    obtain: str | None = None
-
-
-class RigidOffset(StrictModel):
-    """A fixed transform by translation [m] and unit quaternion (wxyz)."""
-
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-
-    @model_validator(mode="after")
-    def _unit(self) -> RigidOffset:
-        norm = float(np.linalg.norm(self.rotation_wxyz))
-        if abs(norm - 1.0) > 1e-3:
-            raise ValueError(f"rotation_wxyz has length {norm:.6f}, expected 1")
-        return self
-
-    def matrix(self) -> np.ndarray:
-        """(4, 4) float64."""
-        w, x, y, z = np.asarray(self.rotation_wxyz, dtype=np.float64) / np.linalg.norm(self.rotation_wxyz)
-        T = np.eye(4)
-        T[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        T[:3, 3] = self.translation
-        return T
+Bound = Annotated[float, Field(allow_inf_nan=True)]
+Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
 
 
 class FingerJoint(StrictModel):
@@ -124,8 +114,9 @@ class Arm(StrictModel):
     def _limits(self) -> Arm:
         if len(self.limits) != len(self.joints):
             raise ValueError(f"{len(self.limits)} limits for {len(self.joints)} joints")
-        if any(low >= high for low, high in self.limits):
-            raise ValueError("a lower limit is not below its upper limit")
+        for joint, (low, high) in zip(self.joints, self.limits, strict=True):
+            if not low < high:
+                raise ValueError(f"a lower limit is not below its upper limit: {joint}, {low} to {high}")
         return self
 
     @property
@@ -136,13 +127,25 @@ class Arm(StrictModel):
 
 
 class Embodiment(StrictModel):
-    """A robot. `posture` holds joints that are no part of the state (waist, head) at fixed positions."""
+    """A robot.
+
+    Attributes:
+        joint_units: of all angles of this file (limits, posture, finger joints) and of the angles in state vectors
+            handed to this embodiment. EpisodeSets hold radians; `deg` is for arrays as a robot wrote them. Slides are
+            in metres either way.
+        posture: joints that are no part of the state (waist, head), at fixed positions.
+        verified: whether names, limits and poses were checked against the description itself; if not,
+            `unverified_reason` says why.
+    """
 
     name: str
     description: Description
     base_link: str
     arms: tuple[Arm, ...] = Field(min_length=1)
+    joint_units: Literal["rad", "deg"] = "rad"
     posture: dict[str, float] = Field(default_factory=dict)
+    verified: bool = True
+    unverified_reason: str | None = None
     description_path: Path
 
     @model_validator(mode="after")
@@ -154,6 +157,12 @@ class Embodiment(StrictModel):
         names = [arm.name for arm in self.arms]
         if len(set(names)) != len(names):
             raise ValueError(f"arms named twice: {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _honest(self) -> Embodiment:
+        if self.verified == bool(self.unverified_reason):
+            raise ValueError("unverified_reason goes with verified: false, and only with it")
         return self
 
     @property
@@ -200,12 +209,40 @@ class Embodiment(StrictModel):
 
     def outside_limits(self, state: np.ndarray, tolerance_rad: float = 0.02) -> np.ndarray:
         """Bool (N, J): joint positions beyond their limits by more than the tolerance; gripper columns are False."""
+        tolerance = tolerance_rad if self.joint_units == "rad" else math.degrees(tolerance_rad)
         outside = np.zeros(state.shape, dtype=bool)
         for arm in self.arms:
             columns, limits = self.joint_columns(arm), np.asarray(arm.limits, dtype=np.float64)
             joints = state[:, columns].astype(np.float64)
-            outside[:, columns] = (joints < limits[:, 0] - tolerance_rad) | (joints > limits[:, 1] + tolerance_rad)
+            outside[:, columns] = (joints < limits[:, 0] - tolerance) | (joints > limits[:, 1] + tolerance)
         return outside
+
+    def limit_violations(self, state: np.ndarray, tolerance_rad: float = 0.02) -> list[LimitViolation]:
+        """For each joint that leaves its limits: frames, the worst value and where; worst first."""
+        limits = {
+            column: pair for arm in self.arms for column, pair in zip(self._columns(arm), arm.limits, strict=True)
+        }
+        return limit_violations(
+            state, self.outside_limits(state, tolerance_rad), limits, self.state_names, self.joint_units
+        )
+
+    def _columns(self, arm: Arm) -> range:
+        return range(*self.joint_columns(arm).indices(self.state_size))
+
+    def check_limits(self, state: np.ndarray, where: object, tolerance_rad: float = 0.02) -> None:
+        """Raises: DataError naming the joint that is furthest out, its value, its limits and the frames outside."""
+        self.check_state(state, where)
+        violations = self.limit_violations(state, tolerance_rad)
+        if violations:
+            worst = violations[0]
+            raise DataError(
+                "Joint position is beyond its limit",
+                where=f"{where}, embodiment {self.name}, frame {worst.worst_frame}, {worst.joint}",
+                expected=f"{worst.lower:g} to {worst.upper:g} {worst.unit}",
+                got=f"{worst.worst:g} {worst.unit}; {worst.frames} of {len(state)} frames are outside"
+                + (f", and {len(violations) - 1} more joints" if len(violations) > 1 else ""),
+                next_step="check the joint order, the units and the sign of this joint",
+            )
 
 
 def embodiment_names() -> list[str]:
@@ -213,19 +250,17 @@ def embodiment_names() -> list[str]:
     return sorted(path.stem for path in EMBODIMENT_ROOT.glob("*.yaml"))
 
 
-def description_variable(name: str) -> str:
-    """Environment variable that says where the kinematic description of an embodiment is."""
-    return f"WORLDLINE_DESCRIPTION_{name.upper()}"
-
-
 def load_embodiment(name_or_path: str | Path, description_path: Path | str | None = None) -> Embodiment:
     """Load an embodiment by its name, or from a YAML file.
 
     The kinematic description is looked for at `description_path`, then where the environment variable
-    `WORLDLINE_DESCRIPTION_<NAME>` points, then beside the YAML file. It is opened only when kinematics are built.
+    `WORLDLINE_DESCRIPTION_<NAME>` points, then in the package or beside the YAML file, as the YAML says. It is opened
+    only when kinematics are built.
 
     Raises:
-        ConfigError: no embodiment of that name (the message lists those there are), or the YAML is not valid.
+        ConfigError: no embodiment of that name (the message lists those there are), the YAML is not valid, or an
+            installed package lacks the description.
+        UnavailableError: the package that carries the description is installed in a version that does not fit.
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
@@ -243,10 +278,9 @@ def load_embodiment(name_or_path: str | Path, description_path: Path | str | Non
         raise ConfigError(
             "description_path is not a key of the file", where=path, next_step="use description: {file: ...}"
         )
-    described = values.get("description")
-    file = described.get("file", "") if isinstance(described, dict) else ""
-    override = description_path or os.environ.get(description_variable(str(values.get("name", ""))))
-    return validate(Embodiment, {**values, "description_path": Path(override or path.parent / str(file))}, where=path)
+    embodiment = validate(Embodiment, {**values, "description_path": path.parent}, where=path)
+    located = locate_description(embodiment.name, embodiment.description, path.parent, description_path)
+    return embodiment.model_copy(update={"description_path": located})
 
 
 def read_description(embodiment: Embodiment) -> str:
@@ -255,13 +289,4 @@ def read_description(embodiment: Embodiment) -> str:
     Raises:
         UnavailableError: the file is not there; the message says how to get it.
     """
-    path = embodiment.description_path
-    if not path.is_file():
-        raise UnavailableError(
-            f"The kinematic description of {embodiment.name} is not here",
-            where=path,
-            expected=embodiment.description.file,
-            next_step=(embodiment.description.obtain or "restore the file beside the embodiment's YAML")
-            + f"; then set {description_variable(embodiment.name)}=/path/to/it or pass description_path",
-        )
-    return path.read_text(encoding="utf-8")
+    return read_description_file(embodiment.name, embodiment.description, embodiment.description_path)

@@ -1,17 +1,18 @@
 """Forward kinematics: from `observation.state` (or `action`) to tool, link and wrist camera poses, in batches.
 
-The chains are `pytorch_kinematics` chains in float64, built from URDF by its own parser and from MJCF by
-`worldline_core.geometry.mjcf`. Axis legend: n frames, a arms, j state columns.
+The chains are `pytorch_kinematics` chains in float64, built from trees that `worldline_core.geometry.urdf` and
+`worldline_core.geometry.mjcf` read; all poses are float64. Tools and wrist cameras need the arms only: they come from
+a chain without the other links, which gives the same bits and is faster. Axis legend: n frames, a arms, j state
+columns, l links.
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 
 import numpy as np
-import pytorch_kinematics as pk
 import torch
 from jaxtyping import Float
 from pytorch_kinematics.chain import Chain
@@ -21,8 +22,23 @@ from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import Embodiment, read_description
-from worldline_core.geometry.mjcf import TreeBody, parse_xml, read_mjcf
+from worldline_core.geometry.kinematic_tree import TreeBody, kept_for, mounted
+from worldline_core.geometry.mjcf import read_mjcf
 from worldline_core.geometry.se3 import invert
+from worldline_core.geometry.urdf import read_urdf
+
+
+def read_tree(embodiment: Embodiment) -> TreeBody:
+    """The tree of an embodiment's description, with its mounts.
+
+    Raises:
+        UnavailableError: the kinematic description is not there.
+        DataError: it cannot be read.
+    """
+    text, path = read_description(embodiment), embodiment.description_path
+    tree = read_urdf(text, path) if embodiment.description.format == "urdf" else read_mjcf(text, path)
+    mounts = embodiment.description.mounts
+    return mounted(tree, {name: offset.matrix() for name, offset in mounts.items()}) if mounts else tree
 
 
 class ArmKinematics:
@@ -30,20 +46,18 @@ class ArmKinematics:
 
     Raises:
         UnavailableError: the kinematic description is not there.
+        DataError: the kinematic description cannot be read.
         ConfigError: the embodiment names a joint or link that the description does not have.
     """
 
     def __init__(self, embodiment: Embodiment) -> None:
         self.embodiment = embodiment
-        text = read_description(embodiment)
-        if embodiment.description.format == "urdf":
-            chain = pk.build_chain_from_urdf(_kinematic_part(text, embodiment.description_path))
-        else:
-            chain = chain_from_tree(read_mjcf(text, embodiment.description_path))
-        self.chain: Chain = chain.to(dtype=torch.float64)
-        self.links: tuple[str, ...] = tuple(chain.get_frame_names(exclude_fixed=False))
-        self.joints: tuple[str, ...] = tuple(chain.get_joint_parameter_names())
+        self.tree = read_tree(embodiment)
+        self.chain: Chain = chain_from_tree(self.tree)
+        self.links: tuple[str, ...] = tuple(self.chain.get_frame_names(exclude_fixed=False))
+        self.joints: tuple[str, ...] = tuple(self.chain.get_joint_parameter_names())
         self._check_names()
+        self._check_units()
 
     def _check_names(self) -> None:
         embodiment = self.embodiment
@@ -63,8 +77,25 @@ class ArmKinematics:
                     got=", ".join(unknown),
                 )
 
-    def _joint_positions(self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None) -> Tensor:
-        """Positions of every joint of the chain (n, joints): state, posture, fingers; anything else at zero."""
+    def _check_units(self) -> None:
+        kinds = {joint.name: joint.kind for body in self.tree.walk() for joint in body.joints}
+        slides = [name for arm in self.embodiment.arms for name in arm.joints if kinds[name] == "prismatic"]
+        if self.embodiment.joint_units == "deg" and slides:
+            raise ConfigError(
+                "An arm with a slide cannot be given in degrees",
+                where=f"embodiment {self.embodiment.name}",
+                expected="joint_units: rad",
+                got=f"slides {', '.join(slides)}",
+            )
+        self._revolute = {name for name, kind in kinds.items() if kind == "revolute"}
+
+    def _joint_positions(
+        self, names: Iterable[str], state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None
+    ) -> Tensor:
+        """Positions [rad or m] of joints (n, joints): state, posture, fingers; anything else at zero.
+
+        This is the one place where degrees become radians.
+        """
         embodiment = self.embodiment
         values = torch.as_tensor(state, dtype=torch.float64)
         embodiment.check_state(values.detach().cpu().numpy(), "state")
@@ -83,40 +114,77 @@ class ArmKinematics:
             columns.update({name: values[:, start + i] for i, name in enumerate(arm.joints)})
             for finger in arm.gripper.finger_joints:
                 columns[finger.name] = finger.closed + opening[:, index].clamp(0, 1) * (finger.open - finger.closed)
+        if embodiment.joint_units == "deg":
+            columns.update({n: c * (math.pi / 180) for n, c in columns.items() if n in self._revolute})
         zero = torch.zeros_like(values[:, 0])
-        return torch.stack([columns.get(name, zero) for name in self.joints], dim=-1)
-
-    def _all_poses(
-        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None
-    ) -> Float[Tensor, "l n 4 4"]:
-        T_root_link = self.chain.forward_kinematics_tensor(self._joint_positions(state, posture))
-        base = T_root_link[self.chain.frame_to_idx[self.embodiment.base_link]]
-        return invert(base)[None] @ T_root_link
+        return torch.stack([columns.get(name, zero) for name in names], dim=-1)
 
     def link_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
     ) -> dict[str, Float[Tensor, "n 4 4"]]:
-        """T_base_link of every link (body, site) by name.
+        """T_base_link of every link (body, site) by name, float64.
 
         Args:
             state: (n, j) observation.state or action.
-            posture: positions [rad, m] of joints outside the state, (n,) or one number each; the embodiment's
-                own posture where not given.
+            posture: positions [the embodiment's units, m] of joints outside the state, (n,) or one number each; the
+                embodiment's own posture where not given.
 
         Raises:
             DataError: the joint vector has a wrong length or is not finite.
         """
-        poses = self._all_poses(state, posture)
-        return {name: poses[self.chain.frame_to_idx[name]] for name in self.links}
+        return self._poses(self.chain, self.links, state, posture)
+
+    def arm_poses(
+        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
+    ) -> dict[str, Float[Tensor, "n 4 4"]]:
+        """T_base_link of the end-effector and camera links only: what `tools_of` and `wrist_cameras_of` need."""
+        return self._poses(self._arm_chain, self._arm_links, state, posture)
+
+    def _poses(
+        self,
+        chain: Chain,
+        links: tuple[str, ...],
+        state: np.ndarray | Tensor,
+        posture: Mapping[str, np.ndarray] | None,
+    ) -> dict[str, Tensor]:
+        positions = self._joint_positions(chain.get_joint_parameter_names(), state, posture)
+        T_root_link = chain.forward_kinematics_tensor(positions)
+        if self._base_is_root:
+            return {name: T_root_link[chain.frame_to_idx[name]] for name in links}
+        T_root_base = T_root_link[chain.frame_to_idx[self.embodiment.base_link]]
+        T_base_root = invert(T_root_base)
+        return {name: T_base_root @ T_root_link[chain.frame_to_idx[name]] for name in links}
+
+    @cached_property
+    def _base_is_root(self) -> bool:
+        """Whether poses in the root are poses in the base."""
+        root = self.tree
+        return (
+            self.embodiment.base_link == root.name and not root.joints and bool((root.T_parent_body == np.eye(4)).all())
+        )
+
+    @cached_property
+    def _arm_links(self) -> tuple[str, ...]:
+        links: dict[str, None] = {}
+        for arm in self.embodiment.arms:
+            links[arm.end_effector_link] = None
+            if arm.wrist_camera is not None:
+                links[arm.wrist_camera.link] = None
+        return tuple(links)
+
+    @cached_property
+    def _arm_chain(self) -> Chain:
+        tree = kept_for(self.tree, {self.embodiment.base_link, *self._arm_links})
+        return self.chain if tree is None else chain_from_tree(tree)
 
     def tool_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
     ) -> Float[Tensor, "n a 4 4"]:
         """T_base_tool: frame between the fingertips, +z out of the gripper."""
-        return self.tools_of(self.link_poses(state, posture))
+        return self.tools_of(self.arm_poses(state, posture))
 
     def tools_of(self, links: Mapping[str, Tensor]) -> Float[Tensor, "n a 4 4"]:
-        """T_base_tool from what `link_poses` gave."""
+        """T_base_tool from what `link_poses` or `arm_poses` gave."""
         tools = [
             links[arm.end_effector_link] @ torch.from_numpy(arm.T_link_tool.matrix()).to(links[arm.end_effector_link])
             for arm in self.embodiment.arms
@@ -127,12 +195,13 @@ class ArmKinematics:
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
     ) -> dict[str, Float[Tensor, "n 4 4"]]:
         """T_base_camera by view, for the arms whose camera mount is known: from controls, never from a recording."""
-        return self.wrist_cameras_of(self.link_poses(state, posture))
+        return self.wrist_cameras_of(self.arm_poses(state, posture))
 
     def wrist_cameras_of(self, links: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n 4 4"]]:
-        """T_base_camera by view from what `link_poses` gave."""
+        """T_base_camera by view from what `link_poses` or `arm_poses` gave."""
         return {
-            arm.camera_view: links[mount.link] @ torch.tensor(mount.T_link_camera).to(links[mount.link])
+            arm.camera_view: links[mount.link]
+            @ torch.tensor(mount.T_link_camera, dtype=torch.float64).to(links[mount.link])
             for arm in self.embodiment.arms
             if (mount := arm.wrist_camera) is not None
         }
@@ -155,21 +224,6 @@ class ArmKinematics:
             if len(path) > 1:
                 parents[name] = path[-2]
         return parents
-
-
-def _kinematic_part(urdf: str, where: object) -> bytes:
-    """The URDF with its links emptied and anything but links and joints left out.
-
-    Meshes and vendor tags decide no pose, and the parser prints a line for each tag that it does not know.
-    """
-    robot = parse_xml(urdf, where)
-    for element in list(robot):
-        if element.tag not in ("link", "joint"):
-            robot.remove(element)
-        elif element.tag == "link":
-            for child in list(element):
-                element.remove(child)
-    return ET.tostring(robot)
 
 
 def chain_from_tree(tree: TreeBody) -> Chain:

@@ -12,44 +12,11 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from worldline_core.errors import DataError
-
-
-@dataclass(frozen=True)
-class TreeJoint:
-    """One degree of freedom; axis and position in the frame of its body."""
-
-    name: str
-    kind: str
-    axis: np.ndarray
-    position: np.ndarray
-
-
-@dataclass
-class TreeBody:
-    """A body (or site): its pose in its parent at joint positions zero, its joints in order, its children."""
-
-    name: str
-    T_parent_body: np.ndarray
-    joints: list[TreeJoint] = field(default_factory=list)
-    children: list[TreeBody] = field(default_factory=list)
-
-
-def parse_xml(text: str, where: object) -> ET.Element:
-    """Root of an XML text, comments dropped.
-
-    Raises:
-        DataError: not XML.
-    """
-    try:
-        # The user's own file; expat bounds the expansion of entities and fetches none.
-        return ET.fromstring(text.encode())  # noqa: S314
-    except ET.ParseError as error:
-        raise DataError("Kinematic description is not XML", where=where, got=str(error)) from error
+from worldline_core.geometry.kinematic_tree import TreeBody, TreeJoint, numbers, parse_xml, unit
 
 
 def read_mjcf(text: str, where: object) -> TreeBody:
@@ -81,6 +48,7 @@ class _Reader:
         self.where = where
         self.to_radians = 1.0 if settings.get("angle", "degree") == "radian" else math.pi / 180
         self.eulerseq = settings.get("eulerseq", "xyz")
+        self.autolimits = settings.get("autolimits", "true") == "true"
         self.joint_defaults: dict[str, dict[str, str]] = {}
         for default in root.findall("default"):
             self._defaults(default, {}, "main")
@@ -125,45 +93,50 @@ class _Reader:
                 expected="type hinge or slide, ref 0",
                 got=f"type {values.get('type')}, ref {values.get('ref', '0')}",
             )
-        axis = _numbers(values.get("axis", "0 0 1"))
+        name = values.get("name", f"{body}_joint")
+        place = f"{self.where}: joint {name}"
+        axis = unit(numbers(values.get("axis", "0 0 1"), 3, place), place)
         return TreeJoint(
-            values.get("name", f"{body}_joint"), kind, axis / np.linalg.norm(axis), _numbers(values.get("pos", "0 0 0"))
+            name, kind, axis, numbers(values.get("pos", "0 0 0"), 3, place), self._limits(values, kind, place)
         )
 
+    def _limits(self, values: dict[str, str], kind: str, place: str) -> tuple[float, float] | None:
+        limited = values.get("limited", "auto")
+        if "range" not in values or limited == "false" or (limited == "auto" and not self.autolimits):
+            return None
+        lower, upper = numbers(values["range"], 2, place) * (self.to_radians if kind == "revolute" else 1.0)
+        return float(lower), float(upper)
+
     def _pose(self, element: ET.Element) -> np.ndarray:
+        place = f"{self.where}: {element.tag} {element.get('name', '')}"
         T = np.eye(4)
-        T[:3, 3] = _numbers(element.get("pos", "0 0 0"))
+        T[:3, 3] = numbers(element.get("pos", "0 0 0"), 3, place)
         if "quat" in element.attrib:
-            T[:3, :3] = _from_quaternion(_numbers(element.attrib["quat"]))
+            T[:3, :3] = _from_quaternion(unit(numbers(element.attrib["quat"], 4, place), place))
         elif "euler" in element.attrib:
-            for letter, angle in zip(self.eulerseq, _numbers(element.attrib["euler"]) * self.to_radians, strict=True):
+            angles = numbers(element.attrib["euler"], 3, place) * self.to_radians
+            for letter, angle in zip(self.eulerseq, angles, strict=True):
                 turn = _about(np.eye(3)["xyz".index(letter.lower())], float(angle))
                 # Lower case: about the moving axes; upper case: about the fixed ones.
                 T[:3, :3] = T[:3, :3] @ turn if letter.islower() else turn @ T[:3, :3]
         elif "axisangle" in element.attrib:
-            *axis, angle = _numbers(element.attrib["axisangle"])
+            *axis, angle = numbers(element.attrib["axisangle"], 4, place)
             T[:3, :3] = _about(np.asarray(axis), float(angle) * self.to_radians)
         elif "xyaxes" in element.attrib:
-            numbers = _numbers(element.attrib["xyaxes"])
-            x = numbers[:3] / np.linalg.norm(numbers[:3])
-            y = numbers[3:] - (numbers[3:] @ x) * x
-            y = y / np.linalg.norm(y)
+            axes = numbers(element.attrib["xyaxes"], 6, place)
+            x = unit(axes[:3], place)
+            y = unit(axes[3:] - (axes[3:] @ x) * x, place)
             T[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
         elif "zaxis" in element.attrib:
-            z = _numbers(element.attrib["zaxis"])
-            z = z / np.linalg.norm(z)
+            z = unit(numbers(element.attrib["zaxis"], 3, place), place)
             axis = np.cross([0.0, 0.0, 1.0], z)
             sine = float(np.linalg.norm(axis))
             T[:3, :3] = _about(axis if sine > 1e-12 else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2])))
         return T
 
 
-def _numbers(text: str) -> np.ndarray:
-    return np.array([float(value) for value in text.split()], dtype=np.float64)
-
-
 def _from_quaternion(wxyz: np.ndarray) -> np.ndarray:
-    w, *xyz = wxyz / np.linalg.norm(wxyz)
+    w, *xyz = wxyz
     axis = np.asarray(xyz)
     return _about(axis, 2 * math.atan2(float(np.linalg.norm(axis)), float(w)))
 

@@ -1,0 +1,73 @@
+"""Kinematics-only descriptions from packages: what is kept, and that the poses are the source's."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="descriptions are compiled by MuJoCo")
+
+from worldline_core.errors import DataError
+from worldline_core.geometry import description_import
+from worldline_core.geometry.description_import import Recipe, import_description
+from worldline_core.geometry.mjcf import read_mjcf
+
+ARM = """
+<mujoco><compiler angle="degree"/><asset><mesh name="link" file="missing.stl"/></asset>
+<default><default class="arm" group="1"><geom type="mesh" mesh="link"/><joint range="-90 45"/></default></default>
+<worldbody><light pos="0 0 1"/><body name="base" childclass="arm"><freejoint/>
+  <body name="link1" pos="0 0 0.3" euler="10 20 30"><geom/><joint name="j1" axis="0 1 0"/>
+    <body name="hand" pos="0.2 0 0"><joint name="j2" pos="0 0.01 0" axis="1 0 1"/><camera name="c"/></body>
+    <body name="leg" pos="0 0.1 0"><joint name="j3"/></body>
+  </body></body></worldbody>
+<actuator><motor joint="j1"/></actuator></mujoco>
+"""
+GRIPPER = """
+<mujoco><worldbody><body name="palm" pos="0 0 0.1"><site name="grip" pos="0 0 0.05"/>
+  <body name="finger"><joint name="f" type="slide" range="0 0.04"/></body></body></worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def wheels(tmp_path) -> Path:
+    with zipfile.ZipFile(tmp_path / "toy_robots-1.4.2-py3-none-any.whl", "w") as archive:
+        archive.writestr("toy_robots/arm.xml", ARM)
+        archive.writestr("toy_robots/gripper.xml", GRIPPER)
+    return tmp_path
+
+
+RECIPE = Recipe("toy_robots", "toy_robots/arm.xml", "MIT", ("finger", "grip"), ("toy_robots/gripper.xml", "hand"))
+
+
+def test_arm_with_its_gripper_and_nothing_else(wheels, tmp_path):
+    text = import_description("toy", RECIPE, wheels, tmp_path).read_text()
+    assert text.startswith("<!-- Kinematics only, from toy_robots/arm.xml of toy-robots 1.4.2 (MIT);")
+    bodies = {body.name: body for body in read_mjcf(text, "toy.xml").walk()}
+    assert list(bodies) == ["world", "base", "link1", "hand", "gripper/palm", "gripper/grip", "gripper/finger"]
+    joints = {joint.name: joint for body in bodies.values() for joint in body.joints}
+    assert list(joints) == ["j1", "j2", "gripper/f"]
+    assert joints["j1"].limits == pytest.approx((-1.5707963267948966, 0.7853981633974483))
+    assert joints["j2"].position.tolist() == [0, 0.01, 0]
+    assert bodies["gripper/palm"].T_parent_body[2, 3] == pytest.approx(0.1)
+    assert "mesh" not in text
+    assert "actuator" not in text
+
+
+def test_unknown_body_lists_the_bodies(wheels, tmp_path):
+    with pytest.raises(DataError, match=r"no such body or site[\s\S]*link1[\s\S]*paw"):
+        import_description("toy", Recipe("toy_robots", "toy_robots/arm.xml", "MIT", ("paw",)), wheels, tmp_path)
+
+
+def test_missing_wheel_says_how_to_get_it(wheels, tmp_path):
+    with pytest.raises(DataError, match=r"No wheel[\s\S]*pip download .* other-robots"):
+        import_description("toy", Recipe("other_robots", "arm.xml", "MIT", ("hand",)), wheels, tmp_path)
+
+
+def test_file_with_other_poses_is_not_kept(wheels, tmp_path, monkeypatch):
+    exact = description_import._numbers
+    monkeypatch.setattr(description_import, "_numbers", lambda values: exact([round(float(v), 3) for v in values]))
+    with pytest.raises(DataError, match=r"other poses than its source[\s\S]*1e-09"):
+        import_description("toy", RECIPE, wheels, tmp_path)
+    assert not (tmp_path / "toy.xml").exists()
