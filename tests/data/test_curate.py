@@ -249,7 +249,8 @@ def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
             videos.append({"video_path": str(path.relative_to(tmp_path / "droid"))})
         gripper = np.linspace(0, 1.02, states)[:, None]
         pose = np.concatenate([rng.normal(size=(states, 6)), gripper], axis=1)
-        joints = np.concatenate([rng.normal(size=(states, 7)) * 0.3, gripper], axis=1)
+        bent = np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.6, 0.0])  # a Panda's elbow and wrist cannot be straight
+        joints = np.concatenate([bent + 0.1 * rng.normal(size=(states, 7)), gripper], axis=1)
         described = {
             "texts": ["pick"],
             "success": 1,

@@ -1,4 +1,4 @@
-"""Projection: round trips, invariance, and intrinsics that follow resizes and crops."""
+"""Projection: round trips, invariance, borders, and camera matrices that are none."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import (
     check_intrinsics,
-    crop_intrinsics,
     inside_image,
     project,
-    resize_intrinsics,
     unproject,
 )
 from worldline_core.geometry.se3 import rotation_from_quaternion_wxyz, transform_from, transform_points
 
 K = torch.tensor([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]], dtype=torch.float64)
+steady = settings(derandomize=True, deadline=None)
 unit = st.floats(-1.0, 1.0, allow_nan=False)
 quaternions = st.tuples(unit, unit, unit, unit).filter(lambda q: sum(x * x for x in q) > 0.01)
 points = st.tuples(*[st.floats(-2, 2, allow_nan=False)] * 3)
@@ -31,6 +30,7 @@ def pose(quaternion, translation):
     return transform_from(rotation, torch.tensor(translation, dtype=torch.float64))
 
 
+@steady
 @given(quaternions, points, st.floats(-200, 800), st.floats(-200, 600), st.floats(0.05, 5))
 def test_unproject_then_project_returns_the_pixel(quaternion, translation, u, v, depth):
     T_base_camera = pose(quaternion, translation)
@@ -41,6 +41,7 @@ def test_unproject_then_project_returns_the_pixel(quaternion, translation, u, v,
     assert float(depth_again) == pytest.approx(depth, abs=1e-10)
 
 
+@steady
 @given(quaternions, points, quaternions, points, points)
 def test_moving_camera_and_point_together_changes_nothing(q1, t1, q2, t2, point):
     T_base_camera, T_new_base = pose(q1, t1), pose(q2, t2)
@@ -66,39 +67,6 @@ def test_project_equals_opencv():
         torch.from_numpy(world), torch.from_numpy(square), torch.from_numpy(np.linalg.inv(T_camera_base))[None]
     )
     np.testing.assert_allclose(uv.numpy(), expected[:, 0], atol=1e-9)
-
-
-@given(st.integers(8, 700), st.integers(8, 700), points)
-def test_resize_then_project_equals_project_then_resize(height, width, point):
-    camera = pose((1, 0, 0, 0), (0, 0, -2.5))
-    p = torch.tensor(point, dtype=torch.float64)
-    resized = resize_intrinsics(K, (480, 640), (height, width))
-    uv, _ = project(p, K, camera)
-    uv_resized, _ = project(p, resized, camera)
-    expected = (uv + 0.5) * torch.tensor([width / 640, height / 480], dtype=torch.float64) - 0.5
-    torch.testing.assert_close(uv_resized, expected, atol=1e-8, rtol=0)
-
-
-def test_resize_follows_the_pixels_of_an_actually_resized_image():
-    # A blob drawn at a known place must be found where the resized camera projects it.
-    picture = np.zeros((480, 640), np.float32)
-    uv = torch.tensor([201.3, 333.8], dtype=torch.float64)
-    v, u = np.mgrid[0:480, 0:640]
-    picture = np.exp(-((u - 201.3) ** 2 + (v - 333.8) ** 2) / (2 * 12.0**2)).astype(np.float32)
-    small = cv2.resize(picture, (160, 96), interpolation=cv2.INTER_AREA)
-    rows, columns = np.mgrid[0:96, 0:160]
-    found = np.array([(columns * small).sum(), (rows * small).sum()]) / small.sum()
-    point = unproject(uv, torch.tensor(1.0, dtype=torch.float64), K, torch.eye(4, dtype=torch.float64))
-    expected, _ = project(point, resize_intrinsics(K, (480, 640), (96, 160)), torch.eye(4, dtype=torch.float64))
-    np.testing.assert_allclose(found, expected.numpy(), atol=0.02)
-
-
-def test_crop_moves_the_pixel_by_the_cut():
-    point = torch.tensor([0.1, -0.05, 1.3], dtype=torch.float64)
-    eye = torch.eye(4, dtype=torch.float64)
-    uv, _ = project(point, K, eye)
-    cropped, _ = project(point, crop_intrinsics(K, top=30.0, left=12.5), eye)
-    torch.testing.assert_close(cropped, uv - torch.tensor([12.5, 30.0], dtype=torch.float64))
 
 
 def test_image_border_lies_half_a_pixel_outside_the_outer_centres():

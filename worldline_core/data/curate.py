@@ -20,13 +20,15 @@ from worldline_core.data.episode_index import read_index, read_quarantine
 from worldline_core.data.episode_parts import part_name
 from worldline_core.data.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.resize import resize_frames, resize_masks
+from worldline_core.data.resize import Fit, fitted
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
 from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
 from worldline_core.data.sources.lerobot import LeRobotSource, LeRobotSourceConfig
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig
+from worldline_core.data.sources.repaired import RepairedSource
+from worldline_core.data.undistort import PinholeSource
 from worldline_core.data.video import PixelFormat
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.store.atomic import write_bytes_atomic
@@ -48,6 +50,7 @@ class CurateConfig(StrictModel):
     image_size: tuple[int, int] | None = Field(
         default=None, description="(height, width) of all images; null keeps each size"
     )
+    fit: Fit = Field(default="stretch", description="how images come to that size; letterbox and crop keep the aspect")
     fps: float | None = Field(default=None, gt=0, description="rate of all episodes; null keeps each rate")
     views: tuple[str, ...] | None = Field(default=None, description="views to keep, in this order; null keeps all")
     primary_view: str | None = Field(
@@ -83,12 +86,18 @@ class _Input:
 
 
 def open_source(config: SourceConfig, root: Path) -> EpisodeSource:
-    """The reader of a configured source.
+    """The reader of a configured source: it repairs what the configuration declares as departing from the contract, and
+    takes out lens distortion.
 
     Raises: DataError when the folder is missing or not of that kind.
     """
     if not root.exists():
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
+    source = _reader(config, root)
+    return PinholeSource(RepairedSource(source, config.conventions) if config.conventions.departures else source)
+
+
+def _reader(config: SourceConfig, root: Path) -> EpisodeSource:
     match config:
         case EpisodeSetSourceConfig():
             return EpisodeSetSource(config, root)
@@ -232,17 +241,14 @@ def _prepare(
             got=episode.num_frames,
             evidence={"frames": episode.num_frames},
         )
-    frames = {view: resize_frames(images[::step], config.image_size) for view, images in source_frames.items()}
+    fits = {view: fitted(images.shape[1:3], config.image_size, config.fit) for view, images in source_frames.items()}
+    frames = {view: fits[view].frames(images[::step]) for view, images in source_frames.items()}
     masks: dict[str, np.ndarray] = {}
     for view in views:
         mask = loaded.robot_masks(view)
         if mask is not None:
-            masks[view] = resize_masks(mask[::step], config.image_size)
-    cameras = {
-        view: episode.cameras[view].resized(frames[view].shape[2], frames[view].shape[1])
-        for view in views
-        if view in episode.cameras
-    }
+            masks[view] = fits[view].masks(mask[::step])
+    cameras = {view: episode.cameras[view].transformed(fits[view]) for view in views if view in episode.cameras}
     split = next((s for pattern, s in config.splits.items() if fnmatchcase(episode.scene, pattern)), episode.split)
     prepared = replace(
         episode,

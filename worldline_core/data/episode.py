@@ -14,6 +14,8 @@ import numpy as np
 
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.errors import DataError
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.image_transforms import ImageTransform
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
@@ -48,6 +50,11 @@ class CameraTrack:
                 "Camera poses have a wrong shape", where=self.view, expected="(N or 1, 4, 4)", got=str(shape)
             )
 
+    @classmethod
+    def from_pose(cls, view: str, K: np.ndarray, pose: CameraPose, *, width: int, height: int) -> CameraTrack:
+        """From a pose that says its convention; what every reader of foreign calibration uses."""
+        return cls(view, K, pose.T_base_camera, width, height)
+
     @property
     def moving(self) -> bool:
         return self.T_base_camera.shape[0] > 1
@@ -80,9 +87,12 @@ class CameraTrack:
 
         Pixel centres lie at integer coordinates, so u' = (u + 1/2) s - 1/2.
         """
-        sx, sy = width / self.width, height / self.height
-        scale = np.array([[sx, 0.0, (sx - 1) / 2], [0.0, sy, (sy - 1) / 2], [0.0, 0.0, 1.0]])
-        return replace(self, K=scale @ self.K, width=width, height=height)
+        return self.transformed(ImageTransform.of((self.height, self.width)).resize((height, width)))
+
+    def transformed(self, transform: ImageTransform) -> CameraTrack:
+        """The same camera with its image resized, cropped, padded or letterboxed; K follows."""
+        height, width = transform.image_size
+        return replace(self, K=transform.intrinsics(self.K), width=width, height=height)
 
     def cut(self, start: int, stop: int, step: int = 1) -> CameraTrack:
         """The camera over frames start..stop (exclusive), every `step`-th."""

@@ -20,8 +20,9 @@ from mcap.writer import CompressionType, Writer
 
 from worldline_core.data.episode import CameraTrack, Episode
 from worldline_core.data.mcap_schemas import SCHEMAS
-from worldline_core.data.rotations import quaternion_wxyz
 from worldline_core.errors import DataError
+from worldline_core.geometry.distortion import Distortion
+from worldline_core.geometry.pose_formats import quaternion_wxyz_from_rotation
 from worldline_core.store.atomic import atomic_path
 
 ImageFormat = Literal["png", "jpeg"]
@@ -73,15 +74,23 @@ def _image(frame: np.ndarray, frame_id: str, time_ns: int, image_format: ImageFo
     return {"timestamp": _stamp(time_ns), "frame_id": frame_id, "data": data, "format": image_format}
 
 
-def _calibration(camera: CameraTrack, time_ns: int) -> dict[str, Any]:
+_MODEL_NAMES = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
+
+
+def _calibration(camera: CameraTrack, time_ns: int, distortion: Distortion | None = None) -> dict[str, Any]:
+    """Foxglove's CameraCalibration; a lens with more than five radtan coefficients is a rational_polynomial."""
+    model, coefficients = "plumb_bob", (0.0,) * 5
+    if distortion is not None:
+        coefficients = distortion.coefficients
+        model = "rational_polynomial" if len(coefficients) > 5 else _MODEL_NAMES[distortion.model]
     K = camera.K.reshape(-1).tolist()
     return {
         "timestamp": _stamp(time_ns),
         "frame_id": f"{camera.view}_camera",
         "width": camera.width,
         "height": camera.height,
-        "distortion_model": "plumb_bob",
-        "D": [0.0] * 5,
+        "distortion_model": model,
+        "D": list(coefficients),
         "K": K,
         "R": np.eye(3).reshape(-1).tolist(),
         "P": [*K[0:3], 0.0, *K[3:6], 0.0, *K[6:9], 0.0],
@@ -89,7 +98,7 @@ def _calibration(camera: CameraTrack, time_ns: int) -> dict[str, Any]:
 
 
 def _transform(parent: str, child: str, pose: np.ndarray, time_ns: int) -> dict[str, Any]:
-    w, x, y, z = (float(value) for value in quaternion_wxyz(pose[:3, :3]))
+    w, x, y, z = (float(value) for value in quaternion_wxyz_from_rotation(pose[:3, :3]))
     return {
         "timestamp": _stamp(time_ns),
         "parent_frame_id": parent,
@@ -135,6 +144,7 @@ def write_episode_mcap(
     *,
     image_format: ImageFormat = "png",
     robot_masks: Mapping[str, np.ndarray] | None = None,
+    distortions: Mapping[str, Distortion] | None = None,
 ) -> None:
     """Write one episode.
 
@@ -142,6 +152,7 @@ def write_episode_mcap(
         frames: by view, uint8 (episode.num_video_frames, H, W, 3) RGB.
         image_format: png keeps pixels exactly; jpeg (quality 95) is smaller and keeps them on average within 4 of 255.
         robot_masks: by view, bool (N, H, W), always exact.
+        distortions: lenses by view, where frames and K are those of a distorting lens.
 
     Raises: DataError when frames and states differ in number.
     """
@@ -166,9 +177,8 @@ def write_episode_mcap(
                 recorder.add(topic, "worldline.JointStates", time_ns, message)
             for view, camera in episode.cameras.items():
                 if index == 0:
-                    recorder.add(
-                        f"/{view}/calibration", "foxglove.CameraCalibration", time_ns, _calibration(camera, time_ns)
-                    )
+                    message = _calibration(camera, time_ns, (distortions or {}).get(view))
+                    recorder.add(f"/{view}/calibration", "foxglove.CameraCalibration", time_ns, message)
                 if index == 0 or camera.moving:
                     pose = camera.T_base_camera[index if camera.moving else 0]
                     message = _transform("base", f"{view}_camera", pose, time_ns)

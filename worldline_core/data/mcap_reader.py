@@ -16,17 +16,20 @@ from mcap.reader import make_reader
 
 from worldline_core.data.episode import CameraTrack, Episode
 from worldline_core.data.mcap_io import EPISODE_METADATA, FORMAT_VERSION
+from worldline_core.data.recorded_poses import camera_pose, rejected_as
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.rotations import pose_from_quaternion_wxyz
+from worldline_core.geometry.distortion import Distortion, distortion_from_ros
+from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
 
 
 @dataclass(frozen=True)
 class McapEpisode:
-    """An episode with its images (uint8 RGB) and robot masks (bool) by view."""
+    """An episode with its images (uint8 RGB), robot masks (bool) and lenses by view; a pinhole has no lens entry."""
 
     episode: Episode
     frames: dict[str, np.ndarray]
     robot_masks: dict[str, np.ndarray]
+    distortions: dict[str, Distortion]
 
 
 def read_episode_id(path: Path) -> str:
@@ -96,10 +99,12 @@ def read_episode_mcap(path: Path) -> McapEpisode:
     transforms: dict[str, list[dict[str, Any]]] = {}
     for _, message in messages.get("/tf", []):
         transforms.setdefault(message["child_frame_id"], []).append(message)
-    cameras = {
-        view: _camera(view, bool(moving), messages, transforms, num_frames, path)
-        for view, moving in about["cameras"].items()
-    }
+    cameras: dict[str, CameraTrack] = {}
+    distortions: dict[str, Distortion] = {}
+    for view, moving in about["cameras"].items():
+        cameras[view], lens = _camera(view, bool(moving), messages, transforms, num_frames, path)
+        if lens is not None:
+            distortions[view] = lens
     tools = [_poses(transforms, f"tool_{arm}", num_frames, path) for arm in range(int(about["num_arms"]))]
     episode = Episode(
         episode_id=about["episode_id"],
@@ -125,7 +130,7 @@ def read_episode_mcap(path: Path) -> McapEpisode:
         video_frames=about["video_frames"],
         conventions=about["conventions"],
     )
-    return McapEpisode(episode, frames, masks)
+    return McapEpisode(episode, frames, masks, distortions)
 
 
 def _take(
@@ -168,7 +173,8 @@ def _poses(transforms: dict[str, list[dict[str, Any]]], child: str, count: int, 
         )
     position = np.array([[m["translation"][axis] for axis in "xyz"] for m in found], dtype=np.float64)
     quaternion = np.array([[m["rotation"][axis] for axis in "wxyz"] for m in found], dtype=np.float64)
-    return pose_from_quaternion_wxyz(position, quaternion)
+    with rejected_as("invalid_extrinsics", f"{path}, frame {child}", {"frame": child}):
+        return pose_from_quaternion_wxyz(position, quaternion)
 
 
 def _camera(
@@ -178,8 +184,14 @@ def _camera(
     transforms: dict[str, list[dict[str, Any]]],
     num_frames: int,
     path: Path,
-) -> CameraTrack:
+) -> tuple[CameraTrack, Distortion | None]:
     _, calibration = _take(messages, f"/{view}/calibration", 1, path)[0]
     poses = _poses(transforms, f"{view}_camera", num_frames if moving else 1, path)
     K = np.array(calibration["K"], dtype=np.float64).reshape(3, 3)
-    return CameraTrack(view, K, poses, int(calibration["width"]), int(calibration["height"]))
+    model, coefficients = str(calibration.get("distortion_model", "")), calibration.get("D", [])
+    where = f"{path}, topic /{view}/calibration"
+    with rejected_as("invalid_distortion", where, {"view": view, "model": model, "coefficients": coefficients}):
+        lens = distortion_from_ros(model, coefficients, None)
+    pose = camera_pose(view, poses, extrinsics="camera_to_base", axes="opencv", where=where)
+    width, height = int(calibration["width"]), int(calibration["height"])
+    return CameraTrack.from_pose(view, K, pose, width=width, height=height), lens

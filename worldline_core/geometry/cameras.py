@@ -2,8 +2,8 @@
 
 Camera frame: OpenCV (x right, y down, z forward), metres. `T_base_camera` maps camera points to base.
 Pixels: the *centre* of the top left pixel is (0, 0), so the image covers -0.5 <= u < width - 0.5, likewise v. Under
-this convention a resize by s maps u to (u + 0.5) s - 0.5, and K follows it exactly (`resize_intrinsics`): to resize
-and then project is to project and then resize.
+this convention a resize by s maps u to (u + 0.5) s - 0.5, and K follows it exactly (`image_transforms`): to resize
+and then project is to project and then resize. Distorted lenses are undistorted on ingest (`undistortion`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from worldline_core.errors import CalibrationError
+from worldline_core.geometry.image_transforms import ImageTransform
 from worldline_core.geometry.se3 import invert, transform_points
 
 MIN_DEPTH_M = 0.01
@@ -52,22 +53,9 @@ def inside_image(uv: Float[Tensor, "*b 2"], image_size: tuple[int, int]) -> Bool
     return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
-def resize_intrinsics(
-    K: Float[Tensor, "*b 3 3"], from_size: tuple[int, int], to_size: tuple[int, int]
-) -> Float[Tensor, "*b 3 3"]:
-    """K after the image is resized from (height, width) to (height, width); the aspect ratio may change."""
-    return _pixel_affine(K, to_size[1] / from_size[1], to_size[0] / from_size[0]) @ K
-
-
-def _pixel_affine(K: Tensor, scale_u: float, scale_v: float) -> Tensor:
-    rows = [[scale_u, 0.0, (scale_u - 1) / 2], [0.0, scale_v, (scale_v - 1) / 2], [0.0, 0.0, 1.0]]
-    return torch.tensor(rows, dtype=K.dtype, device=K.device)
-
-
-def crop_intrinsics(K: Float[Tensor, "*b 3 3"], top: float, left: float) -> Float[Tensor, "*b 3 3"]:
-    """K after `top` rows and `left` columns are cut away."""
-    shift = torch.tensor([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]], dtype=K.dtype, device=K.device)
-    return shift @ K
+def transform_intrinsics(K: Float[Tensor, "*b 3 3"], transform: ImageTransform) -> Float[Tensor, "*b 3 3"]:
+    """K after the image is resized, cropped, padded or letterboxed."""
+    return torch.as_tensor(transform.affine, dtype=K.dtype, device=K.device) @ K
 
 
 def valid_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:

@@ -6,7 +6,66 @@ What filters and the calibration doctor measure recordings with. The differentia
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from worldline_core.errors import CalibrationError
+
+MAX_ROTATION_DEVIATION = 1e-3
+"""A recorded rotation with R R^T further from the identity (largest entry) is refused, not repaired."""
+ROTATION_ROUNDING = 1e-6
+"""Up to here a deviation is the rounding of float32 storage: left as it is, and not reported."""
+
+
+@dataclass(frozen=True)
+class RotationRepair:
+    """How many of the poses were given the nearest rotation, and the largest deviation among them."""
+
+    count: int
+    largest: float
+
+
+def rotation_deviation(rotation: np.ndarray) -> np.ndarray:
+    """(...,) largest entry of |R R^T - I| of matrices (..., 3, 3); infinite for a mirrored or not finite one."""
+    known = np.nan_to_num(rotation)
+    deviation = np.abs(known @ np.swapaxes(known, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    usable = np.isfinite(rotation).all(axis=(-2, -1)) & (np.linalg.det(known) > 0)
+    return np.where(usable, deviation, np.inf)
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotations nearest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes, by SVD)."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def repair_rotations(poses: np.ndarray, where: object) -> tuple[np.ndarray, RotationRepair]:
+    """Recorded poses (..., 4, 4) made rigid: the nearest rotation for each that is off by 1e-6 .. 1e-3.
+
+    Returns: the poses (the same array when none is off) and how many were changed.
+
+    Raises: CalibrationError when a pose is not finite, mirrored, further off, or its last row is not 0 0 0 1.
+    """
+    deviation = rotation_deviation(poses[..., :3, :3])
+    known = np.isfinite(poses[..., :3, 3]).all(axis=-1) & (np.abs(poses[..., 3, :] - [0, 0, 0, 1]) < 1e-6).all(axis=-1)
+    bad = ~(known & (deviation <= MAX_ROTATION_DEVIATION))
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise CalibrationError(
+            "Not a rigid transform: the rotation is not orthonormal and right-handed, or not finite",
+            where=f"{where}, frame {first[0]}" if first else where,
+            expected=f"R R^T = I within {MAX_ROTATION_DEVIATION:g}, det R = 1, last row 0 0 0 1",
+            got=f"deviation {deviation[first]:.3g}, {int(bad.sum())} of {bad.size} poses refused; {poses[first].tolist()}",
+            next_step="check whether the matrix is transposed, scaled, or stored in another layout",
+        )
+    off = deviation > ROTATION_ROUNDING
+    if not off.any():
+        return poses, RotationRepair(0, 0.0)
+    repaired = np.array(poses, dtype=np.float64)
+    repaired[off, :3, :3] = nearest_rotation(repaired[off, :3, :3])
+    return repaired, RotationRepair(int(off.sum()), float(deviation[off].max()))
 
 
 def rotation_angle_deg(rotation: np.ndarray) -> np.ndarray:
@@ -38,10 +97,9 @@ def rigid_inverse(pose: np.ndarray) -> np.ndarray:
 
 def mean_pose(poses: np.ndarray) -> np.ndarray:
     """(4, 4) with the median position and the chordal mean rotation of (n, 4, 4)."""
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, np.median(poses[:, :3, 3], axis=0)
+    result[:3, :3] = nearest_rotation(poses[:, :3, :3].mean(axis=0))
+    result[:3, 3] = np.median(poses[:, :3, 3], axis=0)
     return result
 
 

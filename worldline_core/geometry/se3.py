@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import CalibrationError
+from worldline_core.geometry.pose_formats import MIN_QUATERNION_NORM
 
 ROTATION_TOLERANCE = 1e-4
 """Largest deviation of R R^T from the identity (and of det R from 1) that still counts as a rotation."""
@@ -36,8 +37,18 @@ def transform_points(T: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b 3"]
 
 
 def rotation_from_quaternion_wxyz(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrix of a quaternion (normalised first)."""
-    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    """Rotation matrix of a quaternion (normalised first).
+
+    Raises: CalibrationError for a quaternion of no length, or one that is not finite.
+    """
+    norm = quaternion.norm(dim=-1, keepdim=True)
+    if not bool(((norm > MIN_QUATERNION_NORM) & torch.isfinite(norm)).all()):
+        raise CalibrationError(
+            "Quaternion has no direction",
+            expected="a unit quaternion, wxyz",
+            got=f"norms from {float(norm.min()):.3g} to {float(norm.max()):.3g}",
+        )
+    w, x, y, z = (quaternion / norm).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
         torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),

@@ -19,9 +19,12 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.rotations import pose_from_quaternion_xyzw, pose_from_roll_pitch_yaw
-from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LoadedEpisode, no_masks
+from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.distortion import Distortion
+from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
 _FOLDER_V1 = {"head": "head_color", "left_wrist": "hand_left_color", "right_wrist": "hand_right_color"}
 _NAME_V1 = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
@@ -39,6 +42,11 @@ class AgibotGesimSourceConfig(ForeignSourceConfig):
     gripper_v2: GripperRange = GripperRange(closed=119.0, open=0.2)
     tool_offset_v1_m: float = 0.23
     tool_offset_v2_m: float = 0.15
+    distortions: dict[str, LensConfig] = Field(default={}, description="view -> lens, where images are distorted")
+
+    @property
+    def lenses(self) -> dict[str, Distortion]:
+        return {view: lens.distortion for view, lens in self.distortions.items()}
 
 
 class AgibotGesimSource:
@@ -74,7 +82,9 @@ class AgibotGesimSource:
         config = self._config
         raw = _array(folder / "actions.npy", (None, 16))
         opening, overshoot = config.gripper_v1.opening(raw[:, [7, 15]])
-        poses = np.stack([pose_from_quaternion_xyzw(raw[:, a : a + 3], raw[:, a + 3 : a + 7]) for a in (0, 8)], axis=1)
+        with rejected_as("nan_state", folder / "actions.npy"):
+            ends = [pose_from_quaternion_xyzw(raw[:, a : a + 3], raw[:, a + 3 : a + 7]) for a in (0, 8)]
+        poses = np.stack(ends, axis=1)
         state = raw.copy()
         state[:, [7, 15]] = opening
         images = {view: _png_folder(folder / name) for view, name in _FOLDER_V1.items()}
@@ -83,12 +93,14 @@ class AgibotGesimSource:
             raise RejectedInputError(
                 "length_mismatch", "Views differ in the number of images", where=folder, got=counts, evidence=counts
             )
-        cameras = {}
+        cameras: dict[str, CameraTrack] = {}
+        recorded: dict[str, CameraPose] = {}
         for view, name in _NAME_V1.items():
             height, width = _read_png(images[view][0]).shape[:2]
             K = _array(folder / f"intrinsic_{name}.npy", (3, 3)).astype(np.float64)
             track = _array(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)).astype(np.float64)
-            cameras[view] = CameraTrack(view, K, track, width, height)
+            recorded[view] = camera_pose(view, track, extrinsics="camera_to_base", axes="opencv", where=folder)
+            cameras[view] = CameraTrack.from_pose(view, K, recorded[view], width=width, height=height)
         episode = Episode(
             **self._common(episode_id, folder, len(raw)),
             instruction="",
@@ -109,10 +121,11 @@ class AgibotGesimSource:
                 "action": "repeats the state: no commands are published",
                 "tool_offset_m": config.tool_offset_v1_m,
                 "gripper_overshoot": overshoot,
+                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
             },
         )
         frames: Callable[[str], np.ndarray] = lambda view: np.stack([_read_png(path) for path in images[view]])  # noqa: E731
-        return LoadedEpisode(episode, VIEWS, frames, no_masks)
+        return LoadedEpisode(episode, VIEWS, frames, no_masks, config.lenses)
 
     def _load_v2(self, episode_id: str, folder: Path) -> LoadedEpisode:
         config = self._config
@@ -125,13 +138,17 @@ class AgibotGesimSource:
         left, right = slice(0, 7), slice(7, 14)
         state = np.concatenate([joints[:, left], opening[:, :1], joints[:, right], opening[:, 1:]], axis=1)
         action = np.concatenate([commands[:, :7], commanded[:, :1], commands[:, 8:15], commanded[:, 1:]], axis=1)
-        poses = np.stack([pose_from_roll_pitch_yaw(ends[:, a : a + 3], ends[:, a + 3 : a + 6]) for a in (0, 7)], axis=1)
+        poses = np.stack(
+            [pose_from_euler_fixed_xyz(ends[:, a : a + 3], ends[:, a + 3 : a + 6]) for a in (0, 7)], axis=1
+        )
         intrinsics = _array(folder / "intrinsic.npy", (3, 3, 3)).astype(np.float64)
         tracks = _array(folder / "extrinsic_alignstate_0.npy", (3, num_frames, 4, 4)).astype(np.float64)
-        cameras = {}
+        cameras: dict[str, CameraTrack] = {}
+        recorded: dict[str, CameraPose] = {}
         for index, view in enumerate(VIEWS):
             height, width = _read_png(folder / _IMAGE_V2[view]).shape[:2]
-            cameras[view] = CameraTrack(view, intrinsics[index], tracks[index], width, height)
+            recorded[view] = camera_pose(view, tracks[index], extrinsics="camera_to_base", axes="opencv", where=folder)
+            cameras[view] = CameraTrack.from_pose(view, intrinsics[index], recorded[view], width=width, height=height)
         task = folder / "task.txt"
         posture = {name: float(joints[0, 16 + i]) for i, name in enumerate(_POSTURE_V2)}
         names = [f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")]
@@ -151,9 +168,11 @@ class AgibotGesimSource:
                 "gripper_overshoot": overshoot + command_overshoot,
                 "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
                 **posture,
+                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
             },
         )
-        return LoadedEpisode(episode, VIEWS, lambda view: _read_png(folder / _IMAGE_V2[view])[None], no_masks)
+        first: Callable[[str], np.ndarray] = lambda view: _read_png(folder / _IMAGE_V2[view])[None]  # noqa: E731
+        return LoadedEpisode(episode, VIEWS, first, no_masks, config.lenses)
 
 
 def along_z(poses: np.ndarray, offset_m: float) -> np.ndarray:

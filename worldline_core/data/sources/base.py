@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from worldline_core.config.base import StrictModel
+from worldline_core.data.conventions import RecordedConventions
 from worldline_core.data.episode import Episode, Outcome, Split, TaskFamily
+from worldline_core.errors import CalibrationError
+from worldline_core.geometry.distortion import Distortion, DistortionModel
 
 
 @dataclass(frozen=True)
@@ -23,12 +26,14 @@ class LoadedEpisode:
         views: views that have images.
         frames: view -> uint8 (episode.num_video_frames, H, W, 3); decodes when called.
         robot_masks: view -> bool (N, H, W), or None where the source has none.
+        distortions: lenses of the views whose images are not those of a pinhole; K is then that of the lens.
     """
 
     episode: Episode
     views: tuple[str, ...]
     frames: Callable[[str], np.ndarray]
     robot_masks: Callable[[str], np.ndarray | None]
+    distortions: Mapping[str, Distortion] = field(default_factory=dict)
 
 
 class EpisodeSource(Protocol):
@@ -47,6 +52,10 @@ class SourceConfigBase(StrictModel):
     include: tuple[str, ...] | None = Field(
         default=None, description="shell patterns of the episode ids to read; null: all"
     )
+    conventions: RecordedConventions = Field(
+        default=RecordedConventions(),
+        description="how these recordings depart from the contract; `worldline calibrate check` finds out",
+    )
 
     @property
     def label(self) -> str:
@@ -64,6 +73,25 @@ class ForeignSourceConfig(SourceConfigBase):
     scene: str | None = Field(default=None, description="scene of all episodes; default: one scene an episode folder")
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
+
+
+class LensConfig(StrictModel):
+    """A lens that a format has no place for, declared by the user: OpenCV's model and coefficients."""
+
+    model: DistortionModel
+    coefficients: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _usable(self) -> LensConfig:
+        try:
+            _ = self.distortion
+        except CalibrationError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    @property
+    def distortion(self) -> Distortion:
+        return Distortion(self.model, self.coefficients)
 
 
 class GripperRange(StrictModel):

@@ -16,11 +16,11 @@ from pydantic import Field
 from worldline_core.data.episode import Episode
 from worldline_core.data.lerobot_v3 import read_json
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.rotations import pose_from_roll_pitch_yaw
 from worldline_core.data.source_paths import inside
 from worldline_core.data.sources.agibot_gesim import along_z
 from worldline_core.data.sources.base import ForeignSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.video import decode_video, video_size
+from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
 
 _DIGITS = re.compile(r"(\d+)")
 
@@ -71,7 +71,7 @@ class DroidAnnotationSource:
         overshoot = int(np.count_nonzero((states[:, 6] < 0) | (states[:, 6] > 1)))
         state = np.concatenate([joints, opening], axis=1)
         command = self._command(record, len(states))
-        pose = pose_from_roll_pitch_yaw(states[:, :3], states[:, 3:6])[:, None]
+        pose = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6])[:, None]
         success = record.get("success")
         texts = [text for text in record.get("texts", []) if text]
         frames = dict(videos.items())

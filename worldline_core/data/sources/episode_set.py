@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.recorded_poses import with_rigid_poses
 from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
 
 
@@ -31,7 +32,7 @@ class EpisodeSetSource:
 
     def load(self, episode_id: str) -> LoadedEpisode:
         position = self._set.position(episode_id)
-        episode = self._set.episode(position)
+        episode = with_rigid_poses(self._set.episode(position))
         if self._name is not None:
             episode = replace(episode, source=self._name)
         return LoadedEpisode(

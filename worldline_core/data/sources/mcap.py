@@ -46,4 +46,6 @@ class McapSource:
                 got=read.episode.episode_id,
             )
         episode = read.episode if self._name is None else replace(read.episode, source=self._name)
-        return LoadedEpisode(episode, tuple(read.frames), read.frames.__getitem__, read.robot_masks.get)
+        return LoadedEpisode(
+            episode, tuple(read.frames), read.frames.__getitem__, read.robot_masks.get, read.distortions
+        )

@@ -129,7 +129,7 @@ def _load(
     episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] | None
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Every ``stride``-th head frame of a row and its exact masks, or None where it has no masks."""
-    from worldline_core.data.curate import resize_frames, resize_masks
+    from worldline_core.data.resize import resize_frames, resize_masks
 
     masks = episodes.robot_masks(index, HEAD)
     if masks is None:

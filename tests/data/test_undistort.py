@@ -1,0 +1,213 @@
+"""Recordings of distorting lenses: curated, they are those of pinholes, in images, masks and K."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from pydantic import ValidationError
+
+from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.mcap_io import write_episode_mcap
+from worldline_core.data.mcap_reader import read_episode_mcap
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
+from worldline_core.data.sources.base import LoadedEpisode
+from worldline_core.data.undistort import undistorted
+from worldline_core.geometry.distortion import Distortion
+
+Make = Callable[..., tuple]
+HEIGHT, WIDTH = 120, 160
+K = np.array([[95.0, 0.0, 80.3], [0.0, 97.0, 58.9], [0.0, 0.0, 1.0]])
+LENSES = {
+    "plumb_bob": Distortion("radtan", (-0.25, 0.06, 0.001, -0.002, 0.003)),
+    "rational_polynomial": Distortion("radtan", (5.2, 3.1, 0.0003, -0.0002, 0.2, 5.5, 4.6, 0.9)),
+    "kannala_brandt": Distortion("fisheye", (0.02, -0.01, 0.003, -0.001)),
+}
+
+
+def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """What lies at depth 1: smooth colours, float (..., 3) in 0..255."""
+    return 127 + 90 * np.stack([np.sin(6 * x + 1), np.cos(5 * y), np.sin(4 * x + 3 * y)], axis=-1)
+
+
+def disc(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return (x - 0.45) ** 2 + (y - 0.3) ** 2 < 0.2**2
+
+
+def seen_through(lens: Distortion | None, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray]:
+    """Rays' (x, y) of every pixel, by OpenCV's own inverse."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    if lens is None:
+        found = cv2.undistortPoints(pixels, camera.K, np.zeros(5))
+    elif lens.model == "fisheye":
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
+        found = cv2.fisheye.undistortPoints(pixels, camera.K, np.array(lens.coefficients), criteria=criteria)
+    else:
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
+        found = cv2.undistortPointsIter(pixels, camera.K, np.array(lens.coefficients), None, None, criteria)
+    x, y = found.reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
+    return x, y
+
+
+def distorted_sample(make: Make, lens: Distortion | None) -> tuple:
+    """The sample episode whose head camera looks at the scene through the lens."""
+    episode, frames, masks = make(0, height=HEIGHT, width=WIDTH)
+    head = replace(episode.cameras["head"], K=K)
+    x, y = seen_through(lens, head)
+    frames["head"] = np.repeat(scene(x, y).round().astype(np.uint8)[None], len(frames["head"]), axis=0)
+    masks["head"] = np.repeat(disc(x, y)[None], len(masks["head"]), axis=0)
+    return replace(episode, cameras={**episode.cameras, "head": head}), frames, masks
+
+
+def curated_mcap(tmp_path: Path, **changes: Any) -> EpisodeSet:
+    source = {"kind": "mcap", "path": str(tmp_path / "mcap")}
+    settings = {"sources": [source], "image_size": (60, 80), "video_crf": 0, **changes}
+    curate(CurateConfig.model_validate(settings), {}, tmp_path / "out")
+    return EpisodeSet.open(tmp_path / "out")
+
+
+def off_from_scene(curated: EpisodeSet) -> float:
+    """Mean difference of the curated head image from the scene through its curated K, as a pinhole."""
+    camera = curated.episode(0).cameras["head"]
+    expected = scene(*seen_through(None, camera))
+    return float(np.abs(curated.frames(0, "head")[4] - expected).mean())
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sample: Make, model: str) -> None:
+    lens = LENSES[model]
+    episode, frames, masks = distorted_sample(sample, lens)
+    path = tmp_path / "mcap" / "0.mcap"
+    write_episode_mcap(path, episode, frames, robot_masks=masks, distortions={"head": lens})
+    with path.open("rb") as stream:
+        (message,) = [json.loads(m.data) for _, c, m in make_reader(stream).iter_messages(["/head/calibration"])]
+    assert message["distortion_model"] == model
+    assert read_episode_mcap(path).distortions == {"head": lens}
+    curated = curated_mcap(tmp_path)
+    read = curated.episode(0)
+    assert off_from_scene(curated) < 1.5
+    assert read.conventions["undistorted"] == f"head: {lens.model} {list(lens.coefficients)}"
+    mask = curated.robot_masks(0, "head")
+    assert mask is not None
+    expected = disc(*seen_through(None, read.cameras["head"]))
+    assert np.logical_xor(mask[4], expected).sum() <= 0.1 * expected.sum()
+    # The other views had no lens and stay what they were.
+    assert np.allclose(read.cameras["left_wrist"].K, episode.cameras["left_wrist"].resized(80, 60).K)
+
+
+def test_ignoring_the_lens_would_have_shown(tmp_path: Path, sample: Make) -> None:
+    episode, frames, masks = distorted_sample(sample, LENSES["plumb_bob"])
+    write_episode_mcap(tmp_path / "mcap" / "0.mcap", episode, frames, robot_masks=masks)  # the lens is not stated
+    curated = curated_mcap(tmp_path)
+    assert off_from_scene(curated) > 5
+    assert "undistorted" not in curated.episode(0).conventions
+
+
+@pytest.mark.parametrize("fit", ["stretch", "letterbox", "crop"])
+def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, sample: Make, fit: str) -> None:
+    lens = LENSES["plumb_bob"]
+    episode, frames, masks = distorted_sample(sample, lens)
+    path = tmp_path / "mcap" / "0.mcap"
+    write_episode_mcap(path, episode, frames, robot_masks=masks, distortions={"head": lens})
+    curated = curated_mcap(tmp_path, image_size=(64, 64), fit=fit)
+    camera = curated.episode(0).cameras["head"]
+    image = curated.frames(0, "head")[4].astype(float)
+    expected = scene(*seen_through(None, camera))
+    rows = slice(9, 55) if fit == "letterbox" else slice(0, 64)  # 64 x 48 between black bars
+    assert np.abs(image[rows] - expected[rows]).mean() < 1.5
+    if fit == "letterbox":
+        assert image[:7].max() < 10
+        assert image[57:].max() < 10
+    pixels_are_square = camera.K[0, 0] / camera.K[1, 1]
+    stretched = 0.75 if fit == "stretch" else 1.0
+    recorded = curated_ratio(lens)
+    assert pixels_are_square == pytest.approx(recorded * stretched, rel=0.02)
+
+
+def curated_ratio(lens: Distortion) -> float:
+    """fx / fy of the undistorted camera by OpenCV."""
+    whole, _ = cv2.getOptimalNewCameraMatrix(K, np.array(lens.coefficients), (WIDTH, HEIGHT), 0)
+    return float(whole[0, 0] / whole[1, 1])
+
+
+def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, sample: Make) -> None:
+    episode, frames, _ = distorted_sample(sample, None)
+    folds = Distortion("radtan", (-0.9, 0.1, 0.0, 0.0))
+    write_episode_mcap(tmp_path / "mcap" / "0.mcap", episode, frames)
+    second = replace(episode, episode_id="folds", state=episode.state + 0.01)
+    write_episode_mcap(tmp_path / "mcap" / "1.mcap", second, frames, distortions={"head": folds})
+    third = replace(episode, episode_id="unknown", state=episode.state + 0.02)
+    path = tmp_path / "mcap" / "2.mcap"
+    write_episode_mcap(path, third, frames)
+    with pytest.MonkeyPatch.context() as patch:
+        from worldline_core.data import mcap_io
+
+        original = mcap_io._calibration
+        changed = lambda *a, **k: {**original(*a, **k), "distortion_model": "double_sphere", "D": [0.1]}  # noqa: E731
+        patch.setattr(mcap_io, "_calibration", changed)
+        write_episode_mcap(path, third, frames)
+    curated = curated_mcap(tmp_path)
+    assert [row.episode_id for row in curated.rows] == [episode.episode_id]
+    rows = {row.episode_id: row for row in curated.quarantine()}
+    assert {row.reason for row in rows.values()} == {"invalid_distortion"}
+    assert rows["folds"].numbers == {"view": "head", "model": "radtan", "coefficients": [-0.9, 0.1, 0.0, 0.0]}
+    assert "folds back" in rows["folds"].detail
+    assert "double_sphere" in rows["unknown"].detail
+
+
+def loaded(sample: Make, **changes: Any) -> LoadedEpisode:
+    episode, frames, masks = distorted_sample(sample, LENSES["plumb_bob"])
+    values = {"distortions": {"head": LENSES["plumb_bob"]}, **changes}
+    episode = replace(episode, cameras=values.pop("cameras", episode.cameras))
+    return LoadedEpisode(episode, tuple(frames), frames.__getitem__, masks.get, **values)
+
+
+def test_a_lens_needs_a_camera_matrix_of_the_images_own_size(sample: Make) -> None:
+    with pytest.raises(RejectedInputError, match=r"lens is stated for a view without a camera matrix[\s\S]*got: top"):
+        undistorted(loaded(sample, distortions={"top": LENSES["plumb_bob"]}))
+    episode = distorted_sample(sample, None)[0]
+    smaller = episode.cameras["head"].resized(80, 60)
+    wrong = undistorted(loaded(sample, cameras={**episode.cameras, "head": smaller}))
+    with pytest.raises(RejectedInputError, match=r"another size than their lens[\s\S]*60x80[\s\S]*120x160"):
+        wrong.frames("head")
+    singular = replace(episode.cameras["head"], K=np.diag([95.0, 0.0, 1.0]))
+    with pytest.raises(RejectedInputError, match="cannot be inverted") as caught:
+        undistorted(loaded(sample, cameras={**episode.cameras, "head": singular}))
+    assert caught.value.reason == "singular_intrinsics"
+    untouched = loaded(sample, distortions={})
+    assert undistorted(untouched) is untouched
+
+
+def test_a_lens_can_be_declared_for_a_format_without_a_place_for_it(tmp_path: Path) -> None:
+    lens = {"model": "radtan", "coefficients": [0.1, 0.0, 0.0, 0.0]}
+    given = {"path": tmp_path, "fps": 30, "distortions": {"head": lens}}
+    config = AgibotGesimSourceConfig.model_validate(given)
+    assert config.lenses == {"head": Distortion("radtan", (0.1, 0.0, 0.0, 0.0))}
+    lens["coefficients"] = [0.1]
+    with pytest.raises(ValidationError, match="incomplete"):
+        AgibotGesimSourceConfig.model_validate(given)
+
+
+def test_a_real_bundle_is_undistorted_when_its_lens_is_declared(tmp_path: Path, shared_data: Path) -> None:
+    source = {"kind": "agibot_gesim", "path": str(shared_data / "agibot_gesim_v2"), "fps": 30}
+    lens = {"model": "radtan", "coefficients": [-0.1, 0.02, 0.0, 0.0]}
+    plain, curved = tmp_path / "plain", tmp_path / "curved"
+    curate(CurateConfig.model_validate({"sources": [source], "image_size": (48, 64)}), {}, plain)
+    declared = {**source, "distortions": {"head": lens}}
+    curate(CurateConfig.model_validate({"sources": [declared], "image_size": (48, 64)}), {}, curved)
+    a, b = EpisodeSet.open(plain), EpisodeSet.open(curved)
+    assert b.episode(0).cameras["head"].K[0, 0] < a.episode(0).cameras["head"].K[0, 0]
+    assert np.array_equal(b.episode(0).cameras["left_wrist"].K, a.episode(0).cameras["left_wrist"].K)
+    assert not np.array_equal(a.frames(0, "head"), b.frames(0, "head"))
+    assert b.episode(0).conventions["undistorted"] == "head: radtan [-0.1, 0.02, 0.0, 0.0]"

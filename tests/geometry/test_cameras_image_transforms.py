@@ -1,0 +1,136 @@
+"""Resize, crop, pad and letterbox: pixels, images and K move together."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldline_core.data.episode import CameraTrack
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.cameras import project, transform_intrinsics
+from worldline_core.geometry.image_transforms import ImageTransform
+
+K = np.array([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
+SIZE = (480, 640)
+steady = settings(derandomize=True, deadline=None)
+sides = st.integers(8, 700)
+
+
+@st.composite
+def transforms(draw: st.DrawFn) -> ImageTransform:
+    """Chains of up to four changes, whatever their order."""
+    transform = ImageTransform.of(SIZE)
+    for kind in draw(st.lists(st.sampled_from(["resize", "crop", "pad", "letterbox", "centre_crop"]), max_size=4)):
+        height, width = transform.image_size
+        if kind == "crop":
+            size = draw(st.integers(1, height)), draw(st.integers(1, width))
+            top, left = draw(st.integers(0, height - size[0])), draw(st.integers(0, width - size[1]))
+            transform = transform.crop(top, left, size)
+        elif kind == "pad":
+            transform = transform.pad(*(draw(st.integers(0, 50)) for _ in range(4)))
+        else:
+            transform = getattr(transform, kind)((draw(sides), draw(sides)))
+    return transform
+
+
+@steady
+@given(transforms(), st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.2, 4)))
+def test_transform_then_project_equals_project_then_transform(transform, point):
+    p, eye = torch.tensor(point, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    uv, _ = project(p, torch.from_numpy(K), eye)
+    transformed, _ = project(p, transform_intrinsics(torch.from_numpy(K), transform), eye)
+    np.testing.assert_allclose(transformed.numpy(), transform.pixels(uv.numpy()), atol=1e-7, rtol=1e-11)
+    np.testing.assert_allclose(transform_intrinsics(torch.from_numpy(K), transform).numpy(), transform.intrinsics(K))
+
+
+@steady
+@given(sides, sides, st.floats(-300, 900), st.floats(-300, 900))
+def test_a_resize_maps_pixel_borders_to_pixel_borders(height, width, u, v):
+    # From the definition, without the module's matrices: distances from the image's edge (-1/2) scale.
+    pixel = ImageTransform.of(SIZE).resize((height, width)).pixels(np.array([u, v]))
+    expected = [(u + 0.5) * width / 640 - 0.5, (v + 0.5) * height / 480 - 0.5]
+    np.testing.assert_allclose(pixel, expected, atol=1e-9)
+
+
+@steady
+@given(sides, sides)
+def test_letterbox_shows_all_and_centre_crop_fills(height, width):
+    corners = np.array([[-0.5, -0.5], [639.5, 479.5]])
+    boxed = ImageTransform.of(SIZE).letterbox((height, width))
+    (left, top), (right, bottom) = boxed.pixels(corners)
+    assert boxed.image_size == (height, width)
+    assert min(left, top) >= -0.5 - 1e-9
+    assert right <= width - 0.5 + 1e-9
+    assert bottom <= height - 0.5 + 1e-9
+    assert abs((left + 0.5) - (width - 0.5 - right)) <= 1 + 1e-9  # evenly, up to an odd pixel
+    assert abs((top + 0.5) - (height - 0.5 - bottom)) <= 1 + 1e-9
+    filled = ImageTransform.of(SIZE).centre_crop((height, width))
+    (left, top), (right, bottom) = filled.pixels(corners)
+    assert filled.image_size == (height, width)
+    assert max(left, top) <= -0.5 + 1e-9
+    assert right >= width - 0.5 - 1e-9
+    assert bottom >= height - 0.5 - 1e-9
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        ImageTransform.of(SIZE).resize((96, 160)),
+        ImageTransform.of(SIZE).resize((960, 1100)),
+        ImageTransform.of(SIZE).crop(101, 57, (333, 400)),
+        ImageTransform.of(SIZE).pad(7, 0, 13, 4),
+        ImageTransform.of(SIZE).letterbox((256, 256)),
+        ImageTransform.of(SIZE).letterbox((100, 300)).crop(3, 60, (90, 180)).resize((45, 91)),
+        ImageTransform.of(SIZE).centre_crop((240, 240)),
+    ],
+    ids=["shrink", "enlarge", "crop", "pad", "letterbox", "chain", "centre_crop"],
+)
+def test_a_drawn_blob_is_found_where_the_transformed_camera_projects_it(transform):
+    spot, eye = np.array([211.3, 253.8]), torch.eye(4, dtype=torch.float64)
+    v, u = np.mgrid[0:480, 0:640]
+    blob = np.exp(-((u - spot[0]) ** 2 + (v - spot[1]) ** 2) / (2 * 14.0**2))
+    picture = np.repeat((255 * blob).round().astype(np.uint8)[..., None], 3, axis=2)
+    result = transform.frames(picture[None])[0, ..., 0].astype(float)
+    assert result.shape == transform.image_size
+    rows, columns = np.mgrid[0 : result.shape[0], 0 : result.shape[1]]
+    found = np.array([(columns * result).sum(), (rows * result).sum()]) / result.sum()
+    ray = torch.from_numpy(np.linalg.inv(K) @ [*spot, 1.0])
+    expected, _ = project(1.7 * ray, transform_intrinsics(torch.from_numpy(K), transform), eye)
+    np.testing.assert_allclose(found, expected.numpy(), atol=0.03)
+    mask = transform.masks((blob > 0.3)[None])[0]
+    centre = np.argwhere(mask).mean(axis=0)[::-1]
+    np.testing.assert_allclose(centre, expected.numpy(), atol=0.3)
+
+
+def test_frames_are_those_of_opencv_and_padding_is_empty():
+    frames = np.random.default_rng(0).integers(0, 255, (2, *SIZE, 3), dtype=np.uint8)
+    boxed = ImageTransform.of(SIZE).letterbox((100, 160)).frames(frames)
+    inner = cv2.resize(frames[1], (133, 100), interpolation=cv2.INTER_AREA)
+    assert np.array_equal(boxed[1, :, 13:146], inner)
+    assert not boxed[:, :, :13].any()
+    assert not boxed[:, :, 146:].any()
+    assert ImageTransform.of(SIZE).resize(SIZE).frames(frames) is frames
+
+
+def test_a_camera_track_follows_the_same_transform():
+    track = CameraTrack("head", K, np.eye(4)[None], 640, 480)
+    transform = ImageTransform.of(SIZE).letterbox((256, 256))
+    moved = track.transformed(transform)
+    assert (moved.height, moved.width) == (256, 256)
+    assert np.array_equal(moved.K, transform.intrinsics(K))
+    assert np.array_equal(track.resized(64, 48).K, ImageTransform.of(SIZE).resize((48, 64)).intrinsics(K))
+
+
+def test_a_window_outside_of_the_image_and_other_sizes_are_refused():
+    with pytest.raises(ConfigError, match=r"Crop leaves the image[\s\S]*row 400"):
+        ImageTransform.of(SIZE).crop(400, 0, (100, 100))
+    with pytest.raises(ConfigError, match="Padding is negative"):
+        ImageTransform.of(SIZE).pad(-1, 0, 0, 0)
+    with pytest.raises(ConfigError, match="no pixels"):
+        ImageTransform.of((0, 640))
+    with pytest.raises(DataError, match=r"another size[\s\S]*\(480, 640\)[\s\S]*\(48, 64\)"):
+        ImageTransform.of(SIZE).resize((10, 10)).frames(np.zeros((1, 48, 64, 3), np.uint8))

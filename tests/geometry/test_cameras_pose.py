@@ -1,0 +1,174 @@
+"""Camera poses that say their convention, and rotations that are repaired or refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from worldline_core.data.episode import CameraTrack
+from worldline_core.errors import CalibrationError
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.rigid import (
+    MAX_ROTATION_DEVIATION,
+    mean_pose,
+    nearest_rotation,
+    project_points,
+    repair_rotations,
+    rotation_deviation,
+)
+
+K = np.array([[322.0, 0.0, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
+
+
+def poses(count: int = 5, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    result = np.tile(np.eye(4), (count, 1, 1))
+    result[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    result[:, :3, 3] = rng.normal(size=(count, 3))
+    return result
+
+
+def off_by(deviation: float, rotation: np.ndarray) -> np.ndarray:
+    """A shear of the rotation with max |R R^T - I| equal to `deviation`, to first order."""
+    return (np.eye(3) + deviation * np.array([[0, 1.0, 0], [0, 0, 0], [0, 0, 0]])) @ rotation
+
+
+def test_all_four_conventions_of_one_camera_project_alike() -> None:
+    T_base_camera = poses(1)
+    gl = T_base_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    made = [
+        CameraPose.from_camera_to_base(T_base_camera, axes="opencv", where="head"),
+        CameraPose.from_camera_to_base(gl, axes="opengl", where="head"),
+        CameraPose.from_base_to_camera(np.linalg.inv(T_base_camera), axes="opencv", where="head"),
+        CameraPose.from_base_to_camera(np.linalg.inv(gl)[0], axes="opengl", where="head"),
+    ]
+    points = np.random.default_rng(1).normal(size=(20, 3))
+    # OpenCV's own extrinsics (rvec, tvec) map base to camera.
+    T_camera_base = np.linalg.inv(T_base_camera[0])
+    rvec, _ = cv2.Rodrigues(T_camera_base[:3, :3])
+    expected, _ = cv2.projectPoints(points, rvec, T_camera_base[:3, 3], K, None)
+    for pose in made:
+        np.testing.assert_allclose(pose.T_base_camera, T_base_camera, atol=1e-12)
+        uv, _ = project_points(points, K, pose.T_base_camera)
+        np.testing.assert_allclose(uv, expected[:, 0], rtol=1e-8, atol=1e-7)
+    track = CameraTrack.from_pose("head", K, made[1], width=640, height=480)
+    np.testing.assert_allclose(track.T_base_camera, T_base_camera, atol=1e-12)
+
+
+def test_opengl_axes_look_along_minus_z() -> None:
+    # A camera at the origin that looks along the base's -z with y up, as OpenGL says: identity.
+    pose = CameraPose.from_camera_to_base(np.eye(4), axes="opengl", where="head")
+    _, depth = project_points(np.array([[0.0, 0.0, -2.0]]), K, pose.T_base_camera)
+    (uv,), _ = project_points(np.array([[0.0, 0.5, -2.0]]), K, pose.T_base_camera)
+    assert depth[0] == pytest.approx(2.0)
+    assert uv[1] < K[1, 2]  # what is up lies higher in the image
+
+
+def test_a_pose_cannot_be_made_without_its_convention() -> None:
+    with pytest.raises(TypeError, match="from_camera_to_base"):
+        CameraPose()
+    pose = CameraPose.from_camera_to_base(np.eye(4), axes="opencv", where="head")
+    with pytest.raises(TypeError, match="no array"):
+        np.asarray(pose)
+
+
+@pytest.mark.slow
+def test_pyright_refuses_a_bare_array_for_a_pose(tmp_path: Path) -> None:
+    if shutil.which("pyright") is None:
+        pytest.skip("pyright is not installed")
+    snippet = tmp_path / "snippet.py"
+    snippet.write_text(
+        "import numpy as np\n"
+        "from worldline_core.data.episode import CameraTrack\n"
+        "from worldline_core.geometry.camera_pose import CameraPose\n"
+        "T = np.eye(4)[None]\n"
+        'CameraTrack.from_pose("head", np.eye(3), T, width=4, height=4)\n'
+        'CameraPose.from_camera_to_base(T, axes="opengl2", where="head")\n'
+        'CameraPose.from_camera_to_base(T, where="head")\n'
+        "CameraPose(T)\n"
+        'CameraTrack.from_pose("head", np.eye(3), CameraPose.from_camera_to_base(T, axes="opencv", where=""), '
+        "width=4, height=4)\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    run = subprocess.run(
+        ["pyright", "--outputjson", str(snippet)], capture_output=True, text=True, cwd=root, check=False
+    )
+    if not run.stdout.lstrip().startswith("{"):
+        pytest.skip(f"pyright cannot run here: {run.stderr[:200]}")
+    errors = [d for d in json.loads(run.stdout)["generalDiagnostics"] if d["severity"] == "error"]
+    assert [d["range"]["start"]["line"] for d in errors] == [4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("deviation", [2e-6, 1e-4, 0.99e-3])
+def test_a_rotation_within_the_threshold_is_repaired_and_counted(deviation: float) -> None:
+    recorded = poses()
+    true = recorded.copy()
+    recorded[[1, 3], :3, :3] = off_by(deviation, recorded[[1, 3], :3, :3])
+    for build, expected in (
+        (CameraPose.from_camera_to_base, true),
+        (CameraPose.from_base_to_camera, np.linalg.inv(true)),
+    ):
+        pose = build(recorded, axes="opencv", where="episode 4, view head")
+        assert pose.repair.count == 2
+        assert pose.repair.largest == pytest.approx(deviation, rel=1e-2)
+        assert rotation_deviation(pose.T_base_camera[:, :3, :3]).max() < 1e-14
+        # The nearest rotation is not further from the true one than the recorded matrix was.
+        np.testing.assert_allclose(pose.T_base_camera[:, :3, :3], expected[:, :3, :3], atol=deviation)
+
+
+def test_what_is_exact_or_rounded_stays_the_same_array() -> None:
+    for recorded in (poses(), poses().astype(np.float32).astype(np.float64)):
+        repaired, repair = repair_rotations(recorded, "head")
+        assert repaired is recorded
+        assert repair.count == 0
+
+
+@pytest.mark.parametrize("kind", ["beyond", "mirrored", "scaled", "nan", "last_row", "infinite_place"])
+def test_what_is_beyond_repair_is_refused(kind: str) -> None:
+    recorded = poses()
+    if kind == "beyond":
+        recorded[2, :3, :3] = off_by(1.02 * MAX_ROTATION_DEVIATION, recorded[2, :3, :3])
+    elif kind == "mirrored":
+        recorded[2, :3, 0] *= -1
+    elif kind == "scaled":
+        recorded[2, :3, :3] *= 1.01
+    elif kind == "nan":
+        recorded[2, 0, 0] = np.nan
+    elif kind == "infinite_place":
+        recorded[2, 0, 3] = np.inf
+    else:
+        recorded[2, 3, 0] = 0.1
+    with pytest.raises(CalibrationError, match=r"Not a rigid transform[\s\S]*episode 4, frame 2[\s\S]*1 of 5"):
+        CameraPose.from_camera_to_base(recorded, axes="opencv", where="episode 4")
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"wrong shape[\s\S]*\(3, 4\)"):
+        CameraPose.from_camera_to_base(np.eye(4)[:3], axes="opencv", where="head")
+
+
+def test_the_nearest_rotation_is_a_rotation_and_the_nearest() -> None:
+    rng = np.random.default_rng(2)
+    noisy = poses(40)[:, :3, :3] + 0.2 * rng.normal(size=(40, 3, 3))
+    found = nearest_rotation(noisy)
+    assert rotation_deviation(found).max() < 1e-13
+    best = np.linalg.norm(found - noisy, axis=(1, 2))
+    for seed in range(20):  # turning it any way only leads further away
+        turn = Rotation.from_rotvec(0.05 * np.random.default_rng(seed).normal(size=3)).as_matrix()
+        assert (np.linalg.norm(found @ turn - noisy, axis=(1, 2)) > best).all()
+
+
+def test_the_mean_pose_is_that_of_scipy() -> None:
+    scattered = (
+        poses(1)[:, :3, :3] @ Rotation.from_rotvec(0.2 * np.random.default_rng(3).normal(size=(30, 3))).as_matrix()
+    )
+    many = np.tile(np.eye(4), (30, 1, 1))
+    many[:, :3, :3] = scattered
+    np.testing.assert_allclose(mean_pose(many)[:3, :3], Rotation.from_matrix(scattered).mean().as_matrix(), atol=1e-12)
