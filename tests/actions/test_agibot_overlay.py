@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.overlay import contact_sheet, overlay_frames
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.data.curate import CurateConfig, curate
 from worldline_core.data.episode import VIEWS
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.exports.overlays import ARM_COLOURS, OverlayStyle, draw_overlay
 
 # Tool centres at frame 0, read off overlay_sample_0.png, overlay_sample_1.png and overlay_demo_000.png (circles; in
 # pixels of the recorded frames, sheet scale undone): view, arm, (u, v). To within the reading of a drawn circle.
@@ -86,16 +86,15 @@ def test_tool_centres_land_where_the_reference_puts_them(shared_data, name):
 def test_overlay_marks_the_tool_centre(shared_data):
     loaded = load(shared_data, "sample_0")
     tracks, _ = compute_tracks(loaded.episode, None)
-    frames = {view: loaded.frames(view) for view in VIEWS}
-    overlay = overlay_frames(frames, tracks, scale=1)
-    assert overlay.shape == (4, 480, 3 * 640, 3)
-    # The ring of the left arm is yellow in the head view; nothing yellow was there before.
+    frame = loaded.frames("head")[0]
+    drawn = draw_overlay(frame, tracks, 0, "head", tile_height=480, style=OverlayStyle(heat=0.0))
+    assert drawn.shape == frame.shape
+    # The ring of the left arm has its colour around the tool in the head view; nothing had it there before.
     u, v = np.rint(tracks.uv[0, 0, 0]).astype(int)
-    around = (slice(v - 9, v + 10), slice(u - 9, u + 10))
-    yellow = lambda x: ((x[..., 0] > 200) & (x[..., 1] > 150) & (x[..., 2] < 80)).sum()  # noqa: E731
-    assert yellow(overlay[0][around].astype(int)) > 20
-    assert yellow(frames["head"][0][around].astype(int)) == 0
-    assert contact_sheet(overlay, [0, 3], "sample").shape == (22 + 2 * 480, 3 * 640, 3)
+    around = (slice(v - 26, v + 27), slice(u - 26, u + 27))
+    coloured = lambda x: (np.abs(x[around].astype(int) - ARM_COLOURS["left"]).max(axis=-1) < 40).sum()  # noqa: E731
+    assert coloured(drawn) > 50
+    assert coloured(frame) == 0
 
 
 def test_curated_and_resized_samples_keep_their_projections(shared_data, tmp_path):

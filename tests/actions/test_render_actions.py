@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.data.episode import CameraTrack, Episode
@@ -59,7 +60,7 @@ def episode_set(tmp_path_factory) -> Path:
     return root
 
 
-CONFIG = RenderActionsConfig(previews=2, preview_scale=2, preview_rows=2, episodes_per_shard=2)
+CONFIG = RenderActionsConfig(previews=2, preview_height=128, preview_rows=2, episodes_per_shard=2)
 
 
 def digests(root: Path) -> dict[str, str]:
@@ -86,6 +87,9 @@ def test_every_episode_is_kept_or_quarantined(rendered):
     causes = ("valid", "behind_camera", "outside_image", "invalid_calibration")
     assert sum(samples[cause] for cause in causes) == samples["samples"] == N * (2 * 6 + 2)
     assert samples["valid"] > 0
+    assert samples["episodes"] == 3
+    assert samples["gripper_overshoot"].keys() == {"left", "right"}
+    assert summary["by_embodiment"]["so101"]["samples"] == N * 2
     assert summary["camera_motion"] == {
         "head": {"static": 3},
         "left_wrist": {"absent": 1, "kinematics": 2},
@@ -104,6 +108,11 @@ def test_stored_tracks_are_those_computed(rendered):
     assert tracks.image_size == (64, 96)
     assert tracks.arms == ("left", "right")
     assert tracks.valid.dtype == bool
+    assert tracks.uv.dtype == np.float64
+    assert tracks.depth.dtype == tracks.rot6d.dtype == tracks.capsules.dtype == np.float32
+    computed, _ = compute_tracks(episode, kinematics)
+    for name in ("uv", "depth", "rot6d", "gripper", "valid", "capsules"):
+        np.testing.assert_array_equal(getattr(tracks, name), getattr(computed, name))
     assert tracks.capsules.shape[0] == N
 
 

@@ -61,7 +61,11 @@ def render_action_maps(
     ref: tuple[int, int] = REFERENCE_CANVAS,
     dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "b v 9 t h w"]:
-    """Render the maps of every frame of the batch; the arms are added.
+    """Render the maps of every frame of the batch; the arms are added, beyond 1 where they overlap.
+
+    A sample that is not valid leaves exact zeros whatever it holds. A valid one near the border keeps the part of its
+    Gaussian that lies inside. Float32 maps equal the equation to 1e-6 (for values up to 8: it is their rounding),
+    float64 ones to 1e-12.
 
     The Gaussian is a product of a row and a column profile, so the cost is that of one small matrix product a frame
     and view. Differentiable in uv, depth, rot6d and gripper; runs on the device of the tracks. The profiles are

@@ -8,7 +8,6 @@ are used, and the tracks say so (`camera_motion`).
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Literal
 
 import numpy as np
@@ -16,22 +15,30 @@ import torch
 from torch import Tensor
 
 from worldline_core.actions.episode_tracks import (
-    CAUSES,
     HEAD_VIEW,
     EpisodeTracks,
     TrackBatch,
     WristProjection,
     collate_tracks,
-    project_tools,
 )
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
+from worldline_core.actions.tool_projection import project_tools
+from worldline_core.actions.track_counts import TrackCounts, count_samples
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.data.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.se3 import invert
+from worldline_core.geometry.se3 import invert, is_rigid
 
-__all__ = ["ActionTracks", "EpisodeTracks", "TrackBatch", "WristProjection", "collate_tracks", "compute_tracks"]
+__all__ = [
+    "ActionTracks",
+    "EpisodeTracks",
+    "TrackBatch",
+    "TrackCounts",
+    "WristProjection",
+    "collate_tracks",
+    "compute_tracks",
+]
 
 Controls = Literal["action", "state"]
 Fallback = Literal["recorded", "first_frame_mount"]
@@ -43,29 +50,29 @@ def compute_tracks(
     *,
     controls: Controls = "action",
     without_mount: Fallback = "recorded",
-) -> tuple[EpisodeTracks, dict[str, int]]:
+) -> tuple[EpisodeTracks, TrackCounts]:
     """Tracks of every frame, view and arm of an episode, and counts of what was masked or clipped.
+
+    An unusable camera (a singular K, a pose that is not rigid) masks the samples of its view and is counted; controls
+    that are not finite refuse the episode, whether they are joints or recorded tool poses.
 
     Args:
         kinematics: of the episode's embodiment; not needed where the source records tool poses.
         controls: whether commands or measured joints are projected.
         without_mount: what a moving wrist camera without a known mount follows.
 
-    Returns:
-        Tracks, and counts: samples, valid, behind_camera, outside_image, invalid_calibration, gripper_clipped,
-        outside_joint_limits.
-
     Raises:
         CalibrationError: the episode has no camera at all.
-        DataError: its joints do not fit the embodiment, are not finite, or its cameras differ in image size.
+        DataError: its joints do not fit the embodiment or are not finite; its recorded tool poses are not rigid or
+            lack openings; its cameras differ in image size.
     """
     where = f"episode {episode.episode_id}"
     image_size = _image_size(episode, where)
-    counts: Counter[str] = Counter()
+    outside_limits = 0
     wrist_cameras: dict[str, Tensor] = {}
     if episode.T_base_ee is not None:
-        T_base_tool = torch.from_numpy(np.asarray(episode.T_base_ee, dtype=np.float64))
-        gripper = _recorded_gripper(episode, where)
+        T_base_tool = _recorded_tools(episode.T_base_ee, where)
+        gripper = _recorded_gripper(episode.gripper, T_base_tool.shape[:2], where)
         capsules, radii = tool_capsules(T_base_tool)
         kind = "ee_pose"
         arms = ("left", "right") if T_base_tool.shape[1] == 2 else tuple(f"arm{i}" for i in range(T_base_tool.shape[1]))
@@ -76,7 +83,7 @@ def compute_tracks(
         T_base_tool, gripper = kinematics.tools_of(links), kinematics.gripper(values)
         capsules, radii = robot_capsules(kinematics, links)
         wrist_cameras = kinematics.wrist_cameras_of(links)
-        counts["outside_joint_limits"] = int(kinematics.embodiment.outside_limits(values).sum())
+        outside_limits = int(kinematics.embodiment.outside_limits(values).sum())
         kind = controls
         arms = tuple(arm.name for arm in kinematics.embodiment.arms)
     else:
@@ -86,14 +93,11 @@ def compute_tracks(
             expected="an embodiment file, or recorded tool poses",
             got="neither",
         )
-    counts["gripper_clipped"] = int(((gripper < 0) | (gripper > 1)).sum())
     cameras, motion = _camera_poses(episode, T_base_tool, arms, wrist_cameras, without_mount)
     K = torch.stack([_intrinsics(episode, view) for view in VIEWS])
     seen = project_tools(T_base_tool, gripper, K, cameras, image_size)
-    present = torch.tensor([view in episode.cameras for view in VIEWS])
-    for number, cause in enumerate(CAUSES):
-        counts[cause] = int((seen.cause[:, present] == number).sum())
-    counts["samples"] = int(seen.cause[:, present].numel())
+    present = [number for number, view in enumerate(VIEWS) if view in episode.cameras]
+    counts = count_samples(seen.cause[:, present], gripper, arms, outside_limits)
     tracks = EpisodeTracks(
         episode_id=episode.episode_id,
         embodiment=episode.embodiment,
@@ -102,8 +106,9 @@ def compute_tracks(
         image_size=image_size,
         controls=kind,
         camera_motion=motion,
+        uv=seen.uv.numpy(),
         valid=seen.valid.numpy(),
-        **{name: getattr(seen, name).float().numpy() for name in ("uv", "depth", "rot6d", "gripper")},
+        **{name: getattr(seen, name).float().numpy() for name in ("depth", "rot6d", "gripper")},
         **{
             name: torch.nan_to_num(value).float().numpy()
             for name, value in (
@@ -115,7 +120,7 @@ def compute_tracks(
             )
         },
     )
-    return tracks, dict(counts)
+    return tracks, counts
 
 
 def _image_size(episode: Episode, where: str) -> tuple[int, int]:
@@ -131,12 +136,38 @@ def _image_size(episode: Episode, where: str) -> tuple[int, int]:
     return sizes.pop()
 
 
-def _recorded_gripper(episode: Episode, where: str) -> Tensor:
-    if episode.gripper is None:
+def _recorded_tools(recorded: np.ndarray, where: str) -> Tensor:
+    poses = torch.from_numpy(np.asarray(recorded, dtype=np.float64))
+    bad = torch.nonzero(~is_rigid(poses))
+    if len(bad):
+        frame, arm = bad[0].tolist()
         raise DataError(
-            "Tool poses without gripper openings", where=where, expected="gripper (N, A), 0 closed .. 1 open"
+            "Recorded tool poses are not finite, or not rigid transforms",
+            where=f"{where}, frame {frame}, arm {arm}",
+            expected="R R^T = I, det R = 1, last row 0 0 0 1",
+            got=f"{len(bad)} bad, the first {poses[frame, arm].tolist()}",
         )
-    return torch.from_numpy(np.asarray(episode.gripper, dtype=np.float64))
+    return poses
+
+
+def _recorded_gripper(recorded: np.ndarray | None, shape: tuple[int, ...], where: str) -> Tensor:
+    opening = None if recorded is None else np.asarray(recorded, dtype=np.float64)
+    if opening is None or opening.shape != shape:
+        raise DataError(
+            "Tool poses without gripper openings",
+            where=where,
+            expected=f"gripper {tuple(shape)} (frames, arms), 0 closed .. 1 open",
+            got=None if opening is None else opening.shape,
+        )
+    if not np.isfinite(opening).all():
+        frame, arm = np.argwhere(~np.isfinite(opening))[0]
+        raise DataError(
+            "Gripper openings are not finite",
+            where=f"{where}, frame {frame}, arm {arm}",
+            expected="0 closed .. 1 open",
+            got=float(opening[frame, arm]),
+        )
+    return torch.from_numpy(opening)
 
 
 def _intrinsics(episode: Episode, view: str) -> Tensor:

@@ -2,10 +2,7 @@
 
 Axis legend: n frames, v views, a arms, s capsules. Frames of reference: base, tool (between the fingertips, +z out
 of the gripper), camera (OpenCV axes). Units: metres, pixels of the recorded frame size (centre of the first pixel
-is 0), gripper opening 0 closed .. 1 open.
-
-A sample is masked, and counted by its cause, when the tool is behind the camera, outside of the image, or when the
-calibration of the view is invalid (method, section 2).
+is 0), gripper opening 0 closed .. 1 open. Which samples are valid is decided in `tool_projection`.
 """
 
 from __future__ import annotations
@@ -16,82 +13,32 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from worldline_core.actions.tool_projection import CAUSES, Projection, project_tools
 from worldline_core.errors import DataError
-from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, valid_intrinsics
-from worldline_core.geometry.rot6d import rot6d_from_rotation
-from worldline_core.geometry.se3 import invert, is_rigid
+
+__all__ = [
+    "CAUSES",
+    "HEAD_VIEW",
+    "EpisodeTracks",
+    "Projection",
+    "TrackBatch",
+    "WristProjection",
+    "collate_tracks",
+    "project_tools",
+]
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
-CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
-"""What `Projection.cause` counts; 0 is valid."""
 HEAD_VIEW = "head"
 
 
 @dataclass(frozen=True)
-class Projection:
-    """End-effectors seen by cameras. Where `valid` is false, depth, rot6d and gripper still hold what is known, or 0."""
-
-    uv: Float[Tensor, "*n v a 2"]
-    depth: Float[Tensor, "*n v a"]
-    rot6d: Float[Tensor, "*n v a 6"]
-    gripper: Float[Tensor, "*n v a"]
-    valid: Bool[Tensor, "*n v a"]
-    cause: Int[Tensor, "*n v a"]
-
-
-def project_tools(
-    T_base_tool: Float[Tensor, "*n a 4 4"],
-    gripper: Float[Tensor, "*n a"],
-    K: Float[Tensor, "*#n v 3 3"],
-    T_base_camera: Float[Tensor, "*#n v 4 4"],
-    image_size: tuple[int, int],
-) -> Projection:
-    """Project every arm's tool into every view, in float64.
-
-    d is the depth of the tool in the camera, r its orientation in the camera frame (Rot6D), g the gripper opening,
-    clipped to 0..1.
-
-    Args:
-        K: pixels at image_size.
-        T_base_camera: maps camera points to base.
-        image_size: (height, width).
-    """
-    cameras = T_base_camera.double()
-    calibrated = valid_intrinsics(K.double()) & is_rigid(cameras)
-    tools = T_base_tool.double()[..., None, :, :, :]
-    known = calibrated[..., None] & torch.isfinite(tools).all(-1).all(-1)
-    eye = torch.eye(4, dtype=torch.float64, device=tools.device)
-    cameras = torch.where(calibrated[..., None, None], cameras, eye)
-    intrinsics = torch.where(calibrated[..., None, None], K.double(), eye[:3, :3])
-    T_camera_tool = invert(cameras)[..., :, None, :, :] @ torch.where(known[..., None, None], tools, eye)
-    position = T_camera_tool[..., :3, 3]
-    depth = position[..., 2]
-    in_front = depth > MIN_DEPTH_M
-    plane = position / torch.where(in_front, depth, torch.ones_like(depth))[..., None]
-    uv = (intrinsics[..., :, None, :2, :] @ plane[..., None])[..., 0]
-    visible = inside_image(uv, image_size)
-    uv = torch.where((known & in_front)[..., None], uv, torch.zeros_like(uv))
-    opening = gripper.double()[..., None, :].expand(depth.shape)
-    cause = torch.where(visible, 0, 2)
-    cause = torch.where(in_front, cause, 1)
-    cause = torch.where(known & torch.isfinite(opening), cause, 3)
-    rot6d = rot6d_from_rotation(T_camera_tool[..., :3, :3])
-    return Projection(
-        uv=uv,
-        depth=torch.where(known, depth, torch.zeros_like(depth)),
-        rot6d=torch.where(known[..., None], rot6d, torch.zeros_like(rot6d)),
-        gripper=torch.nan_to_num(opening).clamp(0.0, 1.0),
-        valid=cause == 0,
-        cause=cause,
-    )
-
-
-@dataclass(frozen=True)
 class EpisodeTracks:
-    """Tracks of one episode (or of a clip of it), numpy, float32.
+    """Tracks of one episode (or of a clip of it), numpy: float32, but uv float64.
+
+    A float32 pixel of a frame 640 wide is off by up to 3e-5 px, which alone moves a map at 30 x 40 by 1.5e-6.
 
     Attributes:
         views: always the three of the project, in their order; a view that the episode lacks is never valid.
@@ -137,7 +84,8 @@ class EpisodeTracks:
 
         With `clip_start_camera`, wrist views are projected into the camera's pose at frame `start` (default: the
         first of `frames`): a wrist camera sees its own gripper at a constant pixel, so only so does that arm's map
-        in that view carry motion. Head tracks and stored camera poses are unchanged.
+        in that view carry motion. Head tracks and stored camera poses are unchanged. The poses are stored in
+        float32, so these pixels are good to about 1e-4 px in a frame 640 wide.
 
         Raises: DataError for a frame outside of the episode.
         """

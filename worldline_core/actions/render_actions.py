@@ -8,25 +8,26 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
-import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.overlay import contact_sheet, overlay_frames
+from worldline_core.actions.track_counts import TrackCounts, add_counts
 from worldline_core.actions.tracks import ActionTracks, shard_name, write_index, write_shard
 from worldline_core.config import StrictModel
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.video import encode_video
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.exports.contact_sheet import evenly_spaced
+from worldline_core.exports.overlay_views import overlay_sheet, write_overlay_video
+from worldline_core.exports.overlays import OverlayStyle
+from worldline_core.exports.pictures import png_bytes
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 
 class RenderActionsConfig(StrictModel):
@@ -36,6 +37,7 @@ class RenderActionsConfig(StrictModel):
         source: `action` projects the commands (what a simulator is driven by), `state` the measured joints.
         without_mount: what wrist cameras without a known mount follow.
         description_paths: by embodiment, a kinematic description that is the user's own file.
+        preview_height: of one view in the previews, pixels; small frames are enlarged by a whole factor up to it.
         sigma_px_ref: of the heat in the previews, pixels on the 384 x 512 reference canvas.
     """
 
@@ -43,7 +45,7 @@ class RenderActionsConfig(StrictModel):
     without_mount: Literal["recorded", "first_frame_mount"] = "recorded"
     description_paths: dict[str, str] = Field(default_factory=dict)
     previews: int = Field(3, ge=0)
-    preview_scale: int = Field(2, ge=1, le=8)
+    preview_height: int = Field(256, ge=32)
     preview_rows: int = Field(4, ge=1)
     sigma_px_ref: float = Field(SIGMA_PX_REFERENCE, gt=0)
     episodes_per_shard: int = Field(256, ge=1)
@@ -56,7 +58,8 @@ def render_actions(config: RenderActionsConfig, inputs: Mapping[str, Path], outp
     work continues at the first shard that is not written.
 
     Returns:
-        Counts: episodes found, with tracks, quarantined; samples, and masked ones by cause; by embodiment too.
+        Counts: episodes found, with tracks, quarantined; samples, masked ones by cause, and gripper overshoot by arm
+        (`TrackCounts`), of all episodes and by embodiment.
 
     Raises:
         ConfigError: no input `episodes`.
@@ -67,25 +70,24 @@ def render_actions(config: RenderActionsConfig, inputs: Mapping[str, Path], outp
     kinematics = _KinematicsByName(config)
     rows: list[dict[str, Any]] = []
     rejected: list[QuarantineRow] = []
-    counts: Counter[str] = Counter()
-    by_embodiment: dict[str, Counter[str]] = {}
+    counts: dict[str, list[TrackCounts]] = {}
     for number, start in enumerate(tqdm(range(0, len(episodes), config.episodes_per_shard), "tracks", disable=None)):
         positions = range(start, min(start + config.episodes_per_shard, len(episodes)))
         shard = _shard(config, episodes, positions, number, kinematics, output)
         rows += shard["rows"]
         rejected += [QuarantineRow(**row) for row in shard["rejected"]]
         for embodiment, numbers in shard["counts"].items():
-            counts.update(numbers)
-            by_embodiment.setdefault(embodiment, Counter()).update(numbers)
+            counts.setdefault(embodiment, []).append(numbers)
     write_index(output, rows)
     write_quarantine(output, rejected)
     _previews(config, episodes, ActionTracks.open(output), output)
+    by_embodiment = {name: add_counts(parts) for name, parts in sorted(counts.items())}
     summary = {
         "found": len(episodes),
         "kept": len(rows),
         "quarantined": len(rejected),
-        "samples": dict(sorted(counts.items())),
-        "by_embodiment": {name: dict(sorted(numbers.items())) for name, numbers in sorted(by_embodiment.items())},
+        "samples": add_counts(list(by_embodiment.values())),
+        "by_embodiment": by_embodiment,
         "camera_motion": _camera_motion(rows),
         "quarantine_reasons": dict(sorted(Counter(row.reason for row in rejected).items())),
     }
@@ -135,7 +137,7 @@ def _shard(
         return json.loads(done.read_text(encoding="utf-8"))
     tracks: list[EpisodeTracks] = []
     rejected: list[dict[str, str]] = []
-    counts: dict[str, Counter[str]] = {}
+    counts: dict[str, list[TrackCounts]] = {}
     for position in positions:
         row = episodes.rows[position]
         try:
@@ -157,9 +159,9 @@ def _shard(
             )
             continue
         tracks.append(computed)
-        counts.setdefault(episode.embodiment, Counter()).update({**numbers, "episodes": 1})
+        counts.setdefault(episode.embodiment, []).append(numbers)
     rows = write_shard(output, number, tracks)
-    result = {"rows": rows, "rejected": rejected, "counts": {name: dict(c) for name, c in counts.items()}}
+    result = {"rows": rows, "rejected": rejected, "counts": {name: add_counts(c) for name, c in counts.items()}}
     write_json_atomic(done, result)
     return result
 
@@ -196,19 +198,11 @@ def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionT
         if sheet_path.is_file() and video_path.is_file():
             continue
         frames = {view: episodes.frames(position, view) for view in row.views}
-        overlay = overlay_frames(
-            frames, tracks.tracks(row.episode_id), scale=config.preview_scale, sigma_px_ref=config.sigma_px_ref
-        )
-        moments = np.unique(np.linspace(0, len(overlay) - 1, config.preview_rows).round().astype(int)).tolist()
-        sheet = contact_sheet(overlay, moments, f"{row.episode_id}  {row.embodiment}  {row.instruction}")
-        with atomic_path(video_path) as temporary:
-            encode_video(
-                temporary,
-                overlay[:, : overlay.shape[1] // 2 * 2, : overlay.shape[2] // 2 * 2],
-                row.fps,
-                preset="veryfast",
-            )
-        encoded, png = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
-        if not encoded:
-            raise DataError("Contact sheet cannot be encoded", where=row.episode_id, got=str(sheet.shape))
-        write_bytes_atomic(sheet_path, png.tobytes())
+        found, height = tracks.tracks(row.episode_id), config.preview_height
+        style, title = OverlayStyle(config.sigma_px_ref), f"{row.embodiment}  ·  {row.instruction}"
+        write_overlay_video(video_path, frames, found, row.fps, tile_height=height, style=style, title=title)
+        moments = evenly_spaced(min(found.num_frames, row.video_frames), config.preview_rows)
+        chosen = {view: images[moments] for view, images in frames.items()}
+        title = f"{row.episode_id}  ·  {title}"
+        sheet = overlay_sheet(chosen, found, moments, tile_height=height, style=style, title=title)
+        write_bytes_atomic(sheet_path, png_bytes(sheet))

@@ -43,12 +43,13 @@ def robot_capsules(
     tools = kinematics.tools_of(links)
     parents = kinematics.link_parents
     roots = {kinematics.embodiment.base_link, *(name for name in kinematics.links if name not in parents)}
-    segments: list[Tensor] = []
+    # Pairs of points, gathered in one copy at the end: a stack for each capsule costs more than the kinematics.
+    ends: list[Tensor] = []
     radii: list[float] = []
     for index, arm in enumerate(kinematics.embodiment.arms):
         link = arm.end_effector_link
         while link in parents and parents[link] not in roots:
-            segments.append(torch.stack([links[parents[link]][:, :3, 3], links[link][:, :3, 3]], dim=1))
+            ends += [links[parents[link]][:, :3, 3], links[link][:, :3, 3]]
             radii.append(arm.link_radius)
             link = parents[link]
         hand, tool = links[arm.end_effector_link][:, :3, 3], tools[:, index, :3, 3]
@@ -58,18 +59,19 @@ def robot_capsules(
         tips = [name for name in branches if name not in parents.values()]
         if len(tips) < 2:
             # Between two fingers there is air, or the object; a hand without them is drawn up to the tool.
-            segments.append(torch.stack([hand, tool], dim=1))
+            ends += [hand, tool]
             radii.append(hand_radius)
         for name in branches:
             origin = links[name][:, :3, 3]
-            segments.append(torch.stack([links[parents[name]][:, :3, 3], origin], dim=1))
+            ends += [links[parents[name]][:, :3, 3], origin]
             radii.append(hand_radius)
             if name in tips:
                 # A finger's link lies at its root: its tip is as far along the tool's axis as the tool centre.
                 reach = ((tool - origin) * tool_z).sum(-1, keepdim=True)
-                segments.append(torch.stack([origin, origin + reach * tool_z], dim=1))
+                ends += [origin, origin + reach * tool_z]
                 radii.append(arm.gripper_radius)
-    return torch.stack(segments, dim=1), torch.tensor(radii, dtype=torch.float64)
+    capsules = rearrange(torch.stack(ends, dim=1), "n (s ends) xyz -> n s ends xyz", ends=2)
+    return capsules, torch.tensor(radii, dtype=torch.float64)
 
 
 def _below(link: str, parents: dict[str, str]) -> list[str]:

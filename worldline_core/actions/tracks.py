@@ -24,6 +24,8 @@ INDEX_FILE = "index.parquet"
 ARRAYS = (
     "uv", "depth", "rot6d", "gripper", "valid", "T_base_tool", "T_base_camera", "K", "capsules", "capsule_radii",
 )  # fmt: skip
+_DTYPES = {"valid": np.bool_, "uv": np.float64}
+"""Of the arrays that are not float32."""
 _SCHEMA = pa.schema(
     [
         ("episode_id", pa.string()),
@@ -52,8 +54,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
     for episode in tracks:
         for name in ARRAYS:
             value = getattr(episode, name)
-            kind = np.bool_ if name == "valid" else np.float32
-            arrays[f"{episode.episode_id}/{name}"] = np.ascontiguousarray(value, dtype=kind)
+            arrays[f"{episode.episode_id}/{name}"] = np.ascontiguousarray(value, dtype=_DTYPES.get(name, np.float32))
         rows.append(
             {
                 "episode_id": episode.episode_id,

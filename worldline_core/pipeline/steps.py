@@ -32,6 +32,8 @@ class Step:
     inputs: tuple[str, ...]
     optional_inputs: tuple[str, ...] = ()
     summary: str = ""
+    distributed: bool = False
+    """Whether the processes that torchrun starts share its work."""
 
     def load_function(self) -> StepFunction:
         return getattr(importlib.import_module(self.module), self.function)
@@ -71,7 +73,7 @@ _STEPS = (
     ),
     Step(
         "filter",
-        1,
+        2,
         "worldline_core.filters.filter",
         "filter_episodes",
         "FilterConfig",
@@ -80,7 +82,7 @@ _STEPS = (
     ),
     Step(
         "render_actions",
-        1,
+        2,
         "worldline_core.actions.render_actions",
         "render_actions",
         "RenderActionsConfig",
@@ -142,6 +144,7 @@ _STEPS = (
         ("latents", "episodes"),
         ("base",),
         summary="Stage I: action-free, text-conditioned video prediction",
+        distributed=True,
     ),
     Step(
         "train_stage2",
@@ -152,6 +155,7 @@ _STEPS = (
         ("latents", "tracks", "episodes", "stage1"),
         ("teacher",),
         summary="Stage II: action-driven three-view prediction on successes and failures",
+        distributed=True,
     ),
     Step(
         "distill",
@@ -161,6 +165,7 @@ _STEPS = (
         "DistillConfig",
         ("latents", "tracks", "episodes", "stage2", "tokenizer"),
         summary="Stage III: teacher forcing, trajectory regression, distribution matching",
+        distributed=True,
     ),
     Step(
         "rollout",
@@ -204,7 +209,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        1,
+        2,
         "worldline_core.report.report",
         "report",
         "ReportConfig",
@@ -227,4 +232,11 @@ def run_step(store: ArtifactStore, name: str, config: StrictModel, inputs: Mappi
     """Run one step on the store (or find its finished artifact)."""
     step = get_step(name)
     step.check_inputs(inputs)
-    return store.run(step.name, step.version, lambda c, i, o: step.load_function()(c, i, o), config, inputs)
+    return store.run(
+        step.name,
+        step.version,
+        lambda c, i, o: step.load_function()(c, i, o),
+        config,
+        inputs,
+        distributed=step.distributed,
+    )

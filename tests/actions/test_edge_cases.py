@@ -1,0 +1,264 @@
+"""Every edge case that docs/action_maps.md names: what is masked, why, and what is left of it in a map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.actions.action_maps import render_action_maps
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.episode_tracks import CAUSES, TrackBatch, collate_tracks, project_tools
+from worldline_core.actions.track_counts import add_counts
+from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import MIN_DEPTH_M
+
+# Powers of two, so that pixels of the border are exact: u = 64 x / z + 47.5, v = 64 y / z + 31.5.
+K = torch.tensor([[64.0, 0, 47.5], [0, 64.0, 31.5], [0, 0, 1.0]], dtype=torch.float64)
+EYE = torch.eye(4, dtype=torch.float64)
+SIZE = (64, 96)
+VALID, BEHIND, OUTSIDE, INVALID = range(4)
+COUNTED = ("valid", "behind_camera", "outside_image", "invalid_calibration")
+
+
+def see(point, *, gripper=0.5, intrinsics=K, camera=EYE):
+    tool = EYE.clone()
+    tool[:3, 3] = torch.tensor(point, dtype=torch.float64)
+    opening = torch.tensor([[gripper]], dtype=torch.float64)
+    return project_tools(tool[None, None], opening, intrinsics[None], camera[None, None], SIZE)
+
+
+def rendered(seen, grid=(8, 12), sigma=36.0):
+    batch = TrackBatch(*(x[None] for x in (seen.uv, seen.depth, seen.rot6d, seen.gripper, seen.valid)))
+    return render_action_maps(batch, SIZE, grid, sigma)[0]
+
+
+@pytest.mark.parametrize(
+    ("point", "cause"),
+    [
+        pytest.param((0.0, 0.0, 1.0), VALID, id="in view"),
+        pytest.param((0.0, 0.0, -1.0), BEHIND, id="behind"),
+        pytest.param((0.0, 0.0, 0.0), BEHIND, id="depth 0"),
+        pytest.param((0.3, 0.1, 0.0), BEHIND, id="on the camera plane, off the axis"),
+        pytest.param((0.0, 0.0, -0.0), BEHIND, id="depth minus 0"),
+        pytest.param((0.0, 0.0, MIN_DEPTH_M), BEHIND, id="exactly at the least depth"),
+        pytest.param((0.0, 0.0, math.nextafter(MIN_DEPTH_M, 1)), VALID, id="just beyond the least depth"),
+        pytest.param((-0.75, 0.0, 1.0), VALID, id="u = -0.5"),
+        pytest.param((math.nextafter(-0.75, -1), 0.0, 1.0), OUTSIDE, id="u just below -0.5"),
+        pytest.param((0.75, 0.0, 1.0), OUTSIDE, id="u = W - 0.5"),
+        pytest.param((0.75 - 1e-12, 0.0, 1.0), VALID, id="u just below W - 0.5"),
+        pytest.param((0.0, -0.5, 1.0), VALID, id="v = -0.5"),
+        pytest.param((0.0, math.nextafter(-0.5, -1), 1.0), OUTSIDE, id="v just below -0.5"),
+        pytest.param((0.0, 0.5, 1.0), OUTSIDE, id="v = H - 0.5"),
+        pytest.param((0.0, 0.5 - 1e-12, 1.0), VALID, id="v just below H - 0.5"),
+        pytest.param((9.0, 9.0, -1.0), BEHIND, id="behind before outside"),
+        pytest.param((math.nan, 0.0, 1.0), INVALID, id="NaN pose"),
+        pytest.param((0.0, 0.0, math.nan), INVALID, id="NaN depth"),
+        pytest.param((math.inf, 0.0, 1.0), INVALID, id="infinite pose"),
+    ],
+)
+def test_cause_of_a_masked_sample(point, cause):
+    seen = see(point)
+    assert CAUSES[int(seen.cause)] == CAUSES[cause]
+    assert bool(seen.valid) == (cause == VALID)
+    for values in (seen.uv, seen.depth, seen.rot6d, seen.gripper):
+        assert torch.isfinite(values).all()
+    maps = rendered(seen)
+    assert bool((maps == 0).all()) == (cause != VALID)
+
+
+def broken(matrix, *entries):
+    copy = matrix.clone()
+    for row, column, value in entries:
+        copy[row, column] = value
+    return copy
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [
+        pytest.param(K * 0, id="zeros"),
+        pytest.param(broken(K, (0, 0, 0.0)), id="no focal length"),
+        pytest.param(broken(K, (1, 1, -64.0)), id="negative focal length"),
+        pytest.param(broken(K, (0, 2, math.nan)), id="NaN"),
+        pytest.param(broken(K, (2, 2, 2.0)), id="last row"),
+        pytest.param(K.mT, id="transposed"),
+    ],
+)
+def test_invalid_intrinsics_mask_their_view(intrinsics):
+    seen = see((0, 0, 1.0), intrinsics=intrinsics)
+    assert int(seen.cause) == INVALID
+    assert (rendered(seen) == 0).all()
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(EYE * 0, id="zeros"),
+        pytest.param(broken(EYE, (0, 0, 1.1)), id="scaled"),
+        pytest.param(broken(EYE, (2, 2, -1.0)), id="mirrored"),
+        pytest.param(broken(EYE, (0, 1, 0.1)), id="sheared"),
+        pytest.param(broken(EYE, (1, 3, math.nan)), id="NaN"),
+        pytest.param(broken(EYE, (3, 2, 1.0)), id="translation in the last row"),
+    ],
+)
+def test_extrinsics_that_are_not_rigid_mask_their_view_alone(camera):
+    tool = EYE.clone()
+    tool[2, 3] = 1.0
+    seen = project_tools(
+        tool.expand(2, 1, 4, 4), torch.full((2, 1), 0.5), torch.stack([K, K]), torch.stack([EYE, camera]), SIZE
+    )
+    assert seen.cause[..., 0].tolist() == [[VALID, INVALID]] * 2
+    maps = rendered(seen)
+    assert (maps[1] == 0).all()
+    assert float(maps[0, 0].max()) > 0.5
+
+
+def test_one_bad_frame_of_a_moving_camera_masks_that_frame():
+    cameras = EYE.expand(4, 1, 4, 4).clone()
+    cameras[2, 0, 0, 0] = math.nan
+    tool = EYE.clone()
+    tool[2, 3] = 1.0
+    seen = project_tools(tool.expand(4, 1, 4, 4), torch.full((4, 1), 0.5), K[None], cameras, SIZE)
+    assert seen.cause.flatten().tolist() == [VALID, VALID, INVALID, VALID]
+
+
+@pytest.mark.parametrize("opening", [math.nan, math.inf, -math.inf])
+def test_opening_that_is_no_number_masks_the_sample(opening):
+    seen = see((0, 0, 1.0), gripper=opening)
+    assert int(seen.cause) == INVALID
+    assert torch.isfinite(seen.gripper).all()
+    assert (rendered(seen) == 0).all()
+
+
+def test_gradient_of_a_masked_sample_is_finite():
+    tools = EYE.expand(1, 4, 4, 4).clone()
+    tools[0, :, 2, 3] = torch.tensor([1.0, 0.0, -1.0, math.nan], dtype=torch.float64)
+    tools.requires_grad_()
+    opening = torch.tensor([[0.5, 0.5, math.nan, 0.5]], dtype=torch.float64, requires_grad=True)
+    # The camera and its matrix serve every tool: an unknown one must not spoil their gradients either.
+    intrinsics, camera = K[None].clone().requires_grad_(), EYE[None, None].clone().requires_grad_()
+    seen = project_tools(tools, opening, intrinsics, camera, SIZE)
+    rendered(seen).sum().backward()
+    for given in (tools, opening, intrinsics, camera):
+        assert given.grad is not None
+        assert torch.isfinite(given.grad).all()
+    assert tools.grad is not None
+    assert (tools.grad[0, 1:] == 0).all()
+    assert (tools.grad[0, 0] != 0).any()
+
+
+def test_arms_at_one_point_add():
+    tool = EYE.clone()
+    tool[2, 3] = 1.0
+    pair = project_tools(tool.expand(1, 2, 4, 4), torch.tensor([[0.25, 0.75]]), K[None], EYE[None, None], SIZE)
+    alone = project_tools(tool.expand(1, 1, 4, 4), torch.tensor([[1.0]]), K[None], EYE[None, None], SIZE)
+    torch.testing.assert_close(rendered(pair)[:, :8], 2 * rendered(alone)[:, :8])
+    # 0.25 + 0.75: the openings add too.
+    torch.testing.assert_close(rendered(pair)[:, 8], rendered(alone)[:, 8])
+
+
+def test_episodes_with_one_arm_and_with_two_share_a_batch(kinematics, episode):
+    tracks, _ = compute_tracks(episode, kinematics)
+    names = ("uv", "depth", "rot6d", "gripper", "valid")
+    single = replace(tracks, arms=("right",), **{name: getattr(tracks, name)[:, :, 1:] for name in names})
+    maps = render_action_maps(collate_tracks([tracks, single]), SIZE, (8, 12), 36.0)
+    alone = render_action_maps(collate_tracks([single]), SIZE, (8, 12), 36.0)
+    torch.testing.assert_close(maps[1], alone[0], atol=1e-7, rtol=0)
+    assert (maps[0] - maps[1]).abs().max() > 0.5
+
+
+def test_missing_view_is_zero_and_has_no_samples(kinematics, episode):
+    cameras = {view: camera for view, camera in episode.cameras.items() if view != "right_wrist"}
+    tracks, counts = compute_tracks(replace(episode, cameras=cameras), kinematics)
+    maps = render_action_maps(collate_tracks([tracks]), SIZE, (8, 12), 36.0)[0]
+    assert (maps[2] == 0).all()
+    assert (maps[:2].flatten(1).abs().amax(1) > 0.5).all()
+    assert counts["samples"] == 2 * 2 * tracks.num_frames
+
+
+def test_gripper_overshoot_is_clipped_and_counted_by_arm(kinematics, episode):
+    action = episode.action.copy()
+    action[:, 3], action[:, 7] = 0.5, 1.0
+    action[1, 3], action[4, 3], action[6, 7] = 1.25, -0.5, 1.0625
+    tracks, counts = compute_tracks(replace(episode, action=action), kinematics)
+    assert tracks.gripper[[1, 4], 0, 0].tolist() == [1.0, 0.0]
+    assert tracks.gripper[6, 0, 1] == 1.0
+    assert tracks.gripper[0, 0].tolist() == [0.5, 1.0]
+    assert counts["gripper_clipped"] == 3
+    assert counts["gripper_overshoot"] == {
+        "left": {"clipped": 2, "largest": 0.5},
+        "right": {"clipped": 1, "largest": 0.0625},
+    }
+
+
+def test_counts_of_episodes_add_and_the_largest_overshoot_stays(kinematics, episode):
+    action = episode.action.copy()
+    action[:, 3] = 3.0
+    first = compute_tracks(episode, kinematics)[1]
+    second = compute_tracks(replace(episode, action=action), kinematics)[1]
+    total = add_counts([first, second])
+    for name in ("samples", "gripper_clipped", "outside_joint_limits", *COUNTED):
+        assert total[name] == first[name] + second[name]
+    assert total["episodes"] == 2
+    assert total["gripper_overshoot"]["left"] == {
+        "clipped": first["gripper_overshoot"]["left"]["clipped"] + len(action),
+        "largest": 2.0,
+    }
+    assert (
+        total["gripper_overshoot"]["right"]["largest"]
+        == first["gripper_overshoot"]["right"]["largest"]
+        == pytest.approx(0.3)
+    )
+
+
+def test_masked_samples_of_an_episode_are_counted_by_cause(kinematics, episode):
+    """A head camera that looks away, and a wrist camera whose matrix is singular."""
+    cameras = dict(episode.cameras)
+    away = cameras["head"].T_base_camera.copy()
+    away[:, :3, 2] *= -1
+    away[:, :3, 0] *= -1
+    cameras["head"] = replace(cameras["head"], T_base_camera=away)
+    cameras["left_wrist"] = replace(cameras["left_wrist"], K=np.zeros((3, 3)))
+    tracks, counts = compute_tracks(replace(episode, cameras=cameras), kinematics)
+    frames = tracks.num_frames
+    assert counts["behind_camera"] >= 2 * frames
+    assert counts["invalid_calibration"] == 2 * frames
+    assert not tracks.valid[:, :2].any()
+    assert tracks.valid[:, 2].any()
+    assert sum(counts[cause] for cause in COUNTED) == counts["samples"] == 6 * frames
+
+
+@pytest.mark.parametrize(("column", "value"), [(0, math.nan), (3, math.inf)])
+def test_recorded_poses_that_are_no_poses_are_refused(kinematics, episode, column, value):
+    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy().copy()
+    poses[5, 1, 0, column] = value
+    recorded = replace(episode, T_base_ee=poses, gripper=np.ones((len(poses), 2)))
+    with pytest.raises(DataError, match=r"not finite, or not rigid[\s\S]*frame 5, arm 1"):
+        compute_tracks(recorded, None)
+
+
+def test_recorded_poses_that_are_scaled_are_refused(kinematics, episode):
+    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy().copy()
+    poses[:, 0, :3, :3] *= 1000.0
+    recorded = replace(episode, T_base_ee=poses, gripper=np.ones((len(poses), 2)))
+    with pytest.raises(DataError, match=r"not rigid[\s\S]*frame 0, arm 0"):
+        compute_tracks(recorded, None)
+
+
+def test_recorded_opening_that_is_no_number_is_refused(kinematics, episode):
+    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
+    gripper = np.ones((len(poses), 2))
+    gripper[3, 0] = math.nan
+    with pytest.raises(DataError, match=r"Gripper openings are not finite[\s\S]*frame 3, arm 0"):
+        compute_tracks(replace(episode, T_base_ee=poses, gripper=gripper), None)
+
+
+@pytest.mark.parametrize("gripper", [None, np.ones((9, 1))])
+def test_recorded_poses_need_an_opening_each(kinematics, episode, gripper):
+    poses = kinematics.tool_poses(episode.state.astype(np.float64)).numpy()
+    with pytest.raises(DataError, match=r"without gripper openings[\s\S]*\(9, 2\)"):
+        compute_tracks(replace(episode, T_base_ee=poses, gripper=gripper), None)
