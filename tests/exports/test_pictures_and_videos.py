@@ -1,4 +1,4 @@
-"""Scaling, labels, sheets, overlays and side-by-side videos."""
+"""Scaling, labels, sheets and side-by-side videos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from worldline_core.data.video import decode_video
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.exports.labels import fit_text, text_strip, text_width_px
-from worldline_core.exports.overlays import draw_action_overlay, enlarged_intrinsics, gaussian, heat_picture
+from worldline_core.exports.overlays import heat_picture
 from worldline_core.exports.pictures import jpeg_bytes, png_bytes, scale_frames, scaled_size
 from worldline_core.exports.side_by_side import GAP_PX, LABEL_HEIGHT_PX, compose_side_by_side, write_side_by_side
 
@@ -85,32 +85,6 @@ def test_side_by_side_video_and_poster(tmp_path: Path) -> None:
     assert cv2.imread(str(made.poster)).shape == frames[0].shape
     again = write_side_by_side(tmp_path / "again.mp4", columns, 8.0, tile_height=64)
     assert again.video.read_bytes() == made.video.read_bytes()
-
-
-def test_heat_lies_where_the_tool_is() -> None:
-    heat = gaussian(np.array([30.0, 20.0]), 64, 96)
-    assert np.unravel_index(heat.argmax(), heat.shape) == (20, 30)
-    assert heat[20, 30] == pytest.approx(1.0)
-    sigma = 10 * 96 / 512
-    assert gaussian(np.array([30.0, 20.0]), 64, 96)[20, 33] == pytest.approx(np.exp(-0.5 * (3 / sigma) ** 2), rel=1e-5)
-
-
-def test_overlay_marks_valid_arms_only() -> None:
-    frame = np.full((64, 96, 3), 90, dtype=np.uint8)
-    uv = np.array([[20.0, 30.0], [70.0, 30.0]])
-    drawn = draw_action_overlay(frame, uv, np.array([True, False]), gripper=np.array([1.0, 0.0]), scale=2)
-    assert drawn.shape == (128, 192, 3)
-    changed = (drawn != 90).any(axis=-1)
-    assert changed[50:72, 30:52].any()
-    assert not changed[:, 100:].any()
-
-
-def test_intrinsics_follow_the_enlargement() -> None:
-    K = np.array([[90.0, 0.0, 47.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]])
-    point = np.array([0.1, -0.2, 0.7])
-    u, v, w = K @ point
-    large = enlarged_intrinsics(K, 4) @ point
-    assert np.allclose(large[:2] / large[2], (np.array([u, v]) / w + 0.5) * 4 - 0.5)
 
 
 def test_signed_channels_have_two_colours() -> None:

@@ -11,45 +11,14 @@ import pytest
 from mcap.reader import make_reader
 from PIL import Image
 
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.mcap_recording import write_mcap_recordings
-from worldline_core.exports.rerun_recording import RecordingContent, TrackSignals, heat_layer, write_rerun_recording
+from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import export_rollout, safe_stem
 
-COUNT, HEIGHT, WIDTH = 5, 32, 48
-
-
-def rotation(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-
-
-def poses(count: int) -> np.ndarray:
-    result = np.tile(np.eye(4), (count, 1, 1))
-    for i in range(count):
-        result[i, :3, :3] = rotation(0.3 + 0.1 * i)
-        result[i, :3, 3] = (0.1 * i, 0.2, 0.3)
-    return result
-
-
-@pytest.fixture(scope="module")
-def content() -> RecordingContent:
-    generator = np.random.default_rng(0)
-    K = np.array([[40.0, 0, 23.5], [0, 41.0, 15.5], [0, 0, 1]])
-    cameras = {v: CameraTrack(v, K, poses(1 if v == "head" else COUNT), WIDTH, HEIGHT) for v in VIEWS}
-    state = generator.random((COUNT, 4)).astype(np.float32)
-    episode = Episode(
-        episode_id="robot/1", source="synthetic", embodiment="ur5e_pair", scene="s", task_family="lift", instruction="lift <it>",
-        outcome="success", split="test", fps=8.0, state=state, action=state + 1, timestamps=np.arange(COUNT) / 8.0, cameras=cameras,
-        state_names=("left/a", "left/gripper", "right/a", "right/gripper"),
-    )  # fmt: skip
-    frames = {v: generator.integers(0, 255, (COUNT, HEIGHT, WIDTH, 3), dtype=np.uint8) for v in VIEWS}
-    tracks = TrackSignals(
-        uv=np.full((COUNT, 3, 2, 2), 20.0), valid=np.ones((COUNT, 3, 2), bool), gripper=np.ones((COUNT, 2)),
-        T_base_tool=np.stack([poses(COUNT)] * 2, axis=1), views=VIEWS, arms=("left", "right"),
-    )  # fmt: skip
-    return RecordingContent(episode, frames, {"stage2": frames}, tracks, episode.state_names or ())
+COUNT, HEIGHT = 5, 32
+"""As `conftest` makes the episode."""
 
 
 @pytest.fixture(scope="module")
@@ -101,12 +70,31 @@ def test_rerun_signals_are_named_and_timed(chunks: dict[str, list], content: Rec
     assert [time.total_seconds() for time in times] == pytest.approx([0, 0.125, 0.25, 0.375, 0.5])
 
 
-def test_heat_is_transparent_where_nothing_is() -> None:
-    layer = heat_layer(
-        np.array([[10.0, 10.0], [30.0, 20.0]]), np.array([True, False]), HEIGHT, WIDTH, ("left", "right")
-    )
-    assert layer[10, 10, 3] > 150
-    assert layer[20, 30, 3] == 0
+def test_rerun_overlay_layers_hold_the_valid_tools_only(chunks: dict[str, list], content: RecordingContent) -> None:
+    tracks = content.tracks
+    assert tracks is not None
+    for view in VIEWS:
+        points = column(chunks[f"/world/cameras/{view}/points"], "Points2D:positions")
+        points = [row for row in points if row is not None]
+        assert [len(row) for row in points] == [2, 2, 2, 1, 1]
+        # Rerun counts pixels from the picture's corner.
+        assert np.allclose(points[0], tracks.uv[0, VIEWS.index(view)] + 0.5)
+        strips = [
+            row for row in column(chunks[f"/world/cameras/{view}/axes"], "LineStrips2D:strips") if row is not None
+        ]
+        assert [len(row) for row in strips] == [6, 6, 6, 3, 3]
+        assert np.allclose(strips[4][0][0], points[4][0])
+    radii = [row for row in column(chunks["/world/cameras/head/points"], "Points2D:radii") if row is not None]
+    assert radii[0][0] == pytest.approx(HEIGHT * 0.03)
+
+
+def test_rerun_robot_lies_along_its_capsules(chunks: dict[str, list], content: RecordingContent) -> None:
+    tracks = content.tracks
+    assert tracks is not None
+    strips = column(chunks["/world/robot"], "LineStrips3D:strips")
+    assert len(strips) == COUNT
+    assert np.allclose(strips[2][0], tracks.capsules[2, 0])
+    assert column(chunks["/world/robot"], "LineStrips3D:radii")[0] == pytest.approx([0.01])
 
 
 def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ def contact_sheet(
     column_titles: Sequence[str] = (),
     upscale: Upscale = "lanczos",
     gap_px: int = 4,
+    min_width: int = 0,
 ) -> Picture:
     """Composes labelled rows into one picture.
 
@@ -45,6 +46,7 @@ def contact_sheet(
         tile_height: height of a tile; small frames are enlarged by a whole factor to at most this.
         title: a heading over the sheet.
         column_titles: headings over the columns.
+        min_width: of the sheet, for titles that few tiles have no room for.
 
     Raises:
         ValueError: no rows, or a row without pictures.
@@ -57,6 +59,7 @@ def contact_sheet(
     ]
     margin_px = 12
     width = max(tile.shape[0] * (tile.shape[2] + gap_px) - gap_px for tile in tiles) + 2 * margin_px
+    width = max(width, min_width)
     blocks: list[Picture] = [blank(margin_px, width)]
     if title:
         blocks += [text_strip(title, width, 30, size_px=19)]

@@ -2,10 +2,13 @@
 
 Entities (all poses in the robot's base frame, metres, z up; cameras have OpenCV axes, x right, y down, z forward):
 
-    world/cameras/<view>            camera pose and pinhole (K)
+    world/cameras/<view>            camera pose and pinhole (K), shown as a frustum
     world/cameras/<view>/true       recorded frames
-    world/cameras/<view>/actions    heat of the action maps over the frames
+    world/cameras/<view>/actions    heat of the action maps, a transparent image over the frames
+    world/cameras/<view>/points     projected tools, the wider the further the gripper is open; only valid ones
+    world/cameras/<view>/axes       projected tool axes; only of valid tools
     world/tools/<arm>               tool frame per time step; `world/tool_paths/<arm>`: the whole path
+    world/robot                     the arms as the kinematics place them: one line a part
     predicted/<method>/<view>       predicted frames
     signals/{state,action}/<joint>  joint and gripper values
 
@@ -25,34 +28,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from worldline_core.exports.overlays import arm_colour, gaussian
+from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+from worldline_core.exports.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
 from worldline_core.exports.pictures import jpeg_bytes, png_bytes
+from worldline_core.exports.rerun_blueprint import blueprint
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
     import rerun as rr
-    import rerun.blueprint as rrb
 
+    from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.data.episode import Episode
 
 Clip = NDArray[np.uint8]
 """`n h w 3` RGB frames."""
 
-
-@dataclass(frozen=True)
-class TrackSignals:
-    """What a recording shows of the action tracks.
-
-    uv: `n v a 2`, pixels of the frames; valid: `n v a`; gripper: `n a`; T_base_tool: `n a 4 4` (maps tool points to
-    base, metres); views: the names along axis v; arms: the names along axis a.
-    """
-
-    uv: NDArray[np.floating]
-    valid: NDArray[np.bool_]
-    gripper: NDArray[np.floating]
-    T_base_tool: NDArray[np.floating]
-    views: Sequence[str]
-    arms: Sequence[str]
+FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
+"""Depth at which a frustum ends: wrist cameras are near to what they see."""
+ROBOT_COLOUR = (190, 194, 202)
+ROBOT_LINE_M = 0.01
+FRUSTUM_COLOUR = (220, 222, 228)
 
 
 @dataclass(frozen=True)
@@ -64,8 +59,10 @@ class RecordingContent:
     """View -> frames."""
     predicted_frames: Mapping[str, Mapping[str, Clip]] = field(default_factory=dict)
     """Method -> view -> frames."""
-    tracks: TrackSignals | None = None
+    tracks: EpisodeTracks | None = None
     joint_names: Sequence[str] = ()
+    sigma_px_ref: float = SIGMA_PX_REFERENCE
+    """Of the heat, pixels on the 384 x 512 reference canvas."""
 
 
 def write_rerun_recording(path: Path, content: RecordingContent) -> None:
@@ -81,7 +78,10 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
         log_predictions(stream, content)
         if content.tracks is not None:
             log_tools(stream, content.tracks, content.episode.fps)
-            log_heat(stream, content)
+            log_robot(stream, content.tracks, content.episode.fps)
+            for view, frames in content.true_frames.items():
+                if view in content.tracks.views:
+                    log_overlay(stream, content.tracks, view, frames, content.episode.fps, content.sigma_px_ref)
         log_signals(stream, content)
         log_description(stream, content.episode)
         stream.disconnect()
@@ -124,7 +124,8 @@ def log_cameras(stream: rr.RecordingStream, content: RecordingContent) -> None:
                 image_from_camera=K,
                 resolution=[width, height],
                 camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=0.15,
+                image_plane_distance=FRUSTUM_M["fixed" if len(camera.T_base_camera) == 1 else "moving"],
+                color=FRUSTUM_COLOUR,
             )
             stream.log(entity, pinhole, static=True)
             log_poses(stream, entity, np.asarray(camera.T_base_camera, dtype=np.float64), fps)
@@ -149,7 +150,7 @@ def log_predictions(stream: rr.RecordingStream, content: RecordingContent) -> No
             log_frames(stream, f"predicted/{method}/{view}", frames, content.episode.fps)
 
 
-def log_tools(stream: rr.RecordingStream, tracks: TrackSignals, fps: float) -> None:
+def log_tools(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) -> None:
     """Logs tool frames with axes and the path of each tool."""
     import rerun as rr
 
@@ -163,40 +164,63 @@ def log_tools(stream: rr.RecordingStream, tracks: TrackSignals, fps: float) -> N
         log_poses(stream, f"world/tools/{arm}", poses, fps)
 
 
-def log_heat(stream: rr.RecordingStream, content: RecordingContent) -> None:
-    """Logs the action maps' heat as transparent pictures over the frames."""
+def log_robot(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) -> None:
+    """Logs the axes of the robot's capsules as thin grey lines; a capsule of radius 0 is left out.
+
+    Solid ones would hide the tools and the cameras that sit on the hands.
+    """
     import rerun as rr
 
-    tracks = content.tracks
-    if tracks is None:
+    drawn = np.flatnonzero(tracks.capsule_radii > 0)
+    if len(drawn) == 0:
         return
-    for view_index, view in enumerate(tracks.views):
-        if view not in content.true_frames:
-            continue
-        frames = content.true_frames[view]
-        height, width = frames.shape[1:3]
-        count = min(len(frames), len(tracks.uv))
-        pictures = [
-            png_bytes(heat_layer(tracks.uv[i, view_index], tracks.valid[i, view_index], height, width, tracks.arms))
-            for i in range(count)
-        ]
-        columns = rr.EncodedImage.columns(blob=pictures, media_type=["image/png"] * count, draw_order=[10.0] * count)
-        stream.send_columns(f"world/cameras/{view}/actions", timeline(count, content.episode.fps), columns)
+    count, parts = tracks.num_frames, len(drawn)
+    strips = np.asarray(tracks.capsules[:, drawn], dtype=np.float32).reshape(count * parts, 2, 3)
+    columns = rr.LineStrips3D.columns(
+        strips=list(strips), radii=[ROBOT_LINE_M] * (count * parts), colors=[ROBOT_COLOUR] * (count * parts)
+    )
+    stream.send_columns("world/robot", timeline(count, fps), columns.partition([parts] * count))
 
 
-def heat_layer(
-    uv: NDArray[np.floating], valid: NDArray[np.bool_], height: int, width: int, arms: Sequence[str]
-) -> NDArray[np.uint8]:
-    """Every valid arm's Gaussian as one RGBA picture `h w 4`, transparent where there is no heat."""
-    colour = np.zeros((height, width, 3), dtype=np.float32)
-    alpha = np.zeros((height, width, 1), dtype=np.float32)
-    for arm in range(len(uv)):
-        if valid[arm]:
-            heat = gaussian(uv[arm], height, width)[..., None]
-            colour += heat * np.asarray(arm_colour(arms, arm), dtype=np.float32)
-            alpha += heat
-    shown = np.concatenate([colour / np.maximum(alpha, 1e-6), 200.0 * np.minimum(alpha, 1.0)], axis=-1)
-    return np.clip(shown, 0, 255).astype(np.uint8)
+def log_overlay(
+    stream: rr.RecordingStream, tracks: EpisodeTracks, view: str, frames: Clip, fps: float, sigma_px_ref: float
+) -> None:
+    """Logs what `draw_overlay` draws over a view, as layers that can be shown and hidden one by one."""
+    import rerun as rr
+
+    v, entity = tracks.views.index(view), f"world/cameras/{view}"
+    count, size = min(len(frames), tracks.num_frames), (frames.shape[1], frames.shape[2])
+    pictures = [png_bytes(heat_layer(tracks, n, view, size, sigma_px_ref)) for n in range(count)]
+    heat = rr.EncodedImage.columns(blob=pictures, media_type=["image/png"] * count, draw_order=[10.0] * count)
+    stream.send_columns(f"{entity}/actions", timeline(count, fps), heat)
+    shown = [(n, a) for n in range(count) for a in range(len(tracks.arms)) if tracks.valid[n, v, a]]
+    points = [rerun_pixel(tracks.uv[n, v, a], tracks.image_size, size) for n, a in shown]
+    lengths = [int(tracks.valid[n, v].sum()) for n in range(count)]
+    if points:
+        radii = [size[0] * (0.008 + 0.022 * float(tracks.gripper[n, v, a])) for n, a in shown]
+        colours = [arm_colour(tracks.arms, a) for _, a in shown]
+        marks = rr.Points2D.columns(
+            positions=points, radii=radii, colors=colours, labels=[tracks.arms[a] for _, a in shown]
+        )
+        stream.send_columns(f"{entity}/points", timeline(count, fps), marks.partition(lengths))
+        stream.log(f"{entity}/points", rr.Points2D.from_fields(draw_order=30.0, show_labels=False), static=True)
+        axes: list[list[list[float]]] = []
+        axis_colours: list[tuple[int, int, int]] = []
+        for (n, a), origin in zip(shown, points, strict=True):
+            for tip, colour in zip(axis_tips(tracks, n, v, a), AXIS_COLOURS, strict=True):
+                end = origin if tip is None else rerun_pixel(tip, tracks.image_size, size)
+                axes.append([origin, end])
+                axis_colours.append(colour)
+        strips = rr.LineStrips2D.columns(
+            strips=np.asarray(axes, dtype=np.float32), radii=[size[0] / 200] * len(axes), colors=axis_colours
+        )
+        stream.send_columns(f"{entity}/axes", timeline(count, fps), strips.partition([3 * k for k in lengths]))
+        stream.log(f"{entity}/axes", rr.LineStrips2D.from_fields(draw_order=20.0), static=True)
+
+
+def rerun_pixel(uv: NDArray[np.floating], image_size: tuple[int, int], size: tuple[int, int]) -> list[float]:
+    """A pixel of the tracks in a picture of `size`, counted from the picture's corner as Rerun does."""
+    return (picture_pixel(uv, image_size, size) + 0.5).tolist()
 
 
 def log_signals(stream: rr.RecordingStream, content: RecordingContent) -> None:
@@ -229,29 +253,3 @@ def log_description(stream: rr.RecordingStream, episode: Episode) -> None:
     }
     text = "\n".join(f"{name}: {value}" for name, value in facts.items())
     stream.log("description", rr.TextDocument(text, media_type=rr.MediaType.TEXT), static=True)
-
-
-def blueprint(content: RecordingContent) -> rrb.Blueprint:
-    """Frames of every view (a row a method) beside the 3-D scene, time series below."""
-    import rerun.blueprint as rrb
-
-    rows = [
-        rrb.Horizontal(
-            *[
-                rrb.Spatial2DView(origin=f"world/cameras/{view}", name=f"true, {view.replace('_', ' ')}")
-                for view in content.true_frames
-            ]
-        )
-    ]
-    for method, views in content.predicted_frames.items():
-        names = [(f"predicted/{method}/{view}", f"{method}, {view.replace('_', ' ')}") for view in views]
-        rows.append(rrb.Horizontal(*[rrb.Spatial2DView(origin=origin, name=name) for origin, name in names]))
-    series = rrb.Horizontal(
-        rrb.TimeSeriesView(origin="signals/state", name="state"),
-        rrb.TimeSeriesView(origin="signals/action", name="commands"),
-        rrb.TextDocumentView(origin="description", name="episode"),
-        column_shares=[2, 2, 1],
-    )
-    scene = rrb.Spatial3DView(origin="world", name="scene", contents=["$origin/**", "- $origin/cameras/*/actions"])
-    top = rrb.Horizontal(rrb.Vertical(*rows), scene, column_shares=[3, 2])
-    return rrb.Blueprint(rrb.Vertical(top, series, row_shares=[3, 1]), collapse_panels=True)

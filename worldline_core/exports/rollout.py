@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.data.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.exports.rerun_recording import RecordingContent, TrackSignals, write_rerun_recording
+from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.side_by_side import write_side_by_side
 
 if TYPE_CHECKING:
+    from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.actions.tracks import ActionTracks
     from worldline_core.data.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
@@ -54,7 +56,8 @@ def export_rollout(
             "No prediction of this episode", where=episode_id, expected="an episode of the RolloutSet",
             got=", ".join(sets) or "no RolloutSet", next_step="list what was predicted with `worldline inspect <folder>`",
         )  # fmt: skip
-    content = recording_content(having, episode_set, tracks, episode_id)
+    found = None if tracks is None else tracks.tracks(episode_id)
+    content = recording_content(having, episode_set, found, episode_id)
     stem = name or safe_stem(episode_id)
     output.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
@@ -72,7 +75,12 @@ def export_rollout(
 
 
 def recording_content(
-    rollouts: Mapping[str, RolloutSet], episode_set: EpisodeSet, tracks: ActionTracks | None, episode_id: str
+    rollouts: Mapping[str, RolloutSet],
+    episode_set: EpisodeSet,
+    tracks: EpisodeTracks | None,
+    episode_id: str,
+    *,
+    sigma_px_ref: float = SIGMA_PX_REFERENCE,
 ) -> RecordingContent:
     """Gathers the frames, predictions and tracks of one episode."""
     index = episode_set.position(episode_id)
@@ -83,21 +91,8 @@ def recording_content(
         seed = rollout.seeds(episode_id)[0]
         predicted[method] = {view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views}
     true_frames = {view: np.asarray(episode_set.frames(index, view)) for view in views}
-    signals = None if tracks is None else track_signals(tracks, episode_id)
-    return RecordingContent(episode, true_frames, predicted, signals, episode.state_names or ())
-
-
-def track_signals(tracks: ActionTracks, episode_id: str) -> TrackSignals:
-    """One episode's tracks as the recording shows them."""
-    found = tracks.tracks(episode_id)
-    return TrackSignals(
-        uv=np.asarray(found.uv, dtype=np.float64),
-        valid=np.asarray(found.valid, dtype=bool),
-        gripper=np.asarray(found.gripper[:, 0], dtype=np.float64),
-        T_base_tool=np.asarray(found.T_base_tool, dtype=np.float64),
-        views=found.views,
-        arms=found.arms,
-    )
+    names = episode.state_names or ()
+    return RecordingContent(episode, true_frames, predicted, tracks, names, sigma_px_ref)
 
 
 def write_videos(content: RecordingContent, output: Path, stem: str) -> list[Path]:

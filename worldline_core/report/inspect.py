@@ -1,4 +1,4 @@
-"""Inspection of an artifact: what it is, its counts, and a contact sheet to look at.
+"""Inspection of an artifact: what it is and its counts; and, by `inspect_pictures`, a sheet, a video, a recording.
 
 Works on every kind: EpisodeSet, Quarantine, ActionTracks, Latents, Checkpoint, RolloutSet, Scores, Report.
 """
@@ -10,17 +10,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldline_core.errors import ArtifactError, DataError
+from worldline_core.errors import ArtifactError
 from worldline_core.report.artifacts import read_json, read_rows, read_table
-
-if TYPE_CHECKING:
-    from worldline_core.exports.labels import Picture
-
-SHEET_ROWS = 8
 
 
 @dataclass(frozen=True)
@@ -71,20 +65,34 @@ def kind_of(folder: Path) -> str:
 
 
 def inspect(
-    folder: Path, output: Path | None = None, *, episodes: Path | None = None, rerun: bool = False
+    folder: Path,
+    output: Path | None = None,
+    *,
+    episodes: Path | None = None,
+    episode_id: str | None = None,
+    video: bool = False,
+    rerun: bool = False,
+    page: int | None = None,
 ) -> Inspection:
     """Describes an artifact and writes pictures of it.
 
     Args:
         folder: a finished artifact.
-        output: where `contact_sheet.png` (and `<episode>.rrd`) are written; default: the artifact's own `run/`, which
-            belongs to no digest.
-        episodes: the EpisodeSet that tracks or predictions belong to, for pictures that need the recorded frames.
-        rerun: also write a Rerun recording of the first episode.
+        output: where `contact_sheet.png`, `<episode>.mp4` and `<episode>.rrd` are written; default: the artifact's own
+            `run/`, which belongs to no digest.
+        episodes: the EpisodeSet that tracks or predictions belong to; default: the one that their manifest names.
+        episode_id: the episode to show; default: a sheet of several, and the first one's video and recording.
+        video: also write a video of one episode, all views side by side, with its controls drawn over them.
+        rerun: also write a Rerun recording of one episode.
+        page: also write `page/index.html`, to browse so many episodes (0: all) with their videos.
 
     Raises:
         ArtifactError: the folder is of no known kind.
+        DataError: there is no such episode, or its controls cannot be projected.
+        ConfigError: a picture was asked for of a kind that has none.
     """
+    from worldline_core.report.inspect_pictures import PicturesWanted, write_pictures
+
     kind = kind_of(folder)
     describe: dict[str, Callable[[Path], list[str]]] = {
         "EpisodeSet": describe_episodes,
@@ -97,11 +105,9 @@ def inspect(
         "Report": describe_report,
     }
     lines = [*describe_manifest(folder), *describe[kind](folder)]
-    target = output or folder / "run"
-    written = write_pictures(kind, folder, target, episodes)
-    if rerun:
-        written += write_recording(kind, folder, target, episodes)
-    return Inspection(kind, lines, written)
+    wanted = PicturesWanted(episode_id, video, rerun, page)
+    written, notes = write_pictures(kind, folder, output or folder / "run", episodes, wanted)
+    return Inspection(kind, [*lines, *notes], written)
 
 
 def describe_manifest(folder: Path) -> list[str]:
@@ -188,95 +194,3 @@ def describe_report(folder: Path) -> list[str]:
     """Where to look."""
     media = list((folder / "media").iterdir()) if (folder / "media").is_dir() else []
     return [f"open {folder / 'index.html'} in a browser", f"{len(media)} pictures and videos"]
-
-
-def write_pictures(kind: str, folder: Path, output: Path, episodes: Path | None) -> list[Path]:
-    """The contact sheet of a kind that has pictures."""
-    from worldline_core.exports.pictures import png_bytes
-    from worldline_core.store.atomic import write_bytes_atomic
-
-    makers: dict[str, Callable[[], Picture | None]] = {
-        "EpisodeSet": lambda: episode_sheet(folder),
-        "RolloutSet": lambda: rollout_sheet(folder),
-        "ActionTracks": lambda: None if episodes is None else tracks_sheet(folder, episodes),
-    }
-    picture = makers[kind]() if kind in makers else None
-    if picture is None:
-        return []
-    path = output / "contact_sheet.png"
-    write_bytes_atomic(path, png_bytes(picture))
-    return [path]
-
-
-def episode_sheet(folder: Path) -> Picture | None:
-    """Six moments of up to eight episodes, spread over embodiments and tasks."""
-    from worldline_core.data.episode_set import EpisodeSet
-    from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-    from worldline_core.report.sections.data import one_of_each
-
-    episodes = EpisodeSet.open(folder)
-    rows: list[SheetRow] = []
-    for index in one_of_each(read_rows(folder / "index.parquet"), SHEET_ROWS):
-        row = episodes.rows[index]
-        try:
-            frames = np.asarray(episodes.frames(index, row.primary_view, evenly_spaced(row.video_frames, 6)))
-        except DataError:
-            continue
-        rows.append(SheetRow(f"{row.embodiment}  ·  {row.instruction}  ·  {row.outcome}", frames, row.episode_id))
-    return contact_sheet(rows) if rows else None
-
-
-def rollout_sheet(folder: Path) -> Picture | None:
-    """Six moments of up to eight predictions, head view first."""
-    from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-    from worldline_core.rollout.rollout_set import RolloutSet
-
-    rollouts = RolloutSet.open(folder)
-    views = {str(row["episode_id"]): str(row["view"]) for row in reversed(read_rows(folder / "index.parquet"))}
-    rows: list[SheetRow] = []
-    for episode_id in evenly_chosen(sorted(rollouts.episode_ids)):
-        frames = np.asarray(rollouts.frames(episode_id, views[episode_id], rollouts.seeds(episode_id)[0]))
-        rows.append(
-            SheetRow(f"{rollouts.method}  ·  {episode_id}", frames[evenly_spaced(len(frames), 6)], views[episode_id])
-        )
-    return contact_sheet(rows) if rows else None
-
-
-def tracks_sheet(folder: Path, episodes_folder: Path) -> Picture | None:
-    """Action maps over the recorded frames of the first episode that both have."""
-    from worldline_core.actions.tracks import ActionTracks
-    from worldline_core.data.episode_set import EpisodeSet
-    from worldline_core.report.sections.actions import overlay_sheet
-
-    tracks, episodes = ActionTracks.open(folder), EpisodeSet.open(episodes_folder)
-    for index, row in enumerate(episodes.rows):
-        if row.episode_id in tracks:
-            return overlay_sheet(episodes, index, tracks.tracks(row.episode_id))
-    return None
-
-
-def evenly_chosen(names: list[str]) -> list[str]:
-    """Up to eight names, spread over the list."""
-    if len(names) <= SHEET_ROWS:
-        return names
-    return [names[round(i)] for i in np.linspace(0, len(names) - 1, SHEET_ROWS)]
-
-
-def write_recording(kind: str, folder: Path, output: Path, episodes_folder: Path | None) -> list[Path]:
-    """A Rerun recording of the first episode of an EpisodeSet, or of the first prediction of a RolloutSet."""
-    from worldline_core.data.episode_set import EpisodeSet
-    from worldline_core.exports.rerun_recording import write_rerun_recording
-    from worldline_core.exports.rollout import recording_content, safe_stem
-    from worldline_core.rollout.rollout_set import RolloutSet
-
-    source = folder if kind == "EpisodeSet" else episodes_folder
-    if source is None or kind not in ("EpisodeSet", "RolloutSet"):
-        return []
-    episodes = EpisodeSet.open(source)
-    rollouts = {} if kind == "EpisodeSet" else {(opened := RolloutSet.open(folder)).method: opened}
-    first = (
-        episodes.rows[0].episode_id if kind == "EpisodeSet" else sorted(next(iter(rollouts.values())).episode_ids)[0]
-    )
-    path = output / f"{safe_stem(first)}.rrd"
-    write_rerun_recording(path, recording_content(rollouts, episodes, None, first))
-    return [path]

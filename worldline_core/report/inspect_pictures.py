@@ -1,0 +1,247 @@
+"""Pictures of an artifact for `worldline inspect`: a sheet, an overlay video, and a Rerun recording of one episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tqdm import tqdm
+
+from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
+from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.exports.labels import Picture
+from worldline_core.exports.pictures import png_bytes
+from worldline_core.report.artifacts import read_json, read_rows
+from worldline_core.report.inspect_sheets import MOMENTS, episode_sheet, rollout_sheet, tracks_sheet
+from worldline_core.store.atomic import write_bytes_atomic
+
+if TYPE_CHECKING:
+    from worldline_core.actions.episode_tracks import EpisodeTracks
+    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.rollout.rollout_set import RolloutSet
+
+PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
+
+
+@dataclass(frozen=True)
+class PicturesWanted:
+    """What was asked for besides the sheet; the episode is the first one unless it is named.
+
+    Attributes:
+        page: how many episodes a page to browse shows; 0 all, None no page.
+    """
+
+    episode_id: str | None = None
+    video: bool = False
+    rerun: bool = False
+    page: int | None = None
+
+
+def write_pictures(
+    kind: str, folder: Path, output: Path, episodes: Path | None, wanted: PicturesWanted
+) -> tuple[list[Path], list[str]]:
+    """Writes what was asked for; returns the files, and notes on what could not be shown.
+
+    Raises:
+        ConfigError: pictures were asked for of a kind that has none.
+        ArtifactError: the EpisodeSet that the artifact belongs to is not known.
+        DataError: there is no such episode, or its controls cannot be projected.
+    """
+    asked = wanted.video or wanted.rerun or wanted.episode_id is not None or wanted.page is not None
+    if kind not in PICTURED:
+        if asked:
+            raise ConfigError("There are no pictures of this kind of artifact", expected=" | ".join(PICTURED), got=kind)
+        return [], []
+    subject = Subject(kind, folder, episodes)
+    moving = wanted.video or wanted.rerun or wanted.page is not None
+    if subject.episodes_folder is None and (kind == "ActionTracks" or moving):
+        if not asked:
+            return [], ["no pictures: the episodes of these tracks are not known (--episodes FOLDER names them)"]
+        raise ArtifactError(
+            "The episodes that this artifact belongs to are not known",
+            where=folder,
+            expected="a manifest that names a folder which is still there",
+            next_step="name the EpisodeSet with --episodes FOLDER",
+        )
+    written: list[Path] = []
+    notes: list[str] = []
+    picture = subject.sheet(wanted.episode_id, notes)
+    if picture is not None:
+        path = output / "contact_sheet.png"
+        write_bytes_atomic(path, png_bytes(picture))
+        written.append(path)
+    if wanted.video:
+        written += subject.write_video(output, wanted.episode_id or subject.first_episode)
+    if wanted.rerun:
+        written.append(subject.write_recording(output, wanted.episode_id or subject.first_episode, notes))
+    if wanted.page is not None:
+        written.append(subject.write_page(output / "page", wanted.page))
+    return written, notes
+
+
+def linked_folder(folder: Path, name: str) -> Path | None:
+    """The folder of an input that an artifact's manifest names, where it is still there.
+
+    Manifests name inputs relative to the root of the artifacts, two folders up.
+    """
+    entry = read_json(folder / "manifest.json").get("inputs", {}).get(name)
+    if not isinstance(entry, dict) or not isinstance(entry.get("path"), str):
+        return None
+    path = folder.resolve().parent.parent / entry["path"]
+    return path if path.is_dir() else None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An artifact with pictures, and the artifacts that it belongs to."""
+
+    kind: str
+    folder: Path
+    given_episodes: Path | None
+
+    @cached_property
+    def episodes_folder(self) -> Path | None:
+        if self.kind == "EpisodeSet":
+            return self.folder
+        return self.given_episodes or linked_folder(self.folder, "episodes")
+
+    @cached_property
+    def episodes(self) -> EpisodeSet:
+        from worldline_core.data.episode_set import EpisodeSet
+
+        if self.episodes_folder is None:
+            raise ArtifactError("The episodes that this artifact belongs to are not known", where=self.folder)
+        return EpisodeSet.open(self.episodes_folder)
+
+    @cached_property
+    def tracks_folder(self) -> Path | None:
+        return self.folder if self.kind == "ActionTracks" else linked_folder(self.folder, "tracks")
+
+    @cached_property
+    def rollouts(self) -> RolloutSet:
+        from worldline_core.rollout.rollout_set import RolloutSet
+
+        return RolloutSet.open(self.folder)
+
+    @cached_property
+    def sigma_px_ref(self) -> float:
+        """Of the heat, as the tracks' own previews were drawn with."""
+        from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+
+        manifest = {} if self.tracks_folder is None else read_json(self.tracks_folder / "manifest.json")
+        return float(manifest.get("config", {}).get("sigma_px_ref", SIGMA_PX_REFERENCE))
+
+    @property
+    def first_episode(self) -> str:
+        """The first episode that the artifact and its EpisodeSet share."""
+        known = [row.episode_id for row in self.episodes.rows]
+        if self.kind == "RolloutSet":
+            known = [name for name in known if name in set(self.rollouts.episode_ids)]
+        elif self.kind == "ActionTracks":
+            having = {str(row["episode_id"]) for row in read_rows(self.folder / "index.parquet")}
+            known = [name for name in known if name in having]
+        if not known:
+            raise DataError("The artifact shares no episode with this EpisodeSet", where=self.episodes.root)
+        return known[0]
+
+    def tracks(self, episode_id: str) -> EpisodeTracks:
+        """Tracks of an episode: those of the artifact, else computed from its commands.
+
+        Raises:
+            DataError, ConfigError, UnavailableError: they cannot be computed.
+        """
+        from worldline_core.actions.action_tracks import compute_tracks
+        from worldline_core.actions.tracks import ActionTracks
+        from worldline_core.geometry.embodiment import load_embodiment
+        from worldline_core.geometry.kinematics import ArmKinematics
+
+        if self.tracks_folder is not None:
+            return ActionTracks.open(self.tracks_folder).tracks(episode_id)
+        episode = self.episodes.episode(self.episodes.position(episode_id))
+        kinematics = None if episode.T_base_ee is not None else ArmKinematics(load_embodiment(episode.embodiment))
+        return compute_tracks(episode, kinematics)[0]
+
+    def sheet(self, episode_id: str | None, notes: list[str]) -> Picture | None:
+        """Moments of one episode with its controls, or of several episodes (of one, for ActionTracks)."""
+        if episode_id is None and self.kind == "EpisodeSet":
+            return episode_sheet(self.episodes)
+        if self.kind == "RolloutSet":
+            return rollout_sheet(self.rollouts, episode_id)
+        chosen = episode_id or self.first_episode
+        position = self.episodes.position(chosen)
+        row = self.episodes.rows[position]
+        try:
+            tracks = self.tracks(chosen)
+        except WorldLineError as error:
+            if self.kind == "ActionTracks":
+                raise
+            notes.append(f"no controls are drawn: {error.what}")
+            moments = evenly_spaced(row.video_frames, MOMENTS)
+            rows = [SheetRow(view, np.asarray(self.episodes.frames(position, view, moments))) for view in row.views]
+            return contact_sheet(rows, title=f"{row.embodiment}  ·  {row.instruction}")
+        return tracks_sheet(self.episodes, position, tracks, self.sigma_px_ref)
+
+    def write_video(self, output: Path, episode_id: str) -> list[Path]:
+        """All views side by side with the controls drawn over them, `<episode>.mp4`; truth beside a prediction."""
+        from worldline_core.exports.rollout import export_rollout, safe_stem
+
+        if self.kind == "RolloutSet":
+            return export_rollout(self.rollouts, self.episodes, None, episode_id, output, ("mp4",))
+        path = output / f"{safe_stem(episode_id)}.mp4"
+        self._write_overlay(path, self.episodes.position(episode_id), self.tracks(episode_id))
+        return [path]
+
+    def write_page(self, output: Path, count: int) -> Path:
+        """`index.html` and an overlay video of each of `count` episodes (0: all), spread over robots and tasks.
+
+        An episode that cannot be shown stays on the page, with the reason.
+        """
+        from worldline_core.exports.rollout import safe_stem
+        from worldline_core.report.dataset_page import EpisodeCard, dataset_page
+        from worldline_core.report.sections.data import one_of_each
+
+        rows = self.episodes.rows
+        index = read_rows(self.episodes.root / "index.parquet")
+        chosen = sorted(one_of_each(index, count)) if count else list(range(len(rows)))
+        cards: list[EpisodeCard] = []
+        for position in tqdm(chosen, "page", unit="episode", disable=None):
+            row = rows[position]
+            path = output / "videos" / f"{safe_stem(row.episode_id)}.mp4"
+            try:
+                if not path.is_file():
+                    self._write_overlay(path, position, self.tracks(row.episode_id))
+                cards.append(EpisodeCard(row, f"videos/{path.name}"))
+            except WorldLineError as error:
+                cards.append(EpisodeCard(row, None, f"{error.what} ({error.where})"))
+        title = f"{len(cards)} of {len(rows)} episodes"
+        subtitle = "Recorded frames with the commanded tools, projected by the recorded calibration."
+        write_bytes_atomic(output / "index.html", dataset_page(title, subtitle, cards).encode())
+        return output / "index.html"
+
+    def _write_overlay(self, path: Path, position: int, tracks: EpisodeTracks) -> None:
+        from worldline_core.exports.overlay_views import write_overlay_video
+        from worldline_core.exports.overlays import OverlayStyle
+
+        row = self.episodes.rows[position]
+        frames = {view: np.asarray(self.episodes.frames(position, view)) for view in row.views}
+        title = f"{row.embodiment}  ·  {row.instruction}"
+        write_overlay_video(path, frames, tracks, row.fps, style=OverlayStyle(self.sigma_px_ref), title=title)
+
+    def write_recording(self, output: Path, episode_id: str, notes: list[str]) -> Path:
+        """A Rerun recording: frames, controls, cameras, signals, and predictions where the artifact has them."""
+        from worldline_core.exports.rerun_recording import write_rerun_recording
+        from worldline_core.exports.rollout import recording_content, safe_stem
+
+        tracks = None
+        try:
+            tracks = self.tracks(episode_id)
+        except WorldLineError as error:
+            notes.append(f"the recording has no controls in 3-D: {error.what}")
+        rollouts = {self.rollouts.method: self.rollouts} if self.kind == "RolloutSet" else {}
+        path = output / f"{safe_stem(episode_id)}.rrd"
+        content = recording_content(rollouts, self.episodes, tracks, episode_id, sigma_px_ref=self.sigma_px_ref)
+        write_rerun_recording(path, content)
+        return path
