@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from worldline_core.model.world_model import WorldModel
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
@@ -22,3 +27,71 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the real samples are not here (looked in {folder})")
     return folder
+
+
+@pytest.fixture(scope="session")
+def make_model() -> Callable[..., WorldModel]:
+    """Very small world models (4 latent channels, 9 action channels) whose every weight is random: no path is silent."""
+
+    def make(seed: int = 0, *, scale: float = 0.2, **changes: object) -> WorldModel:
+        import torch
+
+        from worldline_core.model.config import WorldModelConfig
+        from worldline_core.model.world_model import WorldModel
+
+        values: dict[str, object] = {
+            "latent_channels": 4,
+            "hidden_size": 24,
+            "num_layers": 2,
+            "num_heads": 2,
+            "num_kv_heads": 1,
+            "head_dim": 12,
+            "intermediate_size": 32,
+            "rope_sections": (2, 2, 2),
+            "towers": "generation",
+        }
+        generator = torch.Generator().manual_seed(seed)
+        model = WorldModel(WorldModelConfig.model_validate(values | changes))
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
+        return model.eval()
+
+    return make
+
+
+QWEN2_TEMPLATE = (
+    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n{{ message['content'] }}<|im_end|>\n{% endfor %}"
+    "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
+)
+
+
+@pytest.fixture(scope="session")
+def write_text_tokenizer() -> Callable[..., None]:
+    """Writes a word tokenizer with Qwen2's special tokens and chat template, as the full-size backbone's folder has."""
+
+    def write(folder: Path, *, vision: bool = True) -> None:
+        from tokenizers import Tokenizer, models, pre_tokenizers
+        from transformers import PreTrainedTokenizerFast
+
+        from worldline_core.model.text import SYSTEM_PROMPT
+
+        special = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", *(["<|vision_start|>"] if vision else [])]
+        sentences = (
+            f"{SYSTEM_PROMPT} system user assistant lift the red cube put it down . move 0 1 2 3 4 5 6 7 8 9 12 32 "
+            "The video is seconds long and is of FPS This video is of resolution 1 2 480x640 32x32 129 24"
+        )
+        words = sentences.replace(".", " . ").split()
+        vocabulary = {word: index for index, word in enumerate(dict.fromkeys(["[UNK]", *special, *words]))}
+        tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token="[UNK]"))  # noqa: S106 - a token of text
+        tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+        fast = PreTrainedTokenizerFast(
+            tokenizer_object=tokenizer,
+            unk_token="[UNK]",  # noqa: S106
+            eos_token="<|im_end|>",  # noqa: S106
+            additional_special_tokens=special,
+        )
+        fast.chat_template = QWEN2_TEMPLATE
+        fast.save_pretrained(folder)
+
+    return write

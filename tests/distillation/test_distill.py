@@ -6,142 +6,22 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from pydantic import ValidationError
-from safetensors.torch import save_file
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.tracks import ActionTracks, write_index, write_shard
-from worldline_core.data import episode_index
+from worldline_core.actions.tracks import ActionTracks
 from worldline_core.distillation import objectives, trajectory_store
 from worldline_core.distillation.batches import robot_masks
 from worldline_core.distillation.config import DistillConfig
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.store.digest import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip
-from worldline_core.training.latent_store import LatentStore, clip_key
-
-VIEWS = ("head", "left_wrist", "right_wrist")
-FRAMES = 21
-EPISODES = {"a": "train", "b": "train", "c": "validation"}
-IMAGE = (32, 32)
-CONTRACT = {
-    "sigma_px_ref": 40.0,
-    "wrist_projection": "current_camera",
-    "tokenizer": "0123",
-    "grid_size": [4, 4],
-}
-
-
-def write_latents(root: Path) -> None:
-    generator = torch.Generator().manual_seed(0)
-    root.mkdir()
-    tensors = {
-        clip_key(name, 1, start): torch.randn(3, 4, 1 + (FRAMES - 1 - start) // 4, 4, 4, generator=generator).half()
-        for name in EPISODES
-        for start in range(0, FRAMES, 4)
-    }
-    save_file(tensors, root / "00000.safetensors")
-    rows = [
-        {
-            "episode_id": name,
-            "shard": "00000.safetensors",
-            "num_frames": FRAMES,
-            "views": list(VIEWS),
-            "source": "test",
-            "embodiment": "test",
-            "split": split,
-            "instruction": "",
-            "primary_view": "head",
-        }
-        for name, split in EPISODES.items()
-    ]
-    pq.write_table(pa.Table.from_pylist(rows), root / "index.parquet")
-    description = {
-        "layout": "clips",
-        "start_step": 4,
-        "strides": [1],
-        "tokenizer": "0123",
-        "latent_shape": [4, 4, 4],
-        "image_size": list(IMAGE),
-    }
-    (root / "store.json").write_text(json.dumps(description))
-
-
-def tracks_of(name: str) -> EpisodeTracks:
-    """One arm that moves to the right, one metre in front of the head camera; the right wrist is not calibrated."""
-    random = np.random.default_rng(len(name))
-    K = np.stack([np.array([[32.0, 0, 15.5], [0, 32.0, 15.5], [0, 0, 1]])] * 3)
-    K[2] = np.nan
-    position = np.stack([np.linspace(-0.4, 0.4, FRAMES), np.zeros(FRAMES), np.ones(FRAMES)], axis=-1)
-    capsules = np.stack([position, position + np.array([0.0, 0.2, 0.0])], axis=1)[:, None]
-    cameras = np.broadcast_to(np.eye(4), (FRAMES, 3, 4, 4))
-    tools = np.broadcast_to(np.eye(4), (FRAMES, 1, 4, 4))
-    shape = (FRAMES, 3, 1)
-    return EpisodeTracks(
-        episode_id=name,
-        embodiment="test",
-        views=VIEWS,
-        arms=("right",),
-        image_size=IMAGE,
-        controls="action",
-        camera_motion=("static", "recorded", "absent"),
-        uv=random.uniform(0, 32, (*shape, 2)).astype(np.float32),
-        depth=np.ones(shape, np.float32),
-        rot6d=np.ones((*shape, 6), np.float32),
-        gripper=np.ones(shape, np.float32),
-        valid=np.ones(shape, bool),
-        T_base_tool=tools.astype(np.float32),
-        T_base_camera=cameras.astype(np.float32),
-        K=K.astype(np.float32),
-        capsules=capsules.astype(np.float32),
-        capsule_radii=np.array([0.05], np.float32),
-    )
-
-
-@pytest.fixture
-def inputs(tmp_path: Path, make_model: Callable) -> dict[str, Path]:
-    folders = {name: tmp_path / name for name in ("latents", "tracks", "episodes", "stage2", "tokenizer", "stage1")}
-    write_latents(folders["latents"])
-    folders["tracks"].mkdir()
-    write_index(folders["tracks"], write_shard(folders["tracks"], 0, [tracks_of(name) for name in EPISODES]))
-    folders["episodes"].mkdir()
-    rows = [
-        episode_index.EpisodeRow(
-            episode_id=name,
-            dataset="datasets/test",
-            episode_index=number,
-            start=0,
-            stop=FRAMES,
-            num_frames=FRAMES,
-            video_frames=FRAMES,
-            fps=8.0,
-            source="test",
-            embodiment="test",
-            scene="s",
-            task_family="grasp",
-            instruction="",
-            outcome="success",
-            split=split,
-            views=VIEWS,
-            bank=None,
-            candidate=None,
-            primary_view="head",
-        )
-        for number, (name, split) in enumerate(EPISODES.items())
-    ]
-    episode_index.write_index(folders["episodes"], rows)
-    for kind in ("stage1", "stage2"):
-        save_checkpoint(folders[kind], make_model(0), kind=kind, action_contract=CONTRACT)
-    return folders
+from worldline_core.training.latent_store import LatentStore
 
 
 def trainer(steps: int, **changes: object) -> dict[str, object]:
@@ -182,10 +62,12 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): digest_file(path) for path in folder_files(folder)}
 
 
-def test_three_steps_give_a_causal_checkpoint(inputs: dict[str, Path], tmp_path: Path) -> None:
+def test_three_steps_give_a_causal_checkpoint(
+    inputs: dict[str, Path], contract: dict[str, object], tmp_path: Path
+) -> None:
     output = tmp_path / "out"
     counts = distill(config(), inputs, output)
-    model, info = load_checkpoint(output, expect_kind="causal", action_contract=CONTRACT)
+    model, info = load_checkpoint(output, expect_kind="causal", action_contract=contract)
     assert info.metadata["distillation"] == "distribution_matching"
     assert info.metadata["sigmas"] == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
     assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
@@ -287,8 +169,9 @@ def test_an_iteration_changes_one_of_the_two_models(inputs: dict[str, Path], tmp
 
 
 def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[str, Path]) -> None:
-    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=VIEWS, tracks=ActionTracks.open(inputs["tracks"]))
-    masks = robot_masks(loader, [Clip("a", 0, 17, 1), Clip("b", 4, 17, 1)], VIEWS)
+    views = ("head", "left_wrist", "right_wrist")
+    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=views, tracks=ActionTracks.open(inputs["tracks"]))
+    masks = robot_masks(loader, [Clip("a", 0, 17, 1), Clip("b", 4, 17, 1)], views)
     assert masks.shape == (2, 3, 5, 4, 4)
     assert set(masks.unique().tolist()) == {0.0, 1.0}
     assert not bool(masks[:, 2].any())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -13,7 +15,6 @@ from worldline_core.model.block_causal import (
     teacher_forcing_mask,
     visible_blocks,
 )
-from worldline_core.model.config import WorldModelConfig
 from worldline_core.model.kv_cache import KVCache
 from worldline_core.model.layers import grouped_attention
 from worldline_core.model.rope import rotate, rotation
@@ -24,25 +25,8 @@ FRAMES = 7
 
 
 @pytest.fixture(scope="module", params=["velocity", "first_frame_residual"])
-def model(request: pytest.FixtureRequest) -> WorldModel:
-    config = WorldModelConfig(
-        prediction=request.param,
-        latent_channels=4,
-        hidden_size=24,
-        num_layers=2,
-        num_heads=2,
-        num_kv_heads=1,
-        head_dim=12,
-        intermediate_size=32,
-        rope_sections=(2, 2, 2),
-        towers="generation",
-    )
-    generator = torch.Generator().manual_seed(0)
-    model = WorldModel(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
-    return model.eval().requires_grad_(False)
+def model(request: pytest.FixtureRequest, make_model: Callable[..., WorldModel]) -> WorldModel:
+    return make_model(prediction=request.param).requires_grad_(False)
 
 
 def clip(frames: int = FRAMES, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:

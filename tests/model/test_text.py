@@ -2,61 +2,78 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.text import SYSTEM_PROMPT, Cosmos3Text, video_prompt
+from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
+from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, video_prompt
 
-TEMPLATE = (
-    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n{{ message['content'] }}<|im_end|>\n{% endfor %}"
-    "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
-)
-CLIP = {"num_frames": 129, "fps": 24.0, "image_size": (480, 640)}
+CLIP = ClipFacts(num_frames=129, fps=24.0, image_size=(480, 640))
 
 
-def write_tokenizer(folder: Path, *, vision: bool = True) -> None:
-    """A word tokenizer with Qwen2's special tokens and chat template."""
-    from tokenizers import Tokenizer, models, pre_tokenizers
-    from transformers import PreTrainedTokenizerFast
-
-    special = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", *(["<|vision_start|>"] if vision else [])]
-    words = f"{SYSTEM_PROMPT} system user assistant lift the red cube put it down .".replace(".", " . ").split()
-    vocabulary = {word: index for index, word in enumerate(dict.fromkeys(["[UNK]", *special, *words]))}
-    tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token="[UNK]"))  # noqa: S106 - a token of text
-    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
-    fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        unk_token="[UNK]",  # noqa: S106
-        eos_token="<|im_end|>",  # noqa: S106
-        additional_special_tokens=special,
-    )
-    fast.chat_template = TEMPLATE
-    fast.save_pretrained(folder)
+@pytest.fixture
+def folder(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> Path:
+    write_text_tokenizer(tmp_path / "tokenizer")
+    return tmp_path / "tokenizer"
 
 
 def test_prompt_carries_duration_and_resolution() -> None:
     facts = "The video is 5.4 seconds long and is of 24 FPS. This video is of 480x640 resolution."
-    assert video_prompt("Lift the cube.", **CLIP) == f"Lift the cube. {facts}"
-    assert video_prompt(" ", **CLIP) == facts
+    assert video_prompt("Lift the cube.", CLIP) == f"Lift the cube. {facts}"
+    assert video_prompt(" ", CLIP) == facts
 
 
-def test_ids_follow_the_chat_template_and_end_with_the_start_of_vision(tmp_path: Path) -> None:
-    write_tokenizer(tmp_path)
-    text = Cosmos3Text(tmp_path, **CLIP)
-    decoded = text.tokenizer.decode(text.ids("lift the red cube"))
+def test_ids_follow_the_chat_template_and_end_with_the_start_of_vision(folder: Path) -> None:
+    text = Cosmos3Text(folder)
+    decoded = text.tokenizer.decode(text.ids("lift the red cube", CLIP))
     assert decoded.startswith("<|im_start|> system You are a helpful assistant")
     assert "<|im_start|> user lift the red cube" in decoded
     assert decoded.endswith("<|im_start|> assistant <|im_end|> <|vision_start|>")
-    ids, mask = text(["lift the red cube", "lift the red cube put it down"])
-    assert mask.sum(dim=1).tolist() == [len(text.ids("lift the red cube")), ids.shape[1]]
-    assert ids[0, mask[0]].tolist() == text.ids("lift the red cube")
+    ids, mask = text(["lift the red cube", "lift the red cube put it down"], [CLIP, CLIP])
+    assert mask.sum(dim=1).tolist() == [len(text.ids("lift the red cube", CLIP)), ids.shape[1]]
+    assert ids[0, mask[0]].tolist() == text.ids("lift the red cube", CLIP)
 
 
-def test_missing_or_foreign_tokenizers_are_named(tmp_path: Path) -> None:
+def test_ids_are_those_of_diffusers(folder: Path) -> None:
+    from diffusers.pipelines.cosmos.pipeline_cosmos3_omni import Cosmos3OmniPipeline
+
+    text = Cosmos3Text(folder)
+    pipeline = SimpleNamespace(
+        config=SimpleNamespace(default_use_system_prompt=True),
+        text_tokenizer=text.tokenizer,
+        llm_special_tokens={
+            "start_of_generation": text.tokenizer.convert_tokens_to_ids(VISION_START),
+            "eos_token_id": text.tokenizer.eos_token_id,
+        },
+        duration_template="The video is {duration:.1f} seconds long and is of {fps:.0f} FPS.",
+        inverse_duration_template="",
+        image_resolution_template="",
+        inverse_image_resolution_template="",
+        video_resolution_template="This video is of {height}x{width} resolution.",
+        inverse_video_resolution_template="",
+    )
+    for instruction in ("lift the red cube.", "put it down", ""):
+        expected, _ = Cosmos3OmniPipeline.tokenize_prompt(
+            pipeline, instruction, num_frames=129, height=480, width=640, fps=24.0
+        )
+        assert text.ids(instruction, CLIP) == expected
+
+
+def test_a_long_instruction_loses_its_last_words_and_nothing_else(folder: Path) -> None:
+    whole = Cosmos3Text(folder).ids("lift the red cube", CLIP)
+    assert Cosmos3Text(folder, max_length=len(whole)).ids("lift the red cube", CLIP) == whole
+    shorter = Cosmos3Text(folder, max_length=len(whole) - 1)
+    assert shorter.ids("lift the red cube", CLIP) == shorter.ids("lift the red", CLIP)
+    with pytest.raises(ConfigError, match="too short for the prompt's frame"):
+        Cosmos3Text(folder, max_length=10).ids("lift", CLIP)
+
+
+def test_missing_or_foreign_tokenizers_are_named(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> None:
     with pytest.raises(UnavailableError, match="text tokenizer is not here"):
-        Cosmos3Text(tmp_path / "nothing", **CLIP)
-    write_tokenizer(tmp_path, vision=False)
+        Cosmos3Text(tmp_path / "nothing")
+    write_text_tokenizer(tmp_path, vision=False)
     with pytest.raises(CheckpointError, match="Not the tokenizer of a Cosmos3 model"):
-        Cosmos3Text(tmp_path, **CLIP)
+        Cosmos3Text(tmp_path)

@@ -2,40 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import pytest
 import torch
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.model.config import cosmos3_nano_config
 from worldline_core.model.rope import video_positions, view_starts
 from worldline_core.model.world_model import WorldModel
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 
 
-def tiny(**changes: object) -> WorldModelConfig:
-    values: dict[str, object] = {
-        "latent_channels": 4,
-        "hidden_size": 24,
-        "num_layers": 2,
-        "num_heads": 2,
-        "num_kv_heads": 1,
-        "head_dim": 12,
-        "intermediate_size": 32,
-        "rope_sections": (2, 2, 2),
-        "vocab_size": 20,
-    }
-    return WorldModelConfig.model_validate(values | changes)
+Build = Callable[..., WorldModel]
 
 
-def build(seed: int = 0, **changes: object) -> WorldModel:
-    """A model whose every weight is random, so that no path is silently zero."""
-    generator = torch.Generator().manual_seed(seed)
-    model = WorldModel(tiny(**changes))
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
-    return model.eval()
+@pytest.fixture
+def build(make_model: Build) -> Build:
+    """Models with both towers."""
+    return partial(make_model, towers="both", vocab_size=20)
 
 
 def sample(batch: int = 2, frames: int = 3, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -46,7 +33,7 @@ def sample(batch: int = 2, frames: int = 3, seed: int = 1) -> tuple[torch.Tensor
     return latents, maps, sigma
 
 
-def test_velocity_is_zero_on_clean_frames_only() -> None:
+def test_velocity_is_zero_on_clean_frames_only(build: Build) -> None:
     latents, maps, sigma = sample()
     velocity = build()(latents, sigma, action_maps=maps).velocity
     assert velocity.shape == latents.shape
@@ -54,7 +41,7 @@ def test_velocity_is_zero_on_clean_frames_only() -> None:
     assert bool((velocity[:, :, :, 1:].abs() > 0).any(dim=(1, 2, 4, 5)).all())
 
 
-def test_sigma_is_not_read_on_clean_frames() -> None:
+def test_sigma_is_not_read_on_clean_frames(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     per_frame = sigma[:, None].repeat(1, 3)
@@ -66,13 +53,13 @@ def test_sigma_is_not_read_on_clean_frames() -> None:
     assert not torch.allclose(model(latents, per_frame).velocity, model(latents, other).velocity)
 
 
-def test_the_whole_clip_may_be_generated_without_a_clean_frame() -> None:
+def test_the_whole_clip_may_be_generated_without_a_clean_frame(build: Build) -> None:
     latents, _, sigma = sample()
     none_clean = torch.zeros(2, 3, dtype=torch.bool)
     assert bool((build()(latents, sigma, clean_frames=none_clean).velocity[:, :, :, 0] != 0).any())
 
 
-def test_sample_prediction_returns_the_velocity_of_the_emitted_latents() -> None:
+def test_sample_prediction_returns_the_velocity_of_the_emitted_latents(build: Build) -> None:
     latents, _, sigma = sample()
     as_velocity, as_sample = build(prediction="velocity"), build(prediction="sample")
     emitted = as_velocity(latents, sigma).velocity
@@ -80,7 +67,7 @@ def test_sample_prediction_returns_the_velocity_of_the_emitted_latents() -> None
     torch.testing.assert_close(as_sample(latents, sigma).velocity[:, :, :, 1:], expected[:, :, :, 1:])
 
 
-def test_first_frame_residual_adds_the_clean_first_frame() -> None:
+def test_first_frame_residual_adds_the_clean_first_frame(build: Build) -> None:
     latents, _, sigma = sample()
     emitted = build(prediction="velocity")(latents, sigma).velocity + latents[:, :, :, :1]
     expected = (latents - emitted) / sigma.clamp_min(0.05).view(-1, 1, 1, 1, 1, 1)
@@ -90,7 +77,9 @@ def test_first_frame_residual_adds_the_clean_first_frame() -> None:
         model(latents, sigma, clean_frames=torch.zeros(2, 3, dtype=torch.bool))
 
 
-def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bit_and_is_trainable() -> None:
+def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bit_and_is_trainable(
+    build: Build,
+) -> None:
     latents, maps, sigma = sample()
     model = build()
     model.action_encoder.reset_output()
@@ -102,8 +91,8 @@ def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bi
     assert bool((gradient.abs().sum(dim=1) > 0).all())
 
 
-def test_views_share_time_and_have_their_own_height_slots() -> None:
-    positions = video_positions(tiny(), torch.arange(2), (2, 3), VIEWS).reshape(3, 2, 3, 2, 3)
+def test_views_share_time_and_have_their_own_height_slots(build: Build) -> None:
+    positions = video_positions(build().config, torch.arange(2), (2, 3), VIEWS).reshape(3, 2, 3, 2, 3)
     assert positions[0, 1].unique().tolist() == [1.0]
     assert positions[1, 0, :, 0, 0].tolist() == [0.0, 8.0, 20.0]
     assert positions[1, 0, 2, :, 1].tolist() == [20.0, 21.0]
@@ -120,7 +109,7 @@ def test_fps_modulation_stretches_time() -> None:
     assert positions[0].tolist() == [5.0, 7.0, 9.0]
 
 
-def test_views_attend_to_each_other() -> None:
+def test_views_attend_to_each_other(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     changed = latents.clone()
@@ -130,12 +119,12 @@ def test_views_attend_to_each_other() -> None:
     assert bool(difference[:, 2].amax() > 0)
 
 
-def test_one_view_runs_alone() -> None:
+def test_one_view_runs_alone(build: Build) -> None:
     latents, _, sigma = sample()
     assert build()(latents[:, :1], sigma, views=("head",)).velocity.shape == (2, 1, 4, 3, 4, 6)
 
 
-def test_features_come_from_the_layer_asked_for() -> None:
+def test_features_come_from_the_layer_asked_for(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     features = model(latents, sigma, features_at=1).features
@@ -148,7 +137,7 @@ def test_features_come_from_the_layer_asked_for() -> None:
         model(latents, sigma, features_at=3)
 
 
-def test_text_encoded_once_equals_text_given_each_time_and_padding_changes_nothing() -> None:
+def test_text_encoded_once_equals_text_given_each_time_and_padding_changes_nothing(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     ids = torch.tensor([[3, 4, 5], [6, 7, 0]])
@@ -160,7 +149,7 @@ def test_text_encoded_once_equals_text_given_each_time_and_padding_changes_nothi
     assert not torch.allclose(both, model(latents, sigma).velocity, atol=1e-3)
 
 
-def test_a_model_without_the_understanding_tower_refuses_text() -> None:
+def test_a_model_without_the_understanding_tower_refuses_text(build: Build) -> None:
     latents, _, sigma = sample()
     model = build(towers="generation")
     assert not any("to_q" in name or name.startswith("embed_tokens") for name, _ in model.named_parameters())
@@ -168,7 +157,7 @@ def test_a_model_without_the_understanding_tower_refuses_text() -> None:
         model(latents, sigma, text_ids=torch.ones(2, 3, dtype=torch.long))
 
 
-def test_parameter_groups_cover_the_generation_tower() -> None:
+def test_parameter_groups_cover_the_generation_tower(build: Build) -> None:
     model = build()
     generation = {name for name, _ in model.generation_parameters()}
     action = {name for name, _ in model.action_parameters()}
@@ -179,7 +168,7 @@ def test_parameter_groups_cover_the_generation_tower() -> None:
     assert "layers.0.self_attn.norm_added_q.weight" in generation
 
 
-def test_gradient_checkpointing_gives_the_same_gradients() -> None:
+def test_gradient_checkpointing_gives_the_same_gradients(build: Build) -> None:
     latents, maps, sigma = sample()
     gradients = []
     for enabled in (False, True):
@@ -191,19 +180,19 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
     torch.testing.assert_close(gradients[0], gradients[1])
 
 
-def test_a_fresh_model_starts_at_zero_velocity() -> None:
+def test_a_fresh_model_starts_at_zero_velocity(build: Build) -> None:
     latents, maps, sigma = sample()
-    model = WorldModel(tiny())
+    model = WorldModel(build().config)
     model.initialise(torch.Generator().manual_seed(0))
     assert bool((model(latents, sigma, action_maps=maps).velocity == 0).all())
-    copying = WorldModel(tiny(prediction="first_frame_residual"))
+    copying = WorldModel(build(prediction="first_frame_residual").config)
     copying.initialise(torch.Generator().manual_seed(0))
     velocity = copying(latents, sigma, action_maps=maps).velocity[:, :, :, 1:]
     one_step = latents[:, :, :, 1:] - sigma.view(-1, 1, 1, 1, 1, 1) * velocity
     torch.testing.assert_close(one_step, latents[:, :, :, :1].expand_as(one_step))
 
 
-def test_shapes_that_do_not_fit_are_refused() -> None:
+def test_shapes_that_do_not_fit_are_refused(build: Build) -> None:
     latents, maps, sigma = sample()
     model = build()
     with pytest.raises(DataError, match="Latents have the wrong shape"):
@@ -214,8 +203,8 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         model(latents, sigma, views=("head", "left_wrist", "tail"))
 
 
-def test_config_that_contradicts_itself_is_refused() -> None:
+def test_config_that_contradicts_itself_is_refused(build: Build) -> None:
     with pytest.raises(ValueError, match="must add up to head_dim / 2"):
-        tiny(rope_sections=(3, 2, 2))
+        build(rope_sections=(3, 2, 2))
     with pytest.raises(ValueError, match="must be a multiple of num_kv_heads"):
-        tiny(num_kv_heads=3)
+        build(num_kv_heads=3)

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import pytest
 
-from worldline_core.report.charts import Axis, Dot, Series, funnel_chart, interval_chart, line_chart, nice_ticks
+from worldline_core.report.charts import (
+    CHARACTER,
+    Axis,
+    Dot,
+    Series,
+    funnel_chart,
+    interval_chart,
+    line_chart,
+    nice_ticks,
+)
 from worldline_core.report.markdown import markdown
 from worldline_core.report.markup import Column, Html, element, interval, join, number, table
+from worldline_core.report.sections.training import error_chart
 
 
 class _Texts(HTMLParser):
@@ -93,3 +104,30 @@ def test_charts_are_xml_and_hold_every_point(hostile_text: str) -> None:
 def test_html_marks_only_what_was_built() -> None:
     assert isinstance(element("p"), Html)
     assert not isinstance("<p></p>", Html)
+
+
+def test_row_labels_of_an_interval_chart_stay_inside_the_picture() -> None:
+    name = "Stage II, shuffled actions (long-trained)"
+    svg = interval_chart([Dot(name, 0.5, 0.4, 0.6), Dot("copy", 0.2)], title="t", value_label="v")
+    found = re.search(rf'<text x="([\d.]+)"[^>]*class="row end">{re.escape(name)}<', svg)
+    assert found is not None
+    right = float(found.group(1))
+    assert right - CHARACTER * len(name) >= 0
+    dots = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', svg)]
+    assert min(dots) > right
+
+
+def test_an_axis_over_less_than_half_a_decade_has_even_ticks() -> None:
+    assert Axis(0.7, 1.2, 0, 1, log=True).ticks() == [0.7, 0.8, 0.9, 1.0, 1.1, 1.2]
+    assert Axis(0.01, 10, 0, 1, log=True).ticks() == pytest.approx([0.01, 0.03, 0.1, 0.3, 1, 3, 10])
+
+
+def test_a_held_out_error_that_was_measured_once_is_a_row_of_dots() -> None:
+    once = {"validation/rollout_error": ([9.0], [0.25]), "validation/rollout_error_copy": ([9.0], [0.5])}
+    shown = error_chart("Distillation", "error", "validation/rollout_error", once)
+    assert shown.count("<circle") == 2
+    assert "held-out scenes" in shown
+    assert "0.500" in shown
+    often = {name: ([3.0, *steps], [0.7, *values]) for name, (steps, values) in once.items()}
+    assert error_chart("Distillation", "error", "validation/rollout_error", often).count("<polyline") == 2
+    assert error_chart("Distillation", "error", "validation/sample_error", once) == ""

@@ -7,4 +7,4 @@ from worldline_core.report.methods import method
 
 def test_another_number_of_steps_is_not_shown_as_the_usual_method() -> None:
     assert method("shipped_stage2").label == "Stage II"
-    assert method("shipped_stage2_35_steps").label == "shipped stage2 35 steps"
+    assert method("shipped_stage2_35_steps").label == "Stage II, 35 steps"

@@ -13,6 +13,7 @@ import pytest
 
 from worldline_core.errors import ArtifactError
 from worldline_core.report.report import ReportConfig, report
+from worldline_core.report.sections.efficiency import block_ratio, block_words, blocks_of
 
 SECTIONS = (
     "summary", "videos", "video", "policy", "planning", "cost", "data", "filters", "actions", "training", "models", "provenance",
@@ -124,6 +125,28 @@ def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path)
     parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
     assert set(parts) == set(re.findall(r'data-run="(\w+)"', text))
     assert Page(parts["cost"]).open == []
+
+
+def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path, tmp_path: Path) -> None:
+    run = (full_report / "run" / "run.js").read_text()
+    parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
+    cost = parts["cost"]
+    assert "Time of each block, from the first to number 50" in cost
+    assert "1.04\u202f\u00d7" in cost
+    assert "block 1 500\u202fms, median 510\u202fms, block 50 520\u202fms" in cost
+    assert "a slow machine" in cost
+    assert "ratio 1.04" in parts["efficiency_tile"]
+    # A chart's line has a point for every block.
+    points = max(re.findall(r'<polyline points="([^"]*)"', cost), key=len)
+    assert len(points.split()) == 50
+
+
+def test_a_ratio_needs_enough_blocks_at_both_ends() -> None:
+    assert block_ratio([1.0] * 9) is None
+    assert block_ratio([1.0] * 5 + [2.0] * 5) == 2.0
+    assert blocks_of({"block_seconds": [1.0, 2.0]}) == [1.0, 2.0]
+    assert blocks_of({}) == []
+    assert "1.04" not in block_words("causal", [0.5, 0.52])
 
 
 def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:

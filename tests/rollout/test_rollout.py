@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from pydantic import ValidationError
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.tracks import write_index, write_shard
@@ -22,6 +24,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.controls import shuffled_partners
 from worldline_core.rollout.rollout import RolloutConfig, rollout
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
+from worldline_core.store.digest import digest_folder
 
 SIZE = (32, 48)
 N = 33
@@ -128,6 +131,28 @@ def test_every_chosen_episode_is_predicted_in_every_view_and_seed(predicted: tup
     assert not np.array_equal(frames, rollouts.frames("b/0 x", "left_wrist", 42))
     with pytest.raises(DataError, match="No such prediction"):
         rollouts.frames("b-1", "head", seed=7)
+
+
+def test_times_lie_beside_the_predictions_and_outside_their_digest(
+    inputs: dict[str, Path], predicted: tuple[Path, dict], tmp_path: Path
+) -> None:
+    output, _ = predicted
+    speed = json.loads((output / "run" / "speed.json").read_text())
+    assert {name: speed[name] for name in ("steps", "batch_size", "device", "dtype")} == {
+        "steps": 4, "batch_size": 2, "device": "cpu", "dtype": "bfloat16",
+    }  # fmt: skip
+    assert speed["frames"] == 6 * N  # the first of four batches of two warms up
+    assert len(speed["block_seconds"]) == 2
+    assert 0 < sum(speed["block_seconds"]) * speed["trajectories"] < speed["seconds"]
+    assert "long_rollout" not in speed
+    rollout(CONFIG.model_copy(update={"timed_blocks": 6}), inputs, tmp_path)
+    long = json.loads((tmp_path / "run" / "speed.json").read_text())["long_rollout"]
+    assert [len(long[name]) for name in ("block_seconds", "block_processor_seconds")] == [6, 6]
+    assert min(long["block_seconds"]) > 0
+    assert digests(tmp_path) == digests(output)
+    assert digest_folder(tmp_path) == digest_folder(output)
+    with pytest.raises(ValidationError, match="timed_blocks needs the sampler block_causal"):
+        RolloutConfig(sampler="full_clip", timed_blocks=2)
 
 
 def test_interrupted_rollouts_end_with_the_same_bytes(

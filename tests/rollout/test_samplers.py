@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import pytest
 import torch
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.config import WorldModelConfig
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
 from worldline_core.rollout.block_causal import BlockCausalSimulator
 from worldline_core.rollout.euler import (
@@ -24,24 +24,8 @@ from worldline_core.rollout.full_clip import rollout_full_clip
 
 
 @pytest.fixture(scope="module")
-def model() -> WorldModel:
-    config = WorldModelConfig(
-        latent_channels=4,
-        hidden_size=24,
-        num_layers=2,
-        num_heads=2,
-        num_kv_heads=1,
-        head_dim=12,
-        intermediate_size=32,
-        rope_sections=(2, 2, 2),
-        towers="generation",
-    )
-    generator = torch.Generator().manual_seed(0)
-    model = WorldModel(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
-    return model.eval().requires_grad_(False)
+def model(make_model: Callable[..., WorldModel]) -> WorldModel:
+    return make_model().requires_grad_(False)
 
 
 def observation(batch: int = 2, frames: int = 9) -> tuple[torch.Tensor, torch.Tensor]:

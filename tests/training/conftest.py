@@ -171,6 +171,12 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     return World(root / "episodes", root / "latents", root / "tracks")
 
 
+@pytest.fixture(scope="session")
+def tiny_model() -> dict[str, object]:
+    """Values of a model that fits the world's latents."""
+    return dict(TINY_MODEL)
+
+
 @pytest.fixture
 def model_config() -> Callable[..., WorldModelConfig]:
     def make(**changes: object) -> WorldModelConfig:

@@ -62,12 +62,10 @@ def teacher(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def stage1_folder(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from .conftest import TINY_MODEL
-
+def stage1_folder(world: Any, tiny_model: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stage1")
     config = Stage1Config.model_validate(
-        {"model": TINY_MODEL, "trainer": trainer_values(6), "clips": {"lengths": [9], "view_weights": {"primary": 1}}}
+        {"model": tiny_model, "trainer": trainer_values(6), "clips": {"lengths": [9], "view_weights": {"primary": 1}}}
     )
     train_stage1(config, world.inputs, folder)
     return folder

@@ -27,6 +27,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.latent_store import TEMPORAL_COMPRESSION
+from worldline_core.training.processes import wait_for_all
 from worldline_core.training.trainer import ParameterGroup, TrainerConfig
 
 __all__ = ["DistillConfig", "distill"]
@@ -132,8 +133,7 @@ def _trajectories(stage: DistillationStage, teacher_folder: Path, info: Checkpoi
         )
     if stage.rank == 0:
         write_bytes_atomic(stage.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
-    if stage.world_size > 1:
-        torch.distributed.barrier()
+    wait_for_all()
     return TrajectoryStore.open(folder)
 
 

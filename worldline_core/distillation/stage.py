@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 
 from worldline_core.actions.tracks import ActionTracks
+from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance
 from worldline_core.distillation.config import DistillConfig
 from worldline_core.distillation.perceptual import PerceptualLoss
@@ -28,12 +29,12 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.latent_store import TEMPORAL_COMPRESSION, LatentRow, LatentStore
+from worldline_core.training.processes import join_processes, wait_for_all
 from worldline_core.training.trainer import (
     Objective,
     ParameterGroup,
     TrainerConfig,
     TrainingResult,
-    process_rank,
     train,
 )
 from worldline_core.training.validation import validation_function
@@ -74,9 +75,10 @@ class DistillationStage:
             CheckpointError: the checkpoint's action maps and latents are not those given here.
         """
         output.mkdir(parents=True, exist_ok=True)
+        device = config.teacher_forcing.trainer.device
+        rank, world_size = join_processes(device)
         stage2 = Path(inputs["stage2"])
         info = read_checkpoint_info(stage2)
-        device = config.teacher_forcing.trainer.device
         store = LatentStore.open(Path(inputs["latents"]))
         check_action_contract(
             info.action_contract,
@@ -92,14 +94,13 @@ class DistillationStage:
             wrist_projection=info.action_contract["wrist_projection"],
             device=device,
         )
-        rank, world_size = process_rank()
         return cls(
             config=config,
             stage2=stage2,
             stage2_info=info,
             store=store,
             loader=loader,
-            rows=training_rows(store, Path(inputs["episodes"]), stage=2, tracks=tracks),
+            rows=training_rows(store, EpisodeSet.open(Path(inputs["episodes"])), stage=2, tracks=tracks),
             output=output,
             perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
             rank=rank,
@@ -189,8 +190,7 @@ class DistillationStage:
                     **{name: value for name, value in result.average.items() if name in names},
                 },
             )
-        if self.world_size > 1:
-            torch.distributed.barrier()
+        wait_for_all()
         return prefixed(step, result.metrics)
 
 

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from worldline_core.errors import CheckpointError, UnavailableError
+from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
 """As in training, the missing letter included."""
 VISION_START = "<|vision_start|>"
 
 
-def video_prompt(instruction: str, *, num_frames: int, fps: float, image_size: tuple[int, int]) -> str:
+@dataclass(frozen=True)
+class ClipFacts:
+    """What a prompt says of its clip: frames, frames a second as they are shown, (height, width) in pixels."""
+
+    num_frames: int
+    fps: float
+    image_size: tuple[int, int]
+
+
+def video_prompt(instruction: str, clip: ClipFacts) -> str:
     """The instruction followed by the clip's duration and resolution."""
+    height, width = clip.image_size
     facts = (
-        f"The video is {num_frames / fps:.1f} seconds long and is of {fps:.0f} FPS.",
-        f"This video is of {image_size[0]}x{image_size[1]} resolution.",
+        f"The video is {clip.num_frames / clip.fps:.1f} seconds long and is of {clip.fps:.0f} FPS.",
+        f"This video is of {height}x{width} resolution.",
     )
     text = instruction.strip()
     for fact in facts:
@@ -32,14 +44,15 @@ class Cosmos3Text:
 
     Args:
         folder: local folder of the Qwen2 tokenizer (``text_tokenizer`` of the diffusers pipeline).
-        num_frames, fps, image_size: of the clips; they are part of the prompt.
+        max_length: most tokens of a prompt. An instruction that is too long loses its last words; the chat around it
+            and the clip's facts stay whole.
 
     Raises:
         UnavailableError: there is no such folder.
         CheckpointError: its tokenizer lacks the chat template or the vision token.
     """
 
-    def __init__(self, folder: Path, *, num_frames: int, fps: float, image_size: tuple[int, int]) -> None:
+    def __init__(self, folder: Path, *, max_length: int | None = None) -> None:
         if not folder.is_dir():
             raise UnavailableError(
                 "The text tokenizer is not here",
@@ -50,7 +63,7 @@ class Cosmos3Text:
         from transformers import AutoTokenizer
 
         self.tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        self.num_frames, self.fps, self.image_size = num_frames, fps, image_size
+        self.max_length = max_length
         start = self.tokenizer.get_vocab().get(VISION_START)
         if start is None or self.tokenizer.eos_token_id is None or self.tokenizer.chat_template is None:
             raise CheckpointError(
@@ -61,15 +74,46 @@ class Cosmos3Text:
             )
         self._ending = [int(self.tokenizer.eos_token_id), int(start)]
 
-    def ids(self, instruction: str) -> list[int]:
-        """Ids of one prompt: chat template, end of text, start of vision."""
-        prompt = video_prompt(instruction, num_frames=self.num_frames, fps=self.fps, image_size=self.image_size)
-        chat = [{"role": "system", "content": SYSTEM_PROMPT}, {"role": "user", "content": prompt}]
+    @property
+    def vocabulary_size(self) -> int:
+        """Ids lie below this."""
+        return max(self.tokenizer.get_vocab().values()) + 1
+
+    def ids(self, instruction: str, clip: ClipFacts) -> list[int]:
+        """Ids of one prompt: chat template, end of text, start of vision.
+
+        Raises:
+            ConfigError: not even a prompt without an instruction fits ``max_length``.
+        """
+        ids = self._prompt_ids(instruction, clip)
+        if self.max_length is None or len(ids) <= self.max_length:
+            return ids
+        words = instruction.split()
+        while words and len(ids) > self.max_length:
+            words.pop()
+            ids = self._prompt_ids(" ".join(words), clip)
+        if len(ids) > self.max_length:
+            raise ConfigError(
+                "The longest allowed text is too short for the prompt's frame",
+                where="text.max_length",
+                expected=f">= {len(ids)}",
+                got=self.max_length,
+            )
+        return ids
+
+    def _prompt_ids(self, instruction: str, clip: ClipFacts) -> list[int]:
+        chat = [
+            {"role": "system", "content": SYSTEM_PROMPT},
+            {"role": "user", "content": video_prompt(instruction, clip)},
+        ]
         text = self.tokenizer.apply_chat_template(chat, tokenize=False, add_generation_prompt=True)
         return [*self.tokenizer(text, add_special_tokens=False)["input_ids"], *self._ending]
 
-    def __call__(self, texts: list[str]) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b m"]]:
-        coded = [self.ids(text) for text in texts]
+    def __call__(
+        self, texts: Sequence[str], clips: Sequence[ClipFacts]
+    ) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b m"]]:
+        """Ids of every clip's prompt."""
+        coded = [self.ids(text, clip) for text, clip in zip(texts, clips, strict=True)]
         length = max(len(row) for row in coded)
         ids = torch.full((len(coded), length), self._ending[0], dtype=torch.long)
         mask = torch.zeros(len(coded), length, dtype=torch.bool)

@@ -10,6 +10,8 @@ from worldline_core.report.markup import Html, element, join
 
 WIDTH, HEIGHT = 600, 320
 LEFT, RIGHT, TOP, BOTTOM = 58, 16, 14, 46
+CHARACTER = 7
+"""Width of a letter of a row's label."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,10 @@ class Axis:
     def ticks(self, wanted: int = 5) -> list[float]:
         if not self.log:
             return nice_ticks(self.low, self.high, wanted)
-        exponents = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
         decades = math.log10(self.high / self.low)
+        if decades < 0.5:
+            return nice_ticks(self.low, self.high, wanted)
+        exponents = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
         factors = (1,) if decades > 3 else (1, 3) if decades > 1.3 else (1, 2, 3, 5, 7)
         ticks = [m * 10.0**e for e in exponents for m in factors]
         return [t for t in ticks if self.low * 0.999 <= t <= self.high * 1.001]
@@ -199,7 +203,8 @@ def interval_chart(
     dots: Sequence[Dot], *, title: str, value_label: str, zero_line: bool = False, digits: int = 3, signed: bool = False
 ) -> Html:
     """Horizontal dots with interval whiskers, a row each: comparisons with their uncertainty."""
-    row_height, left, right = 34, 190, 120
+    row_height, right = 34, 90
+    left = min(WIDTH // 2, 24 + CHARACTER * max((len(dot.label) for dot in dots), default=0))
     height = 12 + row_height * len(dots) + 44
     values = [v for d in dots for v in (d.value, d.low, d.high) if v is not None and math.isfinite(v)]
     low, high = (min(values), max(values)) if values else (0.0, 1.0)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldline_core.exports.pictures import jpeg_bytes, png_bytes
-from worldline_core.report.artifacts import ReportInputs
+from worldline_core.report.artifacts import JsonObject, ReportInputs, read_json
 from worldline_core.report.config import ReportConfig
-from worldline_core.report.markup import Child, Html, element
+from worldline_core.report.markup import Child, Html, element, join
 from worldline_core.report.video_scores import VideoScores
 from worldline_core.store.atomic import write_bytes_atomic
 
@@ -56,6 +56,11 @@ class ReportContext:
         """Scores of every video evaluation."""
         return VideoScores.read(self.inputs.variants("evaluate_video"))
 
+    def summaries(self, step: str) -> list[JsonObject]:
+        """Summaries of every evaluation of a step that has a method in it."""
+        found = [read_json(folder / "summary.json") for folder in self.inputs.variants(step).values()]
+        return [summary for summary in found if summary.get("methods")]
+
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
         """Predicted videos by method, those of candidate banks apart."""
@@ -84,6 +89,16 @@ class ReportContext:
         """A place in the page that is filled from `run/run.js`."""
         self.run_parts[name] = content
         return element("div", element("p", fallback, class_="muted") if fallback else None, data_run=name)
+
+
+def evaluation_section(
+    context: ReportContext, step: str, anchor: str, title: str, lead: str, show: Callable[[JsonObject], Html]
+) -> Section:
+    """A section with a part for every evaluation of a step; one that says so where there is none."""
+    found = context.summaries(step)
+    if not found:
+        return Section(anchor, title, missing=f"no {title.lower().split()[0]} evaluation was given (input {step}).")
+    return Section(anchor, title, lead, join(show(summary) for summary in found))
 
 
 SectionMaker = Callable[[ReportContext], Section]

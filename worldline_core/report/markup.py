@@ -92,10 +92,12 @@ def table(
     *,
     caption: Child = None,
     emphasise: frozenset[int] = frozenset(),
+    dense: bool = False,
 ) -> Html:
     """A table; the first cell of each row is its heading.
 
     Args:
+        dense: intervals stand below their values, for tables of many columns.
         emphasise: numbers of the rows to set in bold.
     """
     head = element(
@@ -117,7 +119,7 @@ def table(
     return element(
         "div",
         element("table", inner, element("thead", head), element("tbody", body)),
-        class_="table-wrap",
+        class_="table-wrap dense" if dense else "table-wrap",
         tabindex="0",
     )
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
+
+TRUE_METHOD = "true"
+"""Stands for the recorded videos among the methods of an evaluation."""
 
 Group = Literal["shipped", "run", "baseline"]
 Kind = Literal["stage2", "causal", "stage2_zero", "stage2_shuffled", "causal_zero", "causal_shuffled", "copy", "other"]
@@ -30,6 +34,8 @@ COLOURS: dict[str, str] = {
 }
 GROUP_LABELS: dict[Group, str] = {"shipped": "long-trained", "run": "this run", "baseline": "baseline"}
 ORDER: tuple[str, ...] = (*LABELS, "other")
+BASE_LABELS = {"stage2": "Stage II", "causal": "causal"}
+STEPS_NAME = re.compile(r"(?:shipped_)?(?P<base>stage2|causal)_(?P<steps>\d+)_steps")
 ZERO_WORDS = frozenset({"zero", "zeroed", "none", "noaction", "noactions", "no"})
 SHUFFLED_WORDS = frozenset({"shuffled", "shuffle"})
 
@@ -44,7 +50,10 @@ class Method:
 
     @property
     def label(self) -> str:
-        return LABELS.get(self.kind, self.name.replace("_", " "))
+        if self.kind in LABELS:
+            return LABELS[self.kind]
+        found = STEPS_NAME.fullmatch(self.name)
+        return f"{BASE_LABELS[found['base']]}, {found['steps']} steps" if found else self.name.replace("_", " ")
 
     @property
     def long_label(self) -> str:
@@ -70,6 +79,11 @@ def method(name: str) -> Method:
     # Another number of steps is another method: it must not stand under the label of the usual one.
     kind = f"{base}{control}" if base and "steps" not in words else "other"
     return Method(name, kind, "shipped" if "shipped" in words else "run")
+
+
+def without_truth(names: Iterable[str]) -> list[Method]:
+    """Methods that predicted, in the report's order: recorded videos, judged as a ceiling, are no method."""
+    return in_order([name for name in names if name != TRUE_METHOD])
 
 
 def in_order(names: list[str]) -> list[Method]:

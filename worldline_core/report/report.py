@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from worldline_core.report.config import ReportConfig
-from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic
 
 __all__ = ["ReportConfig", "report"]
 
@@ -48,6 +48,8 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     from worldline_core.report.sections.trend import trend_section
     from worldline_core.report.sections.video import video_section
 
+    # The page is made anew: nothing that an earlier, killed call left behind may enter the digest.
+    shutil.rmtree(output / "media", ignore_errors=True)
     remove_unfinished(output)
     makers = [
         summary_section, rollouts_section, video_section, policy_section, planning_section, efficiency_section,
@@ -64,10 +66,3 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     logger.info("report: %d sections, missing: %s", len(sections) - len(missing), ", ".join(missing) or "none")
     media = sorted(path.name for path in (output / "media").iterdir()) if (output / "media").is_dir() else []
     return {"sections": len(sections) - len(missing), "missing": missing, "media": len(media)}
-
-
-def remove_unfinished(output: Path) -> None:
-    """Removes what an earlier, killed call left behind: the page is made anew, and nothing stale may enter the digest."""
-    shutil.rmtree(output / "media", ignore_errors=True)
-    for path in output.glob(".*.tmp*"):
-        path.unlink()

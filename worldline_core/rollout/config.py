@@ -35,11 +35,19 @@ class RolloutConfig(StrictModel):
     crf: int = Field(default=8, ge=0, le=51)
     bfloat16: bool = True
     device: str = "cpu"
+    timed_blocks: int = Field(default=0, ge=0)
+    """Blocks of one long block-causal rollout made to measure what each costs; it changes no prediction."""
 
     @model_validator(mode="after")
     def _distinct_seeds(self) -> Self:
         if len(set(self.seeds)) != len(self.seeds):
             raise ValueError(f"seeds repeat: {self.seeds}")
+        return self
+
+    @model_validator(mode="after")
+    def _blocks_to_time(self) -> Self:
+        if self.timed_blocks and self.sampler != "block_causal":
+            raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
         return self
 
 

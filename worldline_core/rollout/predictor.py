@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from worldline_core.actions.action_maps import latent_frame_indices, render_acti
 from worldline_core.actions.episode_tracks import collate_tracks
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, check_action_contract, load_checkpoint
 from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
 from worldline_core.model.tokenizer.pixels import frames_to_video, video_to_frames
@@ -24,6 +25,9 @@ from worldline_core.rollout.block_causal import BLOCK_SIZE, BlockCausalSimulator
 from worldline_core.rollout.config import Job, RolloutConfig
 from worldline_core.rollout.euler import Noise, sigmas_causal, sigmas_full
 from worldline_core.rollout.full_clip import rollout_full_clip
+from worldline_core.rollout.speed import Elapsed, timed
+
+WARM_UP_BLOCKS = 2
 
 
 class Predictor:
@@ -45,6 +49,8 @@ class Predictor:
         self.image_size: tuple[int, int] = (recorded[1], recorded[2])
         self.steps: int | None = None
         self.recent_blocks: int | None = None
+        self.block_seconds: list[float] = []
+        """Wall seconds of each block of the last batch; empty where the clip was sampled whole."""
         if config.sampler != "copy_first_frame":
             self._load_model(Path(inputs["checkpoint"]))
         if isinstance(self.tokenizer, torch.nn.Module):
@@ -81,6 +87,7 @@ class Predictor:
 
     def predict(self, batch: Sequence[Job]) -> list[dict[str, np.ndarray]]:
         """Predicted frames of every view of every job, the observed frame first."""
+        self.block_seconds = []
         observed = self._observed(batch)
         if self.model is None:
             return [
@@ -92,14 +99,39 @@ class Predictor:
             ]
         flat = rearrange(observed, "b v c h w -> (b v) c 1 h w").to(self.config.device)
         with torch.no_grad():
-            first = rearrange(self.tokenizer.encode(flat), "(b v) c 1 h w -> b v c h w", v=len(self.views))
-            maps = self._action_maps(batch, (first.shape[-2], first.shape[-1]))
+            first, maps = self._encoded(batch, flat)
             latents = self._sample(self.model, first, maps, batch)
             flat_latents = rearrange(latents, "b v c t h w -> (b v) c t h w")
             with torch.autocast(self.config.device.split(":")[0], torch.bfloat16, enabled=self.config.bfloat16):
                 video = self.tokenizer.decode(flat_latents, flat[:, :, 0])
         video = rearrange(video, "(b v) c t h w -> b v c t h w", v=len(self.views))
         return [{view: video_to_frames(clip[v]) for v, view in enumerate(self.views)} for clip in video]
+
+    def time_blocks(self, job: Job, blocks: int) -> list[Elapsed]:
+        """What every block takes of one long rollout, for the cost alone; nothing of it is kept.
+
+        The trajectory goes on beyond its own end with its last controls. A few blocks before it warm up.
+
+        Raises:
+            ConfigError: the sampler has no blocks.
+        """
+        if self.model is None or self.config.sampler != "block_causal":
+            raise ConfigError("Only a block-causal rollout has blocks to time", where="timed_blocks", got=blocks)
+        flat = rearrange(self._observed([job]), "b v c h w -> (b v) c 1 h w").to(self.config.device)
+        with torch.no_grad():
+            first, maps = self._encoded([job], flat)
+        controls = maps[:, :, :, -BLOCK_SIZE:]
+        times: list[Elapsed] = []
+        for count in (WARM_UP_BLOCKS, blocks):
+            simulator = self._simulator(self.model, [job])
+            simulator.start(first, maps[:, :, :, :1])
+            times = [timed(partial(simulator.step, controls), self.config.device)[1] for _ in range(count)]
+        return times
+
+    def _encoded(self, batch: Sequence[Job], flat: Tensor) -> tuple[Tensor, Tensor]:
+        """Latents of the observed frames, and the controls' maps at their resolution."""
+        first = rearrange(self.tokenizer.encode(flat), "(b v) c 1 h w -> b v c h w", v=len(self.views))
+        return first, self._action_maps(batch, (first.shape[-2], first.shape[-1]))
 
     def _observed(self, batch: Sequence[Job]) -> Tensor:
         firsts = []
@@ -134,29 +166,33 @@ class Predictor:
         return torch.zeros_like(maps) if self.config.actions == "zero" else maps
 
     def _sample(self, model: WorldModel, first: Tensor, maps: Tensor, batch: Sequence[Job]) -> Tensor:
-        noise = Noise([job.seed for job in batch])
-        steps = self.steps or 1
         if self.config.sampler == "full_clip":
             return rollout_full_clip(
                 model,
                 first,
                 maps,
-                noise=noise,
-                sigmas=sigmas_full(steps),
+                noise=Noise([job.seed for job in batch]),
+                sigmas=sigmas_full(self.steps or 1),
                 views=self.views,
                 bfloat16=self.config.bfloat16,
             )
-        simulator = BlockCausalSimulator(
+        simulator = self._simulator(model, batch)
+        simulator.start(first, maps[:, :, :, :1])
+        blocks = [first[:, :, :, None]]
+        for start in range(1, maps.shape[3], BLOCK_SIZE):
+            controls = maps[:, :, :, start : start + BLOCK_SIZE]
+            block, elapsed = timed(partial(simulator.step, controls), self.config.device)
+            blocks.append(block)
+            self.block_seconds.append(elapsed.wall)
+        return torch.cat(blocks, dim=3)
+
+    def _simulator(self, model: WorldModel, batch: Sequence[Job]) -> BlockCausalSimulator:
+        return BlockCausalSimulator(
             model,
-            noise=noise,
-            sigmas=sigmas_causal(steps),
+            noise=Noise([job.seed for job in batch]),
+            sigmas=sigmas_causal(self.steps or 1),
             sink_blocks=self.config.sink_blocks,
             recent_blocks=self.recent_blocks if self.recent_blocks is not None else 3,
             views=self.views,
             bfloat16=self.config.bfloat16,
         )
-        simulator.start(first, maps[:, :, :, :1])
-        blocks = [first[:, :, :, None]]
-        starts = range(1, maps.shape[3], BLOCK_SIZE)
-        blocks.extend(simulator.step(maps[:, :, :, start : start + BLOCK_SIZE]) for start in starts)
-        return torch.cat(blocks, dim=3)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from worldline_core.rollout.config import Job, RolloutConfig
 from worldline_core.rollout.controls import shuffled_partners
 from worldline_core.rollout.predictor import Predictor
 from worldline_core.rollout.rollout_set import RolloutSetWriter
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.rollout.speed import BatchTime, SpeedLog, device_name, long_rollout, timed
 
 __all__ = ["RolloutConfig", "rollout"]
 
@@ -26,7 +26,8 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
 
     Writes a RolloutSet. Predictions already there are kept; a batch is made again as a whole if one of its videos is
-    missing, so the bytes do not depend on where an earlier call stopped. Times go to ``run/speed.json``.
+    missing, so the bytes do not depend on where an earlier call stopped. Times go to ``run/speed.json``: seconds a frame, and
+    ``block_seconds`` of the block-causal sampler, per trajectory; ``long_rollout`` holds those of ``timed_blocks``.
 
     Returns:
         counts, frames, and the checkpoint's kind.
@@ -45,22 +46,30 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     jobs = plan_jobs(config, episodes, tracks, chosen)
     predictor = Predictor(config, inputs, episodes, tracks)
     writer = RolloutSetWriter(output, config.method, predictor.fps, crf=config.crf)
-    made, seconds = 0, 0.0
+    speed, first = SpeedLog(output / "run"), True
     for batch in tqdm(list(batches(jobs, config.batch_size)), desc=f"rollout {config.method}", disable=None):
         if all(writer.has(job.episode_id, job.seed, predictor.views) for job in batch):
             for job in batch:
                 for view in predictor.views:
                     writer.register(job.episode_id, job.seed, view, job.frames, predictor.image_size)
             continue
-        started = time.perf_counter()
-        predictions = predictor.predict(batch)
-        seconds += time.perf_counter() - started
-        made += sum(job.frames for job in batch)
+        predictions, elapsed = timed(partial(predictor.predict, batch), config.device)
+        made = sum(job.frames for job in batch)
+        speed.add(BatchTime(len(batch), made, elapsed.wall, tuple(predictor.block_seconds), first))
+        first = False
         for job, frames in zip(batch, predictions, strict=True):
             writer.add(job.episode_id, job.seed, frames)
     writer.close()
-    speed = {"frames": made, "seconds": seconds, "seconds_per_frame": seconds / made if made else None}
-    write_json_atomic(output / "run" / "speed.json", speed)
+    facts: dict[str, Any] = {
+        "steps": predictor.steps,
+        "batch_size": config.batch_size,
+        "device": config.device,
+        "device_name": device_name(config.device),
+        "dtype": "bfloat16" if config.bfloat16 else "float32",
+    }
+    if config.timed_blocks:
+        facts["long_rollout"] = long_rollout(predictor.time_blocks(jobs[0], config.timed_blocks), config.device)
+    speed.close(facts)
     return {
         "method": config.method,
         "episodes": len(chosen),

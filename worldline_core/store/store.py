@@ -25,6 +25,7 @@ from worldline_core.errors import ArtifactError
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
 from worldline_core.store.lock import exclusive_lock
+from worldline_core.store.workers import announced, is_helper, wait_for_announcement, wait_until
 
 logger = logging.getLogger(__name__)
 
@@ -89,8 +90,13 @@ class ArtifactStore:
         inputs: Mapping[str, Path],
         *,
         seeds: Mapping[str, int] | None = None,
+        distributed: bool = False,
     ) -> Artifact:
         """Return the artifact of a step, working only for what is not there yet.
+
+        Args:
+            distributed: the step shares its work among the processes of torchrun. Of any other step the first process
+                does all the work.
 
         Raises:
             WorldLineError: whatever the step raises; its unfinished work stays in ``<key>.partial/``.
@@ -102,6 +108,13 @@ class ArtifactStore:
             return found
         folder = self.root / step / key
         partial = folder.with_name(f"{key}.partial")
+        sources = {name: path.resolve() for name, path in inputs.items()}
+        announcement = self.root / step / f".{key}.workers"
+        if is_helper():
+            done = wait_for_announcement(announcement, lambda: self.find(step, key))
+            if done is None and distributed:
+                function(config, sources, partial)
+            return done or wait_until(lambda: self.find(step, key))
         with exclusive_lock(self.root / step / f".{key}.lock"):
             if (found := self.find(step, key)) is not None:
                 return found
@@ -113,7 +126,8 @@ class ArtifactStore:
             remove_unfinished(partial)
             logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
             started = time.time()
-            metrics = function(config, {name: path.resolve() for name, path in inputs.items()}, partial)
+            with announced(announcement):
+                metrics = function(config, sources, partial)
             digest = digest_folder(partial)
             manifest = {
                 "step": step,
@@ -200,6 +214,7 @@ def describe_environment() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
+        "processes": int(os.environ.get("WORLD_SIZE", "1")),
         "packages": versions,
         "git_commit": _git_commit(),
     }

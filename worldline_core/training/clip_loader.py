@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +14,7 @@ from worldline_core.actions.action_maps import latent_frame_indices, render_acti
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.errors import ArtifactError
+from worldline_core.model.text import ClipFacts
 from worldline_core.training.clip_sampler import PRIMARY, Clip, ClipBatch
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.text import TextEncoder
@@ -33,7 +35,12 @@ class Batch:
 
 
 class ClipLoader:
-    """Loads batches of clips from the caches."""
+    """Loads batches of clips from the caches.
+
+    Args:
+        text: turns instructions into ids; its prompts may name a clip's duration and size.
+        frame_rates: frames a second of the recordings, by episode; needed with ``text``.
+    """
 
     def __init__(
         self,
@@ -42,6 +49,7 @@ class ClipLoader:
         views: tuple[str, ...],
         tracks: ActionTracks | None = None,
         text: TextEncoder | None = None,
+        frame_rates: Mapping[str, float] | None = None,
         sigma_px_ref: float = 10.0,
         wrist_projection: WristProjection = "current_camera",
         device: str = "cpu",
@@ -50,6 +58,7 @@ class ClipLoader:
         self.views = views
         self.tracks = tracks
         self.text = text
+        self.frame_rates = frame_rates or {}
         self.sigma_px_ref = sigma_px_ref
         self.wrist_projection: WristProjection = wrist_projection
         self.device = device
@@ -79,9 +88,17 @@ class ClipLoader:
         maps = None if self.tracks is None else self.action_maps(batch.clips, views)
         ids = mask = None
         if self.text is not None:
-            ids, mask = self.text([row.instruction for row in rows])
+            facts = [self.clip_facts(clip) for clip in batch.clips]
+            ids, mask = self.text([row.instruction for row in rows], facts)
             ids, mask = ids.to(self.device), mask.to(self.device)
         return Batch(batch.clips, views, latents, maps, ids, mask)
+
+    def clip_facts(self, clip: Clip) -> ClipFacts:
+        """What a prompt may say of a clip: a stride shows its frames at a lower rate."""
+        rate = self.frame_rates.get(clip.episode_id)
+        if rate is None:
+            raise ArtifactError("The frame rate of an episode is not known.", where=clip.episode_id)
+        return ClipFacts(clip.num_frames, rate / clip.stride, self.store.image_size)
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
         """Maps at latent resolution: latent frame j takes the control of video frame 4 j (method.md section 2)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Literal
 
 from worldline_core.actions.tracks import ActionTracks
@@ -15,16 +14,14 @@ logger = logging.getLogger(__name__)
 
 
 def training_rows(
-    store: LatentStore, episodes: Path, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
+    store: LatentStore, episodes: EpisodeSet, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
 ) -> list[LatentRow]:
     """Rows of the store whose episode is in the set, fit for the stage, and (Stage II) has action tracks.
 
     Raises:
         DataError: if none is left.
     """
-    allowed = {
-        row.episode_id for row in EpisodeSet.open(episodes).rows if (row.stage1_ok if stage == 1 else row.stage2_ok)
-    }
+    allowed = {row.episode_id for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)}
     rows = [row for row in store.rows if row.episode_id in allowed]
     fitting = [row for row in rows if tracks is None or row.episode_id in tracks]
     if len(fitting) < len(rows):

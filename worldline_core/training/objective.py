@@ -19,6 +19,7 @@ from worldline_core.training.flow_matching import (
     flow_matching_loss,
     sample_sigmas,
 )
+from worldline_core.training.processes import average_values
 from worldline_core.training.relational import (
     PoolingShape,
     RelationalConfig,
@@ -47,7 +48,9 @@ class RelationalTerm:
         teacher_shape = (taught.shape[2], taught.shape[3], taught.shape[4])
         shape = PoolingShape.common(self.config, student_shape, teacher_shape)
         intra, cross = relational_losses(pool_features(features, shape), pool_features(taught, shape), step)
-        scale_intra, scale_cross = self.scales.update(flow.item(), intra.item(), cross.item(), step)
+        # Over all processes, so that their scales stay equal and one saved state is everyone's.
+        seen = average_values({"flow": flow.item(), "intra": intra.item(), "cross": cross.item()})
+        scale_intra, scale_cross = self.scales.update(seen["flow"], seen["intra"], seen["cross"], step)
         values = {
             "relational_intra": intra.item(),
             "relational_cross": cross.item(),

@@ -14,31 +14,22 @@ from pydantic import Field
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
 from worldline_core.actions.tracks import ActionTracks
-from worldline_core.config.base import StrictModel
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling, source_counts
-from worldline_core.training.episode_rows import training_rows
-from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.objective import FlowMatchingObjective, RelationalTerm
+from worldline_core.training.processes import join_processes
 from worldline_core.training.relational import RelationalConfig
-from worldline_core.training.trainer import (
-    OptimizerConfig,
-    ParameterGroup,
-    TrainerConfig,
-    process_rank,
-    train,
-)
-from worldline_core.training.validation import validation_function
+from worldline_core.training.stage import Stage, StageConfig
+from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
 from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
 
 FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)
 
 
-class Stage2Config(StrictModel):
+class Stage2Config(StageConfig):
     """``start_from``: "stage1" takes a base or Stage I checkpoint, "stage2" goes on with a Stage II checkpoint.
 
     ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
@@ -47,16 +38,10 @@ class Stage2Config(StrictModel):
     """
 
     start_from: Literal["stage1", "stage2"] = "stage1"
-    trainer: TrainerConfig
-    clips: ClipSampling = ClipSampling()
-    splits: tuple[str, ...] = ("train",)
-    validation_splits: tuple[str, ...] = ("validation",)
     action_multiplier: float = Field(default=66.0, gt=0)
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
     sigma_px_ref: float = Field(default=10.0, gt=0)
     wrist_projection: Literal["current_camera", "clip_start_camera"] = "current_camera"
-    sigma: SigmaSampling = SigmaSampling()
-    weighting: LossWeighting = LossWeighting()
     relational: RelationalConfig | None = RelationalConfig()
 
 
@@ -94,31 +79,21 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         ConfigError: if relational terms are asked for without a teacher.
         DataError: if no clip fits, or latents are not finite.
     """
+    device = config.trainer.device
+    processes = join_processes(device)
     torch.manual_seed(config.trainer.seed)
     kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
     model, info = load_checkpoint(Path(inputs["stage1"]), expect_kind=kinds, towers="generation")
-    model.to(config.trainer.device).train()
-    store = LatentStore.open(Path(inputs["latents"]))
+    model.to(device).train()
     tracks = ActionTracks.open(Path(inputs["tracks"]))
-    rows = training_rows(store, Path(inputs["episodes"]), stage=2, tracks=tracks)
+    stage = Stage.open(config, inputs, output, number=2, title="stage II", processes=processes, tracks=tracks)
     loader = ClipLoader(
-        store,
+        stage.store,
         views=model.config.views,
         tracks=tracks,
         sigma_px_ref=config.sigma_px_ref,
         wrist_projection=config.wrist_projection,
-        device=config.trainer.device,
-    )
-    rank, world_size = process_rank()
-    sampler = ClipSampler(
-        store,
-        config.clips,
-        splits=config.splits,
-        batch_size=config.trainer.batch_size,
-        seed=config.trainer.seed,
-        rank=rank,
-        world_size=world_size,
-        rows=rows,
+        device=device,
     )
     objective = FlowMatchingObjective(
         model,
@@ -128,43 +103,13 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         relational=_relational(config, inputs, model),
     )
     groups = stage2_groups(model, config.action_multiplier)
-    result = train(
-        config.trainer,
-        groups=groups,
-        objective=objective,
-        load=lambda index: loader.load(sampler.clips(index)),
-        validate=validation_function(
-            store, config.clips, config.validation_splits, config.trainer, rows, loader, objective
-        ),
-        output=output,
-        identity={
-            "config": config.model_dump(mode="json"),
-            "start": info.weights_sha256,
-            "tokenizer": store.description["tokenizer"],
-        },
-        title="stage II",
-        rank=rank,
-        world_size=world_size,
-    )
-    used = [row for row in rows if row.split in config.splits]
-    metadata = {
-        "step": config.trainer.steps,
-        "seed": config.trainer.seed,
-        "start": {"kind": info.kind, "weights_sha256": info.weights_sha256},
-        "tokenizer": store.description["tokenizer"],
-        "episodes": len(used),
-        "sources": source_counts(used),
-        "metrics": result.metrics,
-    }
-    contract = action_contract(
-        config, store, _fps(Path(inputs["episodes"])), tracks.tracks(used[0].episode_id).controls
-    )
-    if rank == 0:
-        weights = {**model.state_dict(), **result.average}
-        save_checkpoint(output, model, kind="stage2", action_contract=contract, metadata=metadata, state_dict=weights)
-    clips = config.trainer.steps * config.trainer.batch_size * config.trainer.accumulation * world_size
+    result = stage.train(objective, groups, loader, start=info.weights_sha256)
+    controls = tracks.tracks(stage.used[0].episode_id).controls
+    contract = action_contract(config, stage.store, stage.episodes.rows[0].fps, controls)
+    facts = {"start": {"kind": info.kind, "weights_sha256": info.weights_sha256}}
+    counts = stage.save(model, result, kind="stage2", action_contract=contract, facts=facts)
     trained = sum(value.numel() for group in groups for value in group.parameters.values())
-    return {"steps": config.trainer.steps, "clips": clips, "trained_parameters": trained, **result.metrics}
+    return {**counts, "trained_parameters": trained, **result.metrics}
 
 
 def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldModel) -> RelationalTerm | None:
@@ -181,9 +126,3 @@ def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldMo
     teacher = load_teacher(Path(inputs["teacher"]), device=config.trainer.device)
     features = TeacherFeatures(teacher, Path(inputs["episodes"]), cached_clips=config.relational.cached_clips)
     return RelationalTerm(config.relational, features, model.config.num_layers)
-
-
-def _fps(episodes: Path) -> float:
-    from worldline_core.data.episode_set import EpisodeSet
-
-    return EpisodeSet.open(episodes).rows[0].fps

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -22,6 +21,7 @@ from worldline_core.errors import ConfigError, TrainingError
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.metrics_log import MetricsLog
+from worldline_core.training.processes import average_gradients, average_values
 from worldline_core.training.training_state import STATE_FILE, load_training_state, save_training_state
 
 
@@ -50,7 +50,7 @@ class TrainerConfig(StrictModel):
     log_every: int = Field(default=20, ge=1)
     validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
     validation_batches: int = Field(default=4, ge=0)
-    save_every_seconds: float = Field(default=60.0, ge=0)
+    save_every_seconds: float = Field(default=20.0, ge=0)
     save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
 
 
@@ -141,6 +141,8 @@ def train[BatchT: NamedClips](
         raise ConfigError("There is nothing to train.", where=title, expected="at least one trainable parameter")
     optimizer = _optimizer(config.optimizer, groups)
     average = ExponentialAverage(parameters, config.ema_decay)
+    # Another number of processes takes other batches: that is another run.
+    identity = {**identity, **({"processes": world_size} if world_size > 1 else {})}
     fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
     state_path = output / STATE_FILE
     first, sums, count, last = 0, {}, 0, {}
@@ -198,15 +200,6 @@ def train[BatchT: NamedClips](
     return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
 
 
-def process_rank() -> tuple[int, int]:
-    """(rank, world size) as torchrun sets them; (0, 1) otherwise. Joins the process group when there is one."""
-    world_size = int(os.environ.get("WORLD_SIZE", "1"))
-    rank = int(os.environ.get("RANK", "0"))
-    if world_size > 1 and not torch.distributed.is_initialized():
-        torch.distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return rank, world_size
-
-
 def _optimizer(config: OptimizerConfig, groups: Sequence[ParameterGroup]) -> torch.optim.AdamW:
     return torch.optim.AdamW(
         [
@@ -253,10 +246,8 @@ def _step[BatchT: NamedClips](
         for key, value in {"loss": loss.item(), **values}.items():
             totals[key] = totals.get(key, 0.0) + value / config.accumulation
     if world_size > 1:
-        for parameter in parameters.values():
-            if parameter.grad is not None:
-                torch.distributed.all_reduce(parameter.grad)
-                parameter.grad /= world_size
+        average_gradients(parameters.values())
+        totals = average_values(totals)
     norm = float(nn.utils.clip_grad_norm_(parameters.values(), config.optimizer.clip_norm))
     if not math.isfinite(norm):
         raise TrainingError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.overlays import REFERENCE_SIGMA_PX, draw_action_overlay, heat_picture
+from worldline_core.exports.overlay_views import overlay_sheet
+from worldline_core.exports.overlays import SIGMA_PX_REFERENCE, OverlayStyle, heat_picture
 from worldline_core.report.artifacts import read_json
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, table
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from worldline_core.data.episode_set import EpisodeSet
 
 TITLE = "Action maps"
-SHEET_HEIGHT = 256
 LATENT_PIXELS = 8
 CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
 CHANNEL_LABELS = ("heat", "depth", "rot 1", "rot 2", "rot 3", "rot 4", "rot 5", "rot 6", "gripper")
@@ -47,7 +46,7 @@ def actions_section(context: ReportContext) -> Section:
         if row.episode_id not in tracks:
             continue
         try:
-            picture = overlay_sheet(episodes, index, tracks.tracks(row.episode_id), sigma_of(context))
+            picture = episode_overlay(episodes, index, tracks.tracks(row.episode_id), sigma_of(context))
         except DataError as error:
             cards.append(notice(f"No overlay of {row.episode_id}: {error.what}"))
             continue
@@ -92,7 +91,7 @@ def masked_table(folder: Path) -> Html:
 def sigma_of(context: ReportContext) -> float:
     """Sigma on the reference canvas with which the tracks' previews were drawn."""
     config = context.inputs.manifest("render_actions").get("config") or {}
-    return float(config.get("sigma_px_ref", REFERENCE_SIGMA_PX))
+    return float(config.get("sigma_px_ref", SIGMA_PX_REFERENCE))
 
 
 def channels_figure(context: ReportContext, tracks: ActionTracks) -> Html:
@@ -144,38 +143,15 @@ def one_an_embodiment(context: ReportContext) -> list[int]:
     return [chosen[name] for name in sorted(chosen)][: context.config.overlay_episodes]
 
 
-def overlay_sheet(
-    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float = REFERENCE_SIGMA_PX
+def episode_overlay(
+    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float = SIGMA_PX_REFERENCE
 ) -> NDArray[np.uint8]:
-    """A sheet with a row a view and a column a moment.
+    """Four moments of an episode in every view, with what the tracks say drawn over them.
 
     Raises:
         DataError: the episode has no view with a track, or its frames cannot be decoded.
     """
     row = episodes.rows[index]
     moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
-    rows: list[SheetRow] = []
-    for position, view in enumerate(tracks.views):
-        if view not in row.views:
-            continue
-        frames = np.asarray(episodes.frames(index, view, moments))
-        scale = max(1, math.ceil(SHEET_HEIGHT / frames.shape[1]))
-        drawn = [
-            draw_action_overlay(
-                frame, tracks.uv[moment, position], tracks.valid[moment, position], gripper=tracks.gripper[moment, position],
-                rot6d=tracks.rot6d[moment, position], depth=tracks.depth[moment, position], K=tracks.K[position], scale=scale,
-                arms=tracks.arms, sigma_px_ref=sigma_px_ref,
-            )
-            for frame, moment in zip(frames, moments, strict=True)
-        ]  # fmt: skip
-        seen = int(tracks.valid[:, position].any(axis=-1).sum())
-        rows.append(
-            SheetRow(
-                f"{view.replace('_', ' ')}  ·  a tool is in view in {seen} of {tracks.num_frames} frames",
-                np.stack(drawn),
-            )
-        )
-    if not rows:
-        raise DataError("The episode has no view with a track", where=row.episode_id)
-    titles = [f"frame {moment}" for moment in moments]
-    return contact_sheet(rows, tile_height=SHEET_HEIGHT, column_titles=titles)
+    frames = {view: np.asarray(episodes.frames(index, view, moments)) for view in tracks.views if view in row.views}
+    return overlay_sheet(frames, tracks, moments, style=OverlayStyle(sigma_px_ref))

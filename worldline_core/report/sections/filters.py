@@ -11,7 +11,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.exports.labels import Picture
-from worldline_core.exports.overlays import draw_action_overlay
+from worldline_core.exports.overlays import draw_overlay
 from worldline_core.report.artifacts import read_rows
 from worldline_core.report.charts import funnel_chart
 from worldline_core.report.context import ReportContext, Section
@@ -28,6 +28,7 @@ from worldline_core.report.refusals import (
 TITLE = "Filters"
 MOMENTS = 5
 NUMBERS_SHOWN = 5
+SHOWN_HEIGHT = 128
 UNITS = {"_rad_s": " rad/s", "_deg": "°", "_rad": " rad", "_px": " px", "_s": " s", "_m": " m"}
 """Longest suffixes first."""
 
@@ -145,7 +146,7 @@ def moments(context: ReportContext, curated: Path, item: Refusal) -> Picture:
     frames = np.asarray(episodes.frames(index, view, chosen))
     if item.effect == NOT_STAGE2:
         frames = with_tools(context, item.episode_id, view, frames, chosen)
-    return contact_sheet([SheetRow("", frames)], tile_height=128, column_titles=[f"frame {i}" for i in chosen])
+    return contact_sheet([SheetRow("", frames)], tile_height=SHOWN_HEIGHT, column_titles=[f"frame {i}" for i in chosen])
 
 
 def with_tools(
@@ -161,12 +162,8 @@ def with_tools(
     found = tracks.tracks(episode_id)
     if view not in found.views or max(chosen) >= found.num_frames:
         return frames
-    v = found.views.index(view)
     drawn = [
-        draw_action_overlay(
-            frame, found.uv[n, v], found.valid[n, v], gripper=found.gripper[n, v], scale=2, arms=found.arms
-        )
-        for frame, n in zip(frames, chosen, strict=True)
+        draw_overlay(frame, found, n, view, tile_height=SHOWN_HEIGHT) for frame, n in zip(frames, chosen, strict=True)
     ]
     return np.stack(drawn)
 

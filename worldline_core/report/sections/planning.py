@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-from worldline_core.report.artifacts import JsonObject, read_json
+from worldline_core.report.artifacts import JsonObject
 from worldline_core.report.charts import Series, line_chart
-from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.context import ReportContext, Section, evaluation_section
 from worldline_core.report.markup import Column, Html, element, interval, join, number, paragraph, table
-from worldline_core.report.methods import Method, in_order
+from worldline_core.report.methods import TRUE_METHOD, Method, in_order, without_truth
 from worldline_core.report.tiles import Tile, bounds
 
 TITLE = "Planning"
-TRUE_METHOD = "true"
+STEP = "evaluate_planning"
 DIRECT = "direct_execution"
-
-
-def summaries(context: ReportContext) -> list[JsonObject]:
-    """Summaries of every planning evaluation that chose something."""
-    found = [read_json(folder / "summary.json") for folder in context.inputs.variants("evaluate_planning").values()]
-    return [summary for summary in found if summary.get("methods")]
 
 
 def planning_section(context: ReportContext) -> Section:
     """Success against N for every method, direct execution, the selector's ceiling, and gains."""
-    found = summaries(context)
-    if not found:
-        return Section("planning", TITLE, missing="no planning evaluation was given (input evaluate_planning).")
     lead = (
         "From each bank of candidate control sequences one is chosen by its predicted video, in brackets of four; the label of the"
         " choice is opened only after all choices are made. Direct execution takes a candidate blindly. The same selector on the"
         " recorded true videos is its own ceiling."
     )
-    return Section("planning", TITLE, lead, join(evaluation(summary) for summary in found))
+    return evaluation_section(context, STEP, "planning", TITLE, lead, evaluation)
 
 
 def evaluation(summary: JsonObject) -> Html:
     """One evaluation: two charts and tables."""
     methods = summary["methods"]
-    order = in_order([name for name in methods if name != TRUE_METHOD])
+    order = without_truth(methods)
     charts = element("div", success_chart(summary, order), gain_chart(summary, order), class_="grid2")
     oracle = summary.get("oracle")
     reach = f" In {100 * oracle['mean']:.0f}\u202f% of the banks at least one candidate succeeds." if oracle else ""
@@ -113,11 +104,7 @@ def budget_table(summary: JsonObject, order: list[Method]) -> Html:
 def bank_table(summary: JsonObject) -> Html:
     """Every bank, folded away."""
     methods = summary["methods"]
-    order = [
-        name
-        for name in (TRUE_METHOD, *[m.name for m in in_order([n for n in methods if n != TRUE_METHOD])])
-        if name in methods
-    ]
+    order = [name for name in (TRUE_METHOD, *[m.name for m in without_truth(methods)]) if name in methods]
     rows: list[list[object]] = []
     for bank, facts in sorted(summary["banks"].items()):
         chosen = []
@@ -152,9 +139,9 @@ def bank_table(summary: JsonObject) -> Html:
 def planning_tiles(context: ReportContext) -> list[Tile]:
     """Success of the choice among the most candidates beside direct execution."""
     tiles: list[Tile] = []
-    for summary in summaries(context)[:1]:
+    for summary in context.summaries(STEP)[:1]:
         methods = summary["methods"]
-        order = in_order([name for name in methods if name != TRUE_METHOD])
+        order = without_truth(methods)
         if not order:
             continue
         first = order[0]

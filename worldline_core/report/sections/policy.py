@@ -2,42 +2,33 @@
 
 from __future__ import annotations
 
-from worldline_core.report.artifacts import JsonObject, read_json
+from worldline_core.report.artifacts import JsonObject
 from worldline_core.report.charts import Dot, interval_chart
-from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.context import ReportContext, Section, evaluation_section
 from worldline_core.report.markup import Column, Html, element, interval, join, notice, number, table
-from worldline_core.report.methods import Method, in_order
+from worldline_core.report.methods import TRUE_METHOD, Method, without_truth
 from worldline_core.report.tiles import Tile, bounds
 from worldline_core.report.video_scores import SPLIT_LABELS
 
 TITLE = "Policy evaluation"
-TRUE_METHOD = "true"
+STEP = "evaluate_policy"
 ALL = "all"
-
-
-def summaries(context: ReportContext) -> list[JsonObject]:
-    """Summaries of every policy evaluation that judged something."""
-    found = [read_json(folder / "summary.json") for folder in context.inputs.variants("evaluate_policy").values()]
-    return [summary for summary in found if summary.get("methods")]
 
 
 def policy_section(context: ReportContext) -> Section:
     """Accuracy by method, the judge's own ceiling, and confusions."""
-    found = summaries(context)
-    if not found:
-        return Section("policy", TITLE, missing="no policy evaluation was given (input evaluate_policy).")
     lead = (
         "A judge that sees only a video extracts evidence in the task family's schema; fixed rules decide whether the episode"
         " succeeded. As many successes as failures are judged in every split and family. Accuracy is agreement with the recorded"
         " outcome; on the recorded videos themselves it is the judge's own ceiling."
     )
-    return Section("policy", TITLE, lead, join(evaluation(summary) for summary in found))
+    return evaluation_section(context, STEP, "policy", TITLE, lead, evaluation)
 
 
 def evaluation(summary: JsonObject) -> Html:
     """One evaluation: chart, table by group, confusions."""
     methods = summary["methods"]
-    order = in_order([name for name in methods if name != TRUE_METHOD])
+    order = without_truth(methods)
     dots = [dot(m.long_label, methods[m.name], m.colour) for m in order]
     if TRUE_METHOD in methods:
         dots.insert(0, dot("recorded videos (ceiling)", methods[TRUE_METHOD], "c2"))
@@ -65,28 +56,29 @@ def dot(label: str, groups: JsonObject, colour: str) -> Dot | None:
 
 def group_table(methods: JsonObject, order: list[Method]) -> Html:
     """Accuracy by split and by family."""
-    groups = [
-        g
-        for g in sorted({g for values in methods.values() for g in values}, key=lambda g: (g != ALL, g))
-        if "/" not in g
-    ]
+    found_groups = {g for values in methods.values() for g in values if "/" not in g}
+    groups = sorted(found_groups, key=lambda g: (g != ALL, g not in SPLIT_LABELS, g))
+    unreadable = {name: values.get(ALL, {}).get("malformed_answers", 0) for name, values in methods.items()}
     rows: list[list[object]] = []
     names = [(TRUE_METHOD, "recorded videos (ceiling)")] if TRUE_METHOD in methods else []
     for name, label in [*names, *[(m.name, m.long_label) for m in order]]:
-        cells = []
+        cells: list[object] = []
         for group in groups:
             found = methods[name].get(group, {}).get("accuracy")
             cells.append(interval(found["mean"], found["low"], found["high"]) if found else None)
-        overall = methods[name].get(ALL, {})
-        malformed = f"{overall.get('malformed_answers', 0)} of {overall.get('answers', 0)}"
-        rows.append([label, *cells, malformed])
+        if any(unreadable.values()):
+            cells.append(f"{unreadable[name]} of {methods[name].get(ALL, {}).get('answers', 0)}")
+        rows.append([label, *cells])
     columns = [
         Column("Videos of"),
         *[Column(str(SPLIT_LABELS.get(g, g)).replace("_", " ").capitalize(), numeric=True) for g in groups],
     ]
-    return table(
-        [*columns, Column("Unreadable answers", numeric=True)], rows, caption="Accuracy by split and by task family"
-    )
+    caption = "Accuracy by split and by task family"
+    if any(unreadable.values()):
+        columns.append(Column("Unreadable answers", numeric=True))
+    else:
+        caption += ". Every answer of the judge could be read."
+    return table(columns, rows, caption=caption, dense=True)
 
 
 def confusion(label: str, groups: JsonObject) -> Html:
@@ -114,9 +106,9 @@ def confusion(label: str, groups: JsonObject) -> Html:
 def policy_tiles(context: ReportContext) -> list[Tile]:
     """Accuracy of the first model's videos beside the judge's ceiling."""
     tiles: list[Tile] = []
-    for summary in summaries(context)[:1]:
+    for summary in context.summaries(STEP)[:1]:
         methods = summary["methods"]
-        order = in_order([name for name in methods if name != TRUE_METHOD])
+        order = without_truth(methods)
         first = next((m for m in order if m.kind == "stage2"), order[0] if order else None)
         found = methods[first.name].get(ALL, {}).get("accuracy") if first else None
         if first is None or found is None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from worldline_core.report.artifacts import JsonObject, read_json_lines
-from worldline_core.report.charts import Series, line_chart
+from worldline_core.report.charts import Dot, Series, interval_chart, line_chart
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, code, element, join, notice, number, table
 
@@ -28,12 +28,15 @@ LOSSES = {
     "validation/loss_no_actions": "held-out, no actions",
 }
 ERRORS = {
-    "validation/sample_error": "held-out scenes",
-    "validation/sample_error_shuffled_actions": "shuffled actions",
-    "validation/sample_error_no_actions": "no actions",
-    "validation/sample_error_copy": "copy first frame",
+    "validation/sample_error": "squared error of the clean latents",
+    "validation/rollout_error": "squared latent error of four-step rollouts",
 }
-ERROR_COLOURS = ("c0", "c3", "c4", "c5")
+CONDITIONS = {
+    "": ("held-out scenes", "c0"),
+    "_shuffled_actions": ("shuffled actions", "c3"),
+    "_no_actions": ("no actions", "c4"),
+    "_copy": ("copy first frame", "c5"),
+}
 NOT_A_PART = frozenset({"step", "learning_rate", "gradient_norm", "flow_matching", "scale_intra", "scale_cross"})
 MOST_PARTS = 6
 
@@ -109,13 +112,7 @@ def stage_charts(title: str, curves: Mapping[str, Curve]) -> list[Html]:
                 else [marked(label, curves[name], ("c0", "c1", "c3", "c4")[index])]
             )
     charts = [chart(title, "loss", series)]
-    errors = [
-        marked(label, curves[name], colour)
-        for (name, label), colour in zip(ERRORS.items(), ERROR_COLOURS, strict=True)
-        if name in curves
-    ]
-    if errors:
-        charts.append(chart(f"{title}: held-out error", "squared error of the clean latents", errors))
+    charts += [error_chart(f"{title}: held-out error", what, name, curves) for name, what in ERRORS.items()]
     names = [n for n in curves if n not in NOT_A_PART and n not in LOSSES and not n.startswith("validation/")]
     pieces = [
         item
@@ -124,7 +121,22 @@ def stage_charts(title: str, curves: Mapping[str, Curve]) -> list[Html]:
     ]
     if pieces:
         charts.append(chart(f"{title}: parts of the loss", "value", pieces))
-    return charts
+    return [made for made in charts if made]
+
+
+def error_chart(title: str, what: str, name: str, curves: Mapping[str, Curve]) -> Html:
+    """A held-out error with the true controls, with others, and of copying; rows of dots where it was measured once."""
+    found = [
+        (label, curves[name + suffix], colour)
+        for suffix, (label, colour) in CONDITIONS.items()
+        if name + suffix in curves
+    ]
+    if not found:
+        return Html("")
+    if all(len(steps) == 1 for _, (steps, _), _ in found):
+        dots = [Dot(label, values[0], colour=colour) for label, (_, values), colour in found]
+        return interval_chart(dots, title=title, value_label=f"{what}, at the last step", zero_line=True)
+    return chart(title, what, [marked(label, curve, colour) for label, curve, colour in found])
 
 
 def chart(title: str, y_label: str, series: Sequence[Series]) -> Html:

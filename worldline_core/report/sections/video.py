@@ -36,7 +36,8 @@ def video_section(context: ReportContext) -> Section:
         parts.append(element("h3", SPLIT_LABELS.get(group, group).capitalize()))
         parts += [metric_table(scores, group, "head"), second_segmenters(scores, group)]
         iou = next((m for m in IOU_METRICS if any(row["metric"] == m for row in scores.by_frame)), None)
-        charts = [*difference_charts(context, scores, group), over_time(scores, group, iou, "Robot IoU")]
+        drift = [over_time(scores, group, iou, "Robot IoU"), over_time(scores, group, "ssim", "SSIM")]
+        charts = [*difference_charts(context, scores, group), *drift]
         parts.append(element("div", charts, class_="grid2") if any(charts) else Html(""))
         parts.append(folded_tables(scores, group))
     return Section("video", TITLE, lead, join(parts))
@@ -67,7 +68,7 @@ def segmenter_note(scores: VideoScores) -> Html:
                 shown,
             )
         )
-    parts += [notice(code(name), f" is not available: {reason}") for name, reason in sorted(scores.unavailable.items())]
+    parts += [notice(code(name), f": {reason}") for name, reason in sorted(scores.unavailable.items())]
     return join(parts)
 
 
@@ -158,15 +159,10 @@ def folded_tables(scores: VideoScores, group: str) -> Html:
     wrists = [metric_table(scores, group, view) for view in ("left_wrist", "right_wrist")]
     if any(wrists):
         parts.append(element("details", element("summary", "Wrist views"), wrists))
-    drift = over_time(scores, group, "ssim", "SSIM") + over_time(scores, group, "psnr", "PSNR, dB")
+    drift = over_time(scores, group, "psnr", "PSNR, dB")
     if drift:
-        parts.append(
-            element(
-                "details",
-                element("summary", "SSIM and PSNR along the prediction"),
-                element("div", Html(drift), class_="grid2"),
-            )
-        )
+        chart = element("div", drift, class_="grid2")
+        parts.append(element("details", element("summary", "PSNR along the prediction"), chart))
     subgroups = scores.subgroups(group)
     if subgroups:
         rows = []

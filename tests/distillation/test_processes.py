@@ -1,0 +1,109 @@
+"""`tasks.distill` under torchrun: two processes, one artifact; the same bytes after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.store.digest import digest_folder
+
+
+def trainer(steps: int) -> dict[str, object]:
+    return {
+        "steps": steps,
+        "batch_size": 1,
+        "precision": "fp32",
+        "log_every": 6,
+        "validation_batches": 0,
+        "save_every_seconds": 3600,
+        "save_every_steps": 1,
+        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
+    }
+
+
+CONFIG = {
+    "distill": {
+        "clips": {"lengths": [17]},
+        "block_size": 2,
+        "teacher_forcing": {"trainer": trainer(3)},
+        "trajectory_regression": {
+            "trainer": trainer(3),
+            "trajectories": {"clips": 2, "clips_per_shard": 2, "substeps": [1, 1, 1, 1]},
+        },
+        "distribution_matching": {"trainer": trainer(12)},
+    }
+}
+
+
+def start(project: Path, inputs: dict[str, Path], artifacts: Path, log: Path) -> subprocess.Popen[bytes]:
+    config = artifacts.parent / "distill.yaml"
+    config.write_text(yaml.safe_dump(CONFIG))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
+               "tasks.distill", "--config", str(config), "--artifacts", str(artifacts)]  # fmt: skip
+    for name in ("latents", "tracks", "episodes", "stage2", "tokenizer"):
+        command += ["--input", f"{name}={inputs[name]}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(project)}
+    with log.open("ab") as stream:
+        return subprocess.Popen(command, cwd=project, env=environment, stdout=stream, stderr=subprocess.STDOUT)
+
+
+def finish(process: subprocess.Popen[bytes], log: Path, seconds: float = 400) -> str:
+    assert process.wait(timeout=seconds) == 0, log.read_text()[-3000:]
+    return log.read_text()
+
+
+def kill_once_there(process: subprocess.Popen[bytes], folder: Path, pattern: str, seconds: float = 300) -> None:
+    """Kill torchrun and its processes at once, as soon as a file that fits the pattern is there."""
+    until = time.monotonic() + seconds
+    while not any(folder.glob(pattern)):
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    # torchrun starts its processes in sessions of their own: killing it alone would let them finish.
+    workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert len(workers) == 2
+    for identity in (process.pid, *map(int, workers)):
+        os.kill(identity, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.slow
+def test_two_processes_distill_one_artifact_and_go_on_after_a_kill(
+    inputs: dict[str, Path], project_root: Path, tmp_path: Path
+) -> None:
+    whole, parts, log = tmp_path / "whole" / "artifacts", tmp_path / "parts" / "artifacts", tmp_path / "log"
+    for folder in (whole, parts):
+        folder.mkdir(parents=True)
+    inputs["tokenizer"].mkdir()  # read only for the perceptual term, which is off
+    text = finish(start(project_root, inputs, whole, log), log)
+    (artifact,) = [path for path in (whole / "distill").iterdir() if path.is_dir()]
+    assert (artifact / "manifest.json").is_file()
+    assert text.count(str(artifact)) == 2  # both processes say where it is
+    assert not list((whole / "distill").glob(".*.workers"))
+    manifest = json.loads((artifact / "manifest.json").read_text())
+    assert manifest["environment"]["processes"] == 2
+    model, info = load_checkpoint(artifact, expect_kind="causal")
+    assert info.metadata["distillation"] == "distribution_matching"
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
+
+    kill_once_there(
+        start(project_root, inputs, parts, log), parts, "distill/*.partial/run/teacher_forcing/run/*/state.*"
+    )
+    (partial,) = (parts / "distill").glob("*.partial")
+    assert not (partial / "checkpoint.json").exists()
+    finish(start(project_root, inputs, parts, log), log)
+    again = parts / "distill" / artifact.name
+    assert json.loads((again / "manifest.json").read_text())["resumed"] is True
+    assert digest_folder(again) == digest_folder(artifact) == manifest["digest"]
+
+    text = finish(start(project_root, inputs, whole, tmp_path / "cached.log"), tmp_path / "cached.log")
+    assert text.count("cached") >= 2

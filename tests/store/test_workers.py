@@ -1,0 +1,94 @@
+"""Several processes of one launch on one step: one owner, helpers that neither wait for its lock nor work alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Mapping
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from worldline_core.config import StrictModel
+from worldline_core.store.store import ArtifactStore
+
+CONTEXT = multiprocessing.get_context("fork")
+
+
+class WorkConfig(StrictModel):
+    seconds: float = 0.0
+
+
+def work(config: WorkConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    """The first process writes the content; every process notes that it took part."""
+    rank = os.environ["RANK"]
+    (output / "run").mkdir(exist_ok=True)
+    (output / "run" / f"rank-{rank}").touch()
+    time.sleep(config.seconds)
+    if rank == "0":
+        (output / "content").write_text("made")
+    return {}
+
+
+def process(root: Path, rank: int, *, distributed: bool, results: Queue[Any], port: int = 29500) -> None:
+    os.environ.update(WORLD_SIZE="2", RANK=str(rank), MASTER_PORT=str(port))
+    artifact = ArtifactStore(root).run("work", 1, work, WorkConfig(seconds=1.0), {}, distributed=distributed)
+    results.put((rank, str(artifact.path), artifact.digest, artifact.cached))
+
+
+def launch(root: Path, *, distributed: bool) -> list[tuple[int, str, str, bool]]:
+    results: Queue[Any] = CONTEXT.Queue()
+    options = {"distributed": distributed, "results": results}
+    # The helper comes first: it has to wait for the owner to begin.
+    processes = []
+    for rank in (1, 0):
+        processes.append(CONTEXT.Process(target=process, args=(root, rank), kwargs=options))
+        processes[-1].start()
+        time.sleep(0.3)
+    found = [results.get(timeout=30) for _ in processes]
+    for one in processes:
+        one.join(timeout=30)
+        assert one.exitcode == 0
+    return sorted(found)
+
+
+@pytest.mark.parametrize("distributed", [True, False])
+def test_one_process_owns_the_artifact(tmp_path: Path, distributed: bool) -> None:
+    first, second = launch(tmp_path, distributed=distributed)
+    assert first[1:3] == second[1:3]
+    folder = Path(first[1])
+    took_part = sorted(path.name for path in (folder / "run").iterdir())
+    assert took_part == (["rank-0", "rank-1"] if distributed else ["rank-0"])
+    assert (folder / "content").read_text() == "made"
+    assert sorted(path.suffix for path in folder.parent.iterdir() if path.is_file()) == [
+        ".lock"
+    ]  # no announcement is left
+    again = launch(tmp_path, distributed=distributed)
+    assert [cached for *_, cached in again] == [True, True]
+
+
+def test_a_helper_does_not_join_work_of_another_launch(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    key = store.key("work", 1, WorkConfig(seconds=1.0), {})
+    partial = tmp_path / "work" / f"{key}.partial"
+    partial.mkdir(parents=True)
+    results: Queue[Any] = CONTEXT.Queue()
+    options = {"distributed": True, "results": results}
+    # Someone else is at work, and says so under another address.
+    (tmp_path / "work" / f".{key}.workers").write_bytes(b"another launch")
+    helper = CONTEXT.Process(target=process, args=(tmp_path, 1), kwargs=options)
+    helper.start()
+    time.sleep(0.8)
+    assert helper.is_alive()
+    assert not (partial / "run").exists()
+    owner = CONTEXT.Process(target=process, args=(tmp_path, 0), kwargs=options)
+    owner.start()
+    processes = [helper, owner]
+    found = sorted(results.get(timeout=30) for _ in processes)
+    for one in processes:
+        one.join(timeout=30)
+    assert found[0][1:3] == found[1][1:3]
+    assert sorted(path.name for path in (Path(found[0][1]) / "run").iterdir()) == ["rank-0", "rank-1"]

@@ -1,0 +1,115 @@
+"""What the text tower is fed: bytes for the embedded default, the backbone's own chat prompt at full size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from worldline_core.config import load_config
+from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
+from worldline_core.model.text import ClipFacts, Cosmos3Text
+from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_sampler import Clip, ClipBatch
+from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.objective import FlowMatchingObjective
+from worldline_core.training.stage1 import Stage1Config, train_stage1
+from worldline_core.training.text import TextConfig, load_text_encoder
+
+CLIP = ClipFacts(17, 8.0, (32, 32))
+
+
+def test_stage1_feeds_the_chat_prompt_of_each_clip(
+    world: Any,
+    tiny_model: dict[str, Any],
+    write_text_tokenizer: Callable[..., None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_text_tokenizer(tmp_path / "tokenizer")
+    config = Stage1Config.model_validate(
+        {
+            "model": tiny_model,
+            "text": {"kind": "cosmos3", "path": str(tmp_path / "tokenizer"), "max_length": 200},
+            "text_dropout": 0.0,
+            "clips": {"lengths": [9], "view_weights": {"primary": 1}},
+            "trainer": {"steps": 2, "batch_size": 2, "validation_batches": 0},
+        }
+    )
+    seen: list[Batch] = []
+    inner = FlowMatchingObjective.loss
+
+    def loss(self: FlowMatchingObjective, batch: Batch, generator: torch.Generator, step: int) -> Any:
+        seen.append(batch)
+        return inner(self, batch, generator, step)
+
+    monkeypatch.setattr(FlowMatchingObjective, "loss", loss)
+    train_stage1(config, world.inputs, tmp_path / "out")
+    tokenizer = Cosmos3Text(tmp_path / "tokenizer").tokenizer
+    assert len(seen) == 2
+    for batch in seen:
+        assert batch.text_ids is not None
+        assert batch.text_mask is not None
+        for clip, ids, mask in zip(batch.clips, batch.text_ids, batch.text_mask, strict=True):
+            number = int(clip.episode_id.removeprefix("episode-"))
+            # 9 frames at 8 a second; the synthetic pictures are 32 pixels high and wide.
+            chat = [
+                {
+                    "role": "system",
+                    "content": "You are a helpful assistant who will generate videos from a give prompt.",
+                },
+                {
+                    "role": "user",
+                    "content": f"move {number}. The video is 1.1 seconds long and is of 8 FPS."
+                    " This video is of 32x32 resolution.",
+                },
+            ]
+            text = tokenizer.apply_chat_template(chat, tokenize=False, add_generation_prompt=True)
+            expected = [
+                *tokenizer(text)["input_ids"],
+                *tokenizer.convert_tokens_to_ids(["<|im_end|>", "<|vision_start|>"]),
+            ]
+            assert ids[mask].tolist() == expected
+
+
+def test_a_stride_slows_the_frames_that_the_prompt_names(world: Any) -> None:
+    asked: list[ClipFacts] = []
+
+    def record(texts: list[str], clips: list[ClipFacts]) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.extend(clips)
+        return torch.ones(len(texts), 1, dtype=torch.long), torch.ones(len(texts), 1, dtype=torch.bool)
+
+    store = LatentStore.open(world.latents)
+    loader = ClipLoader(store, views=("head",), text=record, frame_rates={"episode-000": 8.0})
+    assert loader.clip_facts(Clip("episode-000", 0, 9, 2)) == ClipFacts(9, 4.0, (32, 32))
+    loader.load(ClipBatch((Clip("episode-000", 0, 9, 1),), "head"))
+    assert asked == [ClipFacts(9, 8.0, (32, 32))]
+    with pytest.raises(ArtifactError, match="frame rate of an episode is not known"):
+        loader.load(ClipBatch((Clip("episode-001", 0, 9, 1),), "head"))
+
+
+def test_bytes_are_what_the_shipped_checkpoints_were_trained_on() -> None:
+    ids, mask = load_text_encoder(TextConfig(max_length=6), 300)([" Lift ", "put it down"], [CLIP, CLIP])
+    # Bytes of "lift" and "put i" are shifted by two, 1 ends a text, 0 pads.
+    assert ids.tolist() == [[110, 107, 104, 118, 1, 0], [114, 119, 118, 34, 107, 1]]
+    assert mask.tolist() == [[True] * 5 + [False], [True] * 6]
+
+
+def test_the_full_size_preset_reads_the_backbones_tokenizer() -> None:
+    config = load_config(Stage1Config, preset="cosmos3-nano", section="train_stage1")
+    assert config.text.kind == "cosmos3"
+    with pytest.raises(UnavailableError, match="text tokenizer is not here"):
+        load_text_encoder(config.text, 151_936)
+
+
+def test_text_that_does_not_fit_the_model_is_refused(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> None:
+    with pytest.raises(ConfigError, match="vocabulary is too small"):
+        load_text_encoder(TextConfig(), 100)
+    with pytest.raises(ConfigError, match="needs a folder"):
+        load_text_encoder(TextConfig(kind="cosmos3"), 300)
+    write_text_tokenizer(tmp_path)
+    with pytest.raises(ConfigError, match="vocabulary is too small"):
+        load_text_encoder(TextConfig(kind="cosmos3", path=str(tmp_path)), 20)
