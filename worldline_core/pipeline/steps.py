@@ -63,7 +63,7 @@ def _matches(name: str, pattern: str) -> bool:
 _STEPS = (
     Step(
         "curate",
-        1,
+        2,
         "worldline_core.data.curate",
         "curate",
         "CurateConfig",
@@ -169,7 +169,7 @@ _STEPS = (
     ),
     Step(
         "rollout",
-        1,
+        2,
         "worldline_core.rollout.rollout",
         "rollout",
         "RolloutConfig",
