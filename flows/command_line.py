@@ -46,11 +46,74 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument(
         "--output", type=Path, default=None, help="where the pictures go (default: the artifact's run/)"
     )
+    inspect.add_argument(
+        "--episodes",
+        type=Path,
+        metavar="FOLDER",
+        help="the EpisodeSet of tracks or predictions (default: see manifest)",
+    )
+    inspect.add_argument("--episode", metavar="ID", help="which episode to show (default: several, or the first one)")
+    inspect.add_argument("--video", action="store_true", help="write an mp4 with the controls drawn over all views")
+    inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording (open it with: rerun FILE)")
+    inspect.add_argument(
+        "--page", nargs="?", type=int, const=12, metavar="N", help="write a page to browse N episodes (12; 0: all)"
+    )
     inspect.set_defaults(run=_inspect)
+    _add_embodiment(commands)
+    _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
     doctor.add_argument("--json", action="store_true", help="print JSON")
     doctor.set_defaults(run=_doctor)
     return parser
+
+
+def _add_embodiment(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    embodiment = commands.add_parser("embodiment", help="list robots, show one, prove its kinematics")
+    actions = embodiment.add_subparsers(dest="embodiment_command", required=True, metavar="ACTION")
+    listing = actions.add_parser("list", help="all robots: arms, state size, whether the description is here, verified")
+    listing.set_defaults(run=_embodiment_list)
+    show = actions.add_parser("show", help="state columns, limits, grippers, tools and cameras of a robot")
+    show.set_defaults(run=_embodiment_show)
+    check = actions.add_parser(
+        "check",
+        help="compare forward kinematics with MuJoCo (extra: sim)",
+        description="Compare forward kinematics with MuJoCo at random joint positions within the limits. Exit status:"
+        " 0 all frames agree, 1 not (or nothing could be compared), 2 wrong usage.",
+    )
+    check.add_argument("--samples", type=int, default=1000, help="random joint positions (default: 1000)")
+    check.add_argument("--seed", type=int, default=0)
+    check.set_defaults(run=_embodiment_check)
+    for action in (show, check):
+        action.add_argument("name", metavar="NAME", help="a name of the list, or a YAML file")
+        action.add_argument("--description", type=Path, metavar="FILE", help="the kinematic description to use")
+    for action in (listing, check):
+        action.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    calibrate = commands.add_parser("calibrate", help="find out whether recordings agree with their calibration")
+    actions = calibrate.add_subparsers(dest="calibrate_command", required=True, metavar="ACTION")
+    check = actions.add_parser(
+        "check",
+        help="diagnose episodes, name the mistake, print the line that repairs it",
+        description="Diagnose every episode of a source, or of an EpisodeSet. Exit status: 0 consistent, 1 something"
+        " was found (or nothing could be judged), 2 wrong usage.",
+    )
+    what = check.add_mutually_exclusive_group(required=True)
+    what.add_argument("config", nargs="?", type=Path, metavar="SOURCE_CONFIG.yaml", help="a file with a curate section")
+    what.add_argument("--artifact", type=Path, metavar="FOLDER", help="an EpisodeSet instead of a source")
+    check.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value of the file"
+    )
+    check.add_argument(
+        "--episode", action="append", default=[], metavar="ID", dest="episodes", help="only this one (repeatable)"
+    )
+    check.add_argument(
+        "--output", type=Path, help="where pictures and diagnoses.json go (default: artifacts/calibration/<name>)"
+    )
+    check.add_argument("--no-pictures", action="store_false", dest="pictures", help="draw nothing")
+    check.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    check.set_defaults(run=_calibrate_check)
 
 
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +169,77 @@ def _record(arguments: argparse.Namespace) -> None:
 def _inspect(arguments: argparse.Namespace) -> None:
     from worldline_core.report.inspect import inspect
 
-    print(inspect(arguments.artifact, arguments.output))
+    found = inspect(
+        arguments.artifact,
+        arguments.output,
+        episodes=arguments.episodes,
+        episode_id=arguments.episode,
+        video=arguments.video,
+        rerun=arguments.rerun,
+        page=arguments.page,
+    )
+    print(found)
+
+
+def _calibrate_check(arguments: argparse.Namespace) -> None:
+    import json
+    import sys
+
+    from worldline_core.errors import WorldLineError
+
+    try:
+        from worldline_core.calibration.check_command import check_command
+        from worldline_core.calibration.check_report import as_json, table_text
+
+        found = check_command(
+            arguments.config,
+            arguments.artifact,
+            overrides=arguments.overrides,
+            episodes=arguments.episodes,
+            output=arguments.output,
+            pictures=arguments.pictures,
+        )
+    except WorldLineError as error:
+        # 1 says that something was found; what cannot be checked at all is another status.
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    print(json.dumps(as_json(found), indent=1) if arguments.json else table_text(found))
+    raise SystemExit(0 if found.consistent else 1)
+
+
+def _embodiment_list(arguments: argparse.Namespace) -> None:
+    from worldline_core.geometry.embodiment_report import format_list, list_embodiments
+
+    rows = list_embodiments()
+    if arguments.json:
+        import json
+
+        print(json.dumps(rows, indent=1))
+    else:
+        print(format_list(rows))
+
+
+def _embodiment_show(arguments: argparse.Namespace) -> None:
+    from worldline_core.geometry.embodiment import load_embodiment
+    from worldline_core.geometry.embodiment_report import describe_embodiment
+
+    print(describe_embodiment(load_embodiment(arguments.name, arguments.description)))
+
+
+def _embodiment_check(arguments: argparse.Namespace) -> None:
+    from worldline_core.geometry.embodiment import load_embodiment
+    from worldline_core.geometry.embodiment_check import check_embodiment
+    from worldline_core.geometry.embodiment_report import check_as_json, format_check
+
+    check = check_embodiment(load_embodiment(arguments.name, arguments.description), arguments.samples, arguments.seed)
+    if arguments.json:
+        import json
+
+        print(json.dumps(check_as_json(check), indent=1))
+    else:
+        print(format_check(check))
+    if not check.passed:
+        raise SystemExit(1)
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

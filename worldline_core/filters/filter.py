@@ -29,6 +29,7 @@ from worldline_core.errors import DataError
 from worldline_core.filters.base_motion import BaseMotionConfig
 from worldline_core.filters.calibration import CalibrationConfig
 from worldline_core.filters.corrupted import CorruptedConfig
+from worldline_core.filters.doctor import FilterDoctorConfig
 from worldline_core.filters.inspect_episode import Finding, inspect
 from worldline_core.filters.projection import ProjectionConfig
 from worldline_core.filters.reset import ResetConfig
@@ -53,6 +54,7 @@ class FilterConfig(StrictModel):
     calibration: CalibrationConfig = CalibrationConfig()
     time_alignment: TimeAlignmentConfig = TimeAlignmentConfig()
     projection: ProjectionConfig = ProjectionConfig()
+    doctor: FilterDoctorConfig = FilterDoctorConfig()
 
 
 FINDINGS_FILE = "findings.parquet"

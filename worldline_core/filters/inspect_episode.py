@@ -15,6 +15,7 @@ from worldline_core.filters.calibration import (
     detect_hand_eye,
 )
 from worldline_core.filters.corrupted import detect_corrupted
+from worldline_core.filters.doctor import detect_mistake
 from worldline_core.filters.projection import detect_projection
 from worldline_core.filters.reset import detect_reset
 from worldline_core.filters.signals import Signals
@@ -49,7 +50,25 @@ def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
         findings += _time_alignment(config, signals, signals.T_base_tool)
         findings += _calibration(config, signals, signals.T_base_tool)
         findings += _projection(config, signals, signals.T_base_tool)
+        findings = _with_mistake(config, signals, findings)
     return findings
+
+
+def _with_mistake(config: FilterConfig, signals: Signals, findings: list[Finding]) -> list[Finding]:
+    """The findings with the calibration doctor's: before the other Stage II findings where it explains them."""
+    num_frames = len(next(iter(signals.gray.values())))
+    bad = np.zeros(num_frames, dtype=bool)
+    for finding in findings:
+        if finding.stage == 1 and not finding.verdict.passed:
+            return findings  # the episode is dropped whole: its calibration is nobody's concern
+        if finding.verdict.bad_frames is not None:
+            bad |= finding.verdict.bad_frames
+    verdict = detect_mistake(signals.episode, signals.gray, bad, config.doctor)
+    found = Finding("doctor", None, 2, verdict)
+    if verdict.numbers["verdict"] != "explained":
+        return [*findings, found]
+    first = next((i for i, f in enumerate(findings) if f.stage == 2 and f.detector != "required_views"), len(findings))
+    return [*findings[:first], found, *findings[first:]]
 
 
 def _arms_of(signals: Signals, view: str) -> tuple[int, ...]:

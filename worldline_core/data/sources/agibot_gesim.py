@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from worldline_core.data.conventions import along_tool_z
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.rejection import RejectedInputError
@@ -107,7 +108,7 @@ class AgibotGesimSource:
             state=state.astype(np.float32),
             action=state.astype(np.float32),
             cameras=cameras,
-            T_base_ee=along_z(poses, config.tool_offset_v1_m),
+            T_base_ee=along_tool_z(poses, config.tool_offset_v1_m),
             gripper=opening,
             state_names=tuple(
                 f"{arm}/{name}"
@@ -158,7 +159,7 @@ class AgibotGesimSource:
             state=state.astype(np.float32),
             action=action.astype(np.float32),
             cameras=cameras,
-            T_base_ee=along_z(poses, config.tool_offset_v2_m),
+            T_base_ee=along_tool_z(poses, config.tool_offset_v2_m),
             gripper=opening,
             state_names=tuple(names),
             video_frames=_fewer(1, num_frames, folder),
@@ -173,13 +174,6 @@ class AgibotGesimSource:
         )
         first: Callable[[str], np.ndarray] = lambda view: _read_png(folder / _IMAGE_V2[view])[None]  # noqa: E731
         return LoadedEpisode(episode, VIEWS, first, no_masks, config.lenses)
-
-
-def along_z(poses: np.ndarray, offset_m: float) -> np.ndarray:
-    """Poses (..., 4, 4) moved along their own +z."""
-    moved = poses.copy()
-    moved[..., :3, 3] += offset_m * poses[..., :3, 2]
-    return moved
 
 
 def _fewer(images: int, states: int, folder: Path) -> int | None:

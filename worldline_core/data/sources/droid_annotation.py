@@ -13,11 +13,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from worldline_core.data.conventions import along_tool_z
 from worldline_core.data.episode import Episode
 from worldline_core.data.lerobot_v3 import read_json
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.data.source_paths import inside
-from worldline_core.data.sources.agibot_gesim import along_z
 from worldline_core.data.sources.base import ForeignSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.video import decode_video, video_size
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
@@ -88,7 +88,7 @@ class DroidAnnotationSource:
             state=state.astype(np.float32),
             action=(state if command is None else command).astype(np.float32),
             timestamps=np.arange(len(states)) / fps,
-            T_base_ee=along_z(pose, config.tool_offset_m),
+            T_base_ee=along_tool_z(pose, config.tool_offset_m),
             gripper=opening,
             state_names=(*(f"right/joint_{index}" for index in range(1, 8)), "right/gripper"),
             conventions={

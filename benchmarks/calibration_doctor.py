@@ -1,0 +1,344 @@
+"""How often the calibration doctor names a mistake: every usual one, injected one at a time into healthy recordings.
+
+Run: `python benchmarks/calibration_doctor.py [--splits test,ood_test] [--every 1] [--mistakes ...] [--output out.json]`.
+Recordings with an injected defect (injected_defects.json) are left out. Quaternion, Euler, pose unit and tool offset are
+injected into the same episodes rewritten as tool poses by forward kinematics. `--without-mounts` withholds the wrist
+cameras' stated mounts from the doctor; `--imperfect` disturbs the recordings as careful calibration would; `--typical` prints what healthy episodes reach, where the typical values of
+`CalibrationDoctorConfig` come from (use it on the training split only).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from worldline_core.calibration.diagnosis import Diagnosis
+from worldline_core.calibration.doctor import CalibrationDoctorConfig, diagnose, diagnose_set
+from worldline_core.calibration.observation import small_gray
+from worldline_core.data.convention_needs import applicable
+from worldline_core.data.conventions import (
+    RecordedConventions,
+    apply_conventions,
+    corrupt,
+    corrupted_image_frames,
+)
+from worldline_core.data.episode import Episode
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
+from worldline_core.store.atomic import write_json_atomic
+
+RECORDINGS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "recordings"
+LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
+OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
+SCALES = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.33)
+
+
+@dataclass(frozen=True)
+class Healthy:
+    """A healthy episode with its small grey images, as joints and as tool poses."""
+
+    joints: Episode
+    poses: Episode
+    gray: dict[str, np.ndarray]
+    kinematics: ArmKinematics | None
+
+
+def as_tool_poses(episode: Episode, kinematics: ArmKinematics) -> Episode:
+    """The same episode as a source that records tool poses would give it: xyz, quaternion xyzw, gripper for each arm."""
+    arms = kinematics.embodiment.arms
+    blocks = []
+    for values in (episode.state, episode.action):
+        tools = kinematics.tool_poses(values.astype(np.float64)).numpy()
+        opening = kinematics.gripper(values.astype(np.float64)).numpy()
+        quaternion = quaternion_xyzw_from_rotation(tools[..., :3, :3])
+        block = np.concatenate([tools[..., :3, 3], quaternion, opening[..., None]], axis=-1)
+        blocks.append((tools, opening, block.reshape(len(values), -1).astype(np.float32)))
+    names = tuple(f"{arm.name}/{n}" for arm in arms for n in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper"))
+    return replace(
+        episode,
+        state=blocks[0][2],
+        action=blocks[1][2],
+        T_base_ee=blocks[0][0],
+        gripper=blocks[0][1],
+        state_names=names,
+        state_kind="ee_pose",
+    )
+
+
+def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
+    """The same robot whose wrist camera mounts nobody wrote down."""
+    embodiment = kinematics.embodiment
+    arms = tuple(
+        arm.model_copy(update={"wrist_camera": arm.wrist_camera and arm.wrist_camera.model_copy(update={"link": ""})})
+        for arm in embodiment.arms
+    )
+    stripped = object.__new__(ArmKinematics)
+    stripped.__dict__.update(kinematics.__dict__)
+    stripped.embodiment = embodiment.model_copy(update={"arms": arms})
+    return stripped
+
+
+def imperfect(episode: Episode, seed: int) -> Episode:
+    """The episode as a careful laboratory would have it: calibrated to millimetres, not to rounding.
+
+    Camera mounts off by 5 mm and 1 degree and unsteady by 1 mm and 0.2 degrees, fixed cameras off by 10 mm and 1 degree,
+    focal lengths by 1.5 %, principal points by 1 % of the image, joints noisy by 0.002 rad (standard deviations).
+    """
+    random = np.random.default_rng(seed)
+
+    def disturbed(poses: np.ndarray, metres: float, degrees: float, count: int) -> np.ndarray:
+        angles = random.normal(0, np.radians(degrees) / np.sqrt(3), (count, 3))
+        return poses @ pose_from_euler_fixed_xyz(random.normal(0, metres / np.sqrt(3), (count, 3)), angles)
+
+    cameras = {}
+    for view, camera in episode.cameras.items():
+        poses = disturbed(camera.T_base_camera, *((0.005, 1.0) if camera.moving else (0.01, 1.0)), 1)
+        if camera.moving:
+            poses = disturbed(poses, 0.001, 0.2, len(poses))
+        K = camera.K.copy()
+        K[[0, 1], [0, 1]] *= 1 + random.normal(0, 0.015)
+        K[:2, 2] += random.normal(0, 0.01, 2) * (camera.width, camera.height)
+        cameras[view] = replace(camera, K=K, T_base_camera=poses)
+    state = episode.state + random.normal(0, 0.002, episode.state.shape).astype(np.float32)
+    return replace(episode, cameras=cameras, state=state)
+
+
+def healthy(root: Path, splits: set[str], every: int, disturb: bool) -> Iterator[Healthy]:
+    episodes = EpisodeSet.open(root)
+    defects = json.loads((root / "injected_defects.json").read_text())
+    chosen = [i for i, row in enumerate(episodes.rows) if row.split in splits and row.episode_id not in defects]
+    kinematics: dict[str, ArmKinematics] = {}
+    for i in chosen[::every]:
+        episode = imperfect(episodes.episode(i), i) if disturb else episodes.episode(i)
+        if episode.embodiment not in kinematics:
+            kinematics[episode.embodiment] = ArmKinematics(load_embodiment(episode.embodiment))
+        robot = kinematics[episode.embodiment]
+        gray = {view: small_gray(episodes.frames(i, view)) for view in episodes.rows[i].views}
+        yield Healthy(episode, as_tool_poses(episode, robot), gray, robot)
+
+
+def agibot(root: Path, description: Path) -> Iterator[Healthy]:
+    """AgiBot's published samples below a folder: few pictures, tool poses recorded; those of v1 without their own lag.
+
+    v2 comes with joints, whose kinematics (`description`: its URDF) say what the wrist cameras follow.
+    """
+    source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)
+    kinematics = ArmKinematics(load_embodiment("agibot_g1", description))
+    for name in source.episode_ids():
+        loaded = source.load(name)
+        gray = {view: small_gray(loaded.frames(view)) for view in loaded.views}
+        episode, joints = loaded.episode, loaded.episode.state_kind == "joints"
+        if not joints:
+            episode = apply_conventions(episode, RecordedConventions(camera_lag_frames=2))
+        yield Healthy(episode, episode, gray, kinematics if joints else None)
+
+
+def observable(name: str, episode: Healthy, diagnosis: Diagnosis, config: CalibrationDoctorConfig) -> bool:
+    """Whether a recording holds anything that a mistake would change in a way that can be known to be wrong."""
+    kinematics, state = episode.kinematics, episode.joints.state_kind
+    if name == "image_lag_frames":
+        return min(len(images) for images in episode.gray.values()) > config.min_image_pairs
+    if name == "tool_offset_z_m":  # joints beside the recorded poses, or a wrist camera whose mount is stated
+        mounted = kinematics is not None and any(arm.wrist_camera is not None for arm in kinematics.embodiment.arms)
+        return mounted or (kinematics is not None and state == "joints" and episode.poses is episode.joints)
+    if name == "gripper":  # moves, before a camera or against an object
+        return any(term.startswith(("fingers", "stopped")) for term in diagnosis.none.evidence)
+    if name == "angle_unit" and kinematics is None:
+        return bool((np.abs(np.degrees(episode.joints.state)) > 4 * np.pi).any())
+    return True
+
+
+def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, RecordedConventions]]:
+    """(name, episode to spoil, conventions); numbers vary with `choice`, the same for a whole source."""
+    height, width = (
+        next(iter(episode.joints.cameras.values())).height,
+        next(iter(episode.joints.cameras.values())).width,
+    )
+    scale = SCALES[choice % len(SCALES)]
+    size = (round(height * scale), round(width * scale))
+    cases = [
+        ("none", episode.joints, RecordedConventions()),
+        ("none (tool poses)", episode.poses, RecordedConventions()),
+        ("extrinsics", episode.joints, RecordedConventions(extrinsics="base_to_camera")),
+        ("camera_axes", episode.joints, RecordedConventions(camera_axes="opengl")),
+        ("extrinsics_unit", episode.joints, RecordedConventions(extrinsics_unit="mm")),
+        ("pose_unit", episode.poses, RecordedConventions(pose_unit="mm")),
+        ("quaternion", episode.poses, RecordedConventions(quaternion="wxyz")),
+        ("euler", episode.poses, RecordedConventions(euler="moving_xyz")),
+        ("angle_unit", episode.joints, RecordedConventions(angle_unit="deg")),
+        ("arms", episode.joints, RecordedConventions(arms="exchanged")),
+        ("tool_offset_z_m", episode.poses, RecordedConventions(tool_offset_z_m=OFFSETS_M[choice % len(OFFSETS_M)])),
+        ("intrinsics_size", episode.joints, RecordedConventions(intrinsics_size=size)),
+        ("camera_lag_frames", episode.joints, RecordedConventions(camera_lag_frames=LAGS[choice % len(LAGS)])),
+        ("image_lag_frames", episode.joints, RecordedConventions(image_lag_frames=LAGS[choice % len(LAGS)])),
+        ("gripper", episode.joints, RecordedConventions(gripper="inverted")),
+    ]
+    for name, base, conventions in cases:
+        repeated = name == "none (tool poses)" and episode.poses is episode.joints
+        if not repeated and all(applicable(base, field) for field in conventions.departures):
+            yield name, base, conventions
+
+
+def examine(
+    episode: Healthy, base: Episode, conventions: RecordedConventions, config: CalibrationDoctorConfig, mounts: bool
+) -> Diagnosis:
+    spoiled = corrupt(base, conventions)
+    images = corrupted_image_frames(base.num_frames, conventions)
+    gray = {view: values[images] for view, values in episode.gray.items()}
+    kinematics = episode.kinematics
+    if kinematics is not None and not mounts:
+        kinematics = without_mounts(kinematics)
+    return diagnose(spoiled, gray, kinematics, config)
+
+
+def named(diagnosis: Diagnosis) -> str:
+    return diagnosis.best.mistake if diagnosis.verdict == "explained" else diagnosis.verdict
+
+
+def right(name: str, conventions: RecordedConventions, found: str, value: RecordedConventions) -> bool:
+    """The mistake by name, a lag to within a frame; a healthy episode must not be called anything."""
+    if name.startswith("none"):
+        return found in ("consistent", "too_little_evidence")
+    if found != name:
+        return False
+    if name.endswith("lag_frames"):
+        return abs(getattr(value, name) - getattr(conventions, name)) <= 1
+    return True
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recordings", type=Path, default=RECORDINGS)
+    parser.add_argument("--splits", default="test,ood_test")
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--mistakes", default="", help="comma-separated; default: all")
+    parser.add_argument("--without-mounts", action="store_true")
+    parser.add_argument("--imperfect", action="store_true", help="disturb the healthy calibration by millimetres first")
+    parser.add_argument("--agibot", type=Path, help="folder of AgiBot (GE-Sim) samples to spoil instead")
+    parser.add_argument("--agibot-urdf", type=Path, help="kinematic description of the AgiBot G1")
+    parser.add_argument("--typical", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--output", type=Path)
+    arguments = parser.parse_args()
+    config = CalibrationDoctorConfig()
+    wanted = {name for name in arguments.mistakes.split(",") if name}
+    confusion: dict[str, Counter[str]] = defaultdict(Counter)
+    correct: dict[str, list[bool]] = defaultdict(list)
+    sets: dict[tuple[str, str], list[Diagnosis]] = defaultdict(list)
+    truth: dict[tuple[str, str], RecordedConventions] = {}
+    lag_errors: dict[str, list[float]] = defaultdict(list)
+    measures: dict[str, list[float]] = defaultdict(list)
+    spent, count = 0.0, 0
+    unobservable: Counter[str] = Counter()
+    if arguments.agibot is not None:
+        items = agibot(arguments.agibot, arguments.agibot_urdf)
+    else:
+        items = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every, arguments.imperfect)
+    for number, episode in enumerate(items):
+        for name, base, conventions in injected(episode, number):
+            if wanted and name not in wanted:
+                continue
+            start = time.process_time()
+            diagnosis = examine(episode, base, conventions, config, not arguments.without_mounts)
+            spent, count = spent + time.process_time() - start, count + 1
+            found = named(diagnosis)
+            if not observable(name, episode, diagnosis, config):
+                unobservable[f"{name}: {found}"] += 1
+                continue
+            confusion[name][found] += 1
+            correct[name].append(right(name, conventions, found, diagnosis.best.conventions))
+            if found == name and name.endswith("lag_frames"):
+                lag_errors[name].append(getattr(diagnosis.best.conventions, name) - getattr(conventions, name))
+            if arguments.verbose and not correct[name][-1]:
+                explain(name, conventions, diagnosis)
+            if arguments.typical and name.startswith("none"):
+                rival = {e.mistake: e.score - diagnosis.none.score for e in reversed(diagnosis.ranked)}
+                for mistake, margin in rival.items():
+                    measures[f"{name}: margin of {mistake}"].append(margin)
+                for view in diagnosis.measures:
+                    kind = f"{name}: {'wrist' if view.view.endswith('wrist') else 'still'} "
+                    for field in ("flow_agreement", "motion_overlap", "finger_flow"):
+                        if getattr(view, field) is not None:
+                            measures[kind + field].append(getattr(view, field))
+            same_number = conventions.departures and conventions.departures[0] in _NUMBERED
+            if not same_number:  # numbered mistakes vary over episodes here; a source has one value
+                sets[name, episode.joints.embodiment].append(diagnosis)
+                truth[name, episode.joints.embodiment] = conventions
+    set_correct: dict[str, list[bool]] = defaultdict(list)
+    for (name, embodiment), diagnoses in sets.items():
+        summed = diagnose_set(embodiment, diagnoses, config)
+        found = summed.best.mistake if summed.verdict == "explained" else summed.verdict
+        set_correct[name].append(right(name, truth[name, embodiment], found, summed.best.conventions))
+    report(confusion, correct, set_correct, lag_errors)
+    for case, times in unobservable.items():
+        print(f"not observable in the recording, not counted: {case} ({times})")
+    print(f"{count} diagnoses, {spent / max(count, 1) * 1e3:.0f} ms of CPU each")
+    for name, values in measures.items():
+        low, middle, high = np.percentile(values, [5, 50, 95])
+        print(f"{name}: 5 % {low:.2f}, median {middle:.2f}, 95 % {high:.2f}, max {max(values):.2f} (n = {len(values)})")
+    if arguments.output is not None:
+        write_json_atomic(
+            arguments.output,
+            {
+                "splits": arguments.splits,
+                "every": arguments.every,
+                "imperfect": arguments.imperfect,
+                "stated_mounts": not arguments.without_mounts,
+                "confusion": {name: dict(found) for name, found in confusion.items()},
+                "correct_share": {name: float(np.mean(values)) for name, values in correct.items()},
+                "correct_share_of_sources": {name: float(np.mean(values)) for name, values in set_correct.items()},
+                "not_observable": dict(unobservable),
+                "lag_errors_frames": lag_errors,
+                "cpu_ms_a_diagnosis": spent / max(count, 1) * 1e3,
+            },
+        )
+
+
+_NUMBERED = ("tool_offset_z_m", "intrinsics_size", "camera_lag_frames", "image_lag_frames")
+
+
+def explain(name: str, conventions: RecordedConventions, diagnosis: Diagnosis) -> None:
+    print(f"MISSED {name} {conventions.config_lines()} in {diagnosis.episode_id}: {diagnosis.verdict}")
+    shown = {e.mistake: e for e in reversed(diagnosis.ranked)}
+    for explanation in [*diagnosis.ranked[:3], *(e for k, e in shown.items() if k in (name, "none"))]:
+        terms = {k: round(v, 1) for k, v in explanation.evidence.items() if abs(v) > 2}
+        print(f"    {explanation.score:8.1f} {explanation.conventions.config_lines()} {terms}")
+
+
+def report(
+    confusion: dict[str, Counter[str]],
+    correct: dict[str, list[bool]],
+    set_correct: dict[str, list[bool]],
+    lag_errors: dict[str, list[float]],
+) -> None:
+    print(f"{'injected':20} {'n':>4} {'right':>6} {'sources':>8}  found instead")
+    for name, found in confusion.items():
+        shares = f"{100 * np.mean(correct[name]):5.1f}%"
+        sources = f"{100 * np.mean(set_correct[name]):6.0f}%" if set_correct.get(name) else "      -"
+        accepted = {name} if not name.startswith("none") else {"consistent", "too_little_evidence"}
+        others = ", ".join(f"{k} {v}" for k, v in found.most_common() if k not in accepted)
+        print(f"{name:20} {sum(found.values()):4d} {shares} {sources}  {others}")
+    mistakes = [value for name, values in correct.items() if not name.startswith("none") for value in values]
+    clean = [value for name, values in correct.items() if name.startswith("none") for value in values]
+    if mistakes:
+        print(f"mistakes named correctly: {100 * np.mean(mistakes):.2f} % of {len(mistakes)}")
+    if clean:
+        print(f"false alarms: {100 * (1 - np.mean(clean)):.2f} % of {len(clean)}")
+    for name, errors in lag_errors.items():
+        print(
+            f"{name}: {100 * np.mean(np.abs(errors) <= 1):.1f} % within one frame, largest error {np.abs(errors).max()}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""A synthetic episode with one arm, a head camera and a wrist camera, whose geometry is made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from worldline_core.data.episode import CameraTrack, Episode
+
+COUNT, HEIGHT, WIDTH, FPS = 24, 60, 80, 10.0
+
+
+def looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera-to-base pose with OpenCV axes: z to the target, y as far down as possible."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+@pytest.fixture(scope="session")
+def episode() -> Episode:
+    """A tool that swings and turns over a table; the wrist camera sits behind it and looks along its z."""
+    time = np.linspace(0, 2 * np.pi, COUNT)
+    tools = np.tile(np.eye(4), (COUNT, 1, 1, 1))
+    for n, t in enumerate(time):
+        pitch, yaw = np.pi + 0.3 * np.sin(t), 0.6 * np.cos(1.3 * t)
+        about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+        about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        tools[n, 0, :3, :3] = about_z @ about_x
+        tools[n, 0, :3, 3] = (0.5 + 0.1 * np.cos(t), 0.15 * np.sin(t), 0.2 + 0.05 * np.sin(2 * t))
+    mount = np.eye(4)
+    mount[:3, 3] = (0.0, -0.05, -0.15)
+    K = np.array([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]])
+    head = looking_at(np.array([1.2, 0.0, 0.8]), np.array([0.5, 0.0, 0.2]))[None]
+    cameras = {
+        "head": CameraTrack("head", K, head, WIDTH, HEIGHT),
+        "right_wrist": CameraTrack("right_wrist", K, tools[:, 0] @ mount, WIDTH, HEIGHT),
+    }
+    opening = (0.5 + 0.5 * np.sin(time))[:, None]
+    return Episode(
+        episode_id="synthetic/0", source="synthetic", embodiment="no_such_robot", scene="s", task_family="lift",
+        instruction="lift", outcome="success", split="test", fps=FPS, state=opening.astype(np.float32),
+        action=opening.astype(np.float32), timestamps=np.arange(COUNT) / FPS, cameras=cameras, T_base_ee=tools,
+        gripper=opening, state_names=("right/gripper",), state_kind="ee_pose",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def images() -> dict[str, np.ndarray]:
+    """Noise: only sizes matter where these are used."""
+    generator = np.random.default_rng(1)
+    return {
+        view: generator.integers(0, 255, (COUNT, HEIGHT, WIDTH, 3), dtype=np.uint8) for view in ("head", "right_wrist")
+    }

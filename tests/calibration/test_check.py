@@ -1,0 +1,305 @@
+"""`worldline calibrate check`: what is listed, what it prints and writes, and the line that repairs a recording."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from flows.command_line import main
+from worldline_core.calibration.check import check_calibration
+from worldline_core.calibration.check_page import page
+from worldline_core.calibration.check_report import as_json, cautions, plain, table_text
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, ViewMeasures
+from worldline_core.calibration.findings import CalibrationCheck, Finding, SetFinding
+from worldline_core.calibration.listing import ListedEpisode, combined_conventions, repairing_lines
+from worldline_core.data.conventions import RecordedConventions, apply_conventions, corrupt
+from worldline_core.data.episode import Episode
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import LoadedEpisode, no_masks
+from worldline_core.errors import ConfigError, DataError
+
+CLEAN, INVERTED = "ur5e_pair-test-s1-00000", "ur5e_pair-train-s1-00002"
+"""Shipped recordings; the second has inverted extrinsics (injected_defects.json)."""
+HOSTILE = "<script>alert('x')</script>"
+
+
+def listed(episode: Episode, images: dict[str, np.ndarray], name: str = "synthetic/0") -> ListedEpisode:
+    named = replace(episode, episode_id=name)
+    return ListedEpisode(
+        name, "synthetic", lambda: LoadedEpisode(named, tuple(images), lambda view: images[view], no_masks)
+    )
+
+
+def explained(conventions: RecordedConventions, lines: tuple[str, ...] | None = None) -> Explanation:
+    name = "+".join(conventions.departures)
+    return Explanation(name, conventions, -1.0, {}, conventions.config_lines() if lines is None else lines)
+
+
+# --- the line that repairs
+
+
+def test_lines_name_the_source_by_its_number(episode: Episode, images: dict[str, np.ndarray]) -> None:
+    item = replace(listed(episode, images), config_prefix="curate.sources[3].conventions")
+    assert repairing_lines(item, explained(RecordedConventions(quaternion="wxyz"))) == (
+        "curate.sources[3].conventions.quaternion: wxyz",
+    )
+    assert repairing_lines(item, Explanation("none", RecordedConventions(), 0.0, {}, ())) == ()
+
+
+def test_what_is_declared_already_is_counted_in(episode: Episode, images: dict[str, np.ndarray]) -> None:
+    declared = RecordedConventions(extrinsics="base_to_camera", camera_lag_frames=1)
+    item = replace(listed(episode, images), declared=declared)
+    lines = repairing_lines(item, explained(RecordedConventions(camera_lag_frames=2)))
+    assert "curate.sources[].conventions.camera_lag_frames: 3" in lines
+    assert "curate.sources[].conventions.extrinsics: base_to_camera" in lines
+    wrongly = replace(listed(episode, images), declared=RecordedConventions(extrinsics="base_to_camera"))
+    again = repairing_lines(wrongly, explained(RecordedConventions(extrinsics="base_to_camera")))
+    assert again == ("remove curate.sources[].conventions",)
+
+
+@pytest.mark.parametrize(
+    ("declared", "found"),
+    [
+        (RecordedConventions(camera_lag_frames=1), RecordedConventions(camera_lag_frames=2)),
+        (RecordedConventions(extrinsics="base_to_camera"), RecordedConventions(camera_axes="opengl")),
+        (RecordedConventions(tool_offset_z_m=0.1), RecordedConventions(tool_offset_z_m=-0.03)),
+        (RecordedConventions(gripper="inverted"), RecordedConventions(gripper="inverted")),
+        (RecordedConventions(extrinsics="base_to_camera"), RecordedConventions(extrinsics="base_to_camera")),
+    ],
+)
+def test_one_declaration_repairs_like_two(
+    episode: Episode, declared: RecordedConventions, found: RecordedConventions
+) -> None:
+    together = combined_conventions(declared, found)
+    wrong = corrupt(episode, together)
+    twice, once = apply_conventions(apply_conventions(wrong, declared), found), apply_conventions(wrong, together)
+    assert once.T_base_ee is not None
+    assert twice.T_base_ee is not None
+    assert np.allclose(twice.T_base_ee, once.T_base_ee)
+    assert np.allclose(twice.state, once.state)
+    for view in once.cameras:
+        assert np.allclose(twice.cameras[view].T_base_camera, once.cameras[view].T_base_camera)
+
+
+@pytest.mark.parametrize(
+    ("declared", "found", "message"),
+    [
+        (RecordedConventions(quaternion="wxyz"), RecordedConventions(quaternion="wxyz"), "cannot be declared on top"),
+        (
+            RecordedConventions(camera_axes="opengl", views=("head",)),
+            RecordedConventions(extrinsics="base_to_camera"),
+            "different views",
+        ),
+    ],
+)
+def test_what_one_declaration_cannot_say_is_refused(
+    declared: RecordedConventions, found: RecordedConventions, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        combined_conventions(declared, found)
+
+
+def test_lines_for_other_files_are_handed_on(episode: Episode, images: dict[str, np.ndarray]) -> None:
+    line = "configs/embodiments/x.yaml: arms[].T_link_tool.translation: +0.0500 along the tool's z"
+    explanation = explained(RecordedConventions(tool_offset_z_m=0.05), (line,))
+    assert repairing_lines(listed(episode, images), explanation) == (line,)
+
+
+# --- the check
+
+
+def test_a_bad_episode_is_listed_and_the_rest_goes_on(
+    episode: Episode, images: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    def refuse() -> LoadedEpisode:
+        raise RejectedInputError("truncated_video", "The file ends early", expected=24, got=12)
+
+    broken = ListedEpisode("synthetic/broken", "synthetic", refuse)
+    short = listed(episode, {view: clip[:5] for view, clip in images.items()}, "synthetic/short")
+    holes = replace(episode, T_base_ee=np.full_like(episode.T_base_ee, np.nan))
+    check = check_calibration(
+        [broken, short, listed(holes, images, "synthetic/nan"), listed(episode, images)], tmp_path, pictures=False
+    )
+    assert [finding.reason for finding in check.findings] == ["truncated_video", "length_mismatch", "nan_state", None]
+    assert check.findings[-1].diagnosis is not None
+    assert not check.consistent
+    text = table_text(check)
+    assert "truncated_video: The file ends early; expected 24; got 12" in text
+    assert "3 unreadable" in text
+    stored = json.loads((tmp_path / "diagnoses.json").read_text())
+    assert [entry.get("reason") for entry in stored["episodes"]] == [
+        "truncated_video",
+        "length_mismatch",
+        "nan_state",
+        None,
+    ]
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_kinematics_of_other_arms_are_not_used(episode: Episode, images: dict[str, np.ndarray], tmp_path: Path) -> None:
+    # One arm is recorded, the robot has two; and a robot that is not known at all.
+    pair = replace(episode, embodiment="ur5e_pair")
+    check = check_calibration(
+        [listed(pair, images, "synthetic/pair"), listed(episode, images, "synthetic/unknown")], tmp_path, pictures=False
+    )
+    assert [finding.reason for finding in check.findings] == [None, None]
+    assert "other arms than the recording" in check.findings[0].notes[0]
+    assert "without kinematics of no_such_robot" in check.findings[1].notes[0]
+
+
+def test_nothing_to_check_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no episodes to check"):
+        check_calibration([], tmp_path)
+
+
+def made_up() -> CalibrationCheck:
+    """One finding of each verdict, with names that would break a page that does not escape them."""
+    none = Explanation("none", RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0}, ())
+    best = explained(RecordedConventions(camera_axes="opengl"))
+    measures = (
+        ViewMeasures("head", in_view_share=0.25, flow_agreement=-0.5),
+        ViewMeasures("right_wrist", hand_eye_m=0.0123, hand_eye_deg=4.0, camera_lag_frames=-2.0, in_view_share=1.0),
+    )
+    broken = Diagnosis("b", "explained", best, (best, none), measures, ("a note",))
+    fine = Diagnosis("a", "consistent", none, (none,), (), ())
+    summed = SetDiagnosis("s", 2, "explained", best, (best, none), {"camera_axes": 1, "consistent": 1}, ("of the set",))
+    findings = (
+        Finding(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg"),
+        Finding("b", "s", broken, config_lines=("line one", "line two")),
+        Finding("c", "s", None, "unreadable", f"why {HOSTILE}"),
+    )
+    return CalibrationCheck(findings, (SetFinding(summed, ("line three",)),), Path("out"))
+
+
+def test_the_table_shows_the_worst_of_each_measure() -> None:
+    lines = table_text(made_up()).splitlines()
+    row = next(line for line in lines if line.startswith("b "))
+    for shown in ("explained", "camera_axes", "-1.0", "-80.0", "12.3 mm 4.0 deg", "-2.0", "25%", "-0.50"):
+        assert shown in row
+    text = "\n".join(lines)
+    assert "3 episodes: 1 explained, 1 unreadable, 1 consistent" in text
+    assert "source s, 2 episodes together: explained by camera_axes (score -1.0, as recorded -80.0)" in text
+    assert "single episodes say: camera axes 1, consistent 1" in text
+    assert "    line three" in text
+    assert "  b:\n    line one\n    line two" in text
+
+
+@pytest.mark.parametrize(("agreeing", "cautious"), [(1, True), (4, True), (5, False), (10, False)])
+def test_a_minority_does_not_change_a_source_unnoticed(agreeing: int, cautious: bool) -> None:
+    best = explained(RecordedConventions(camera_axes="opengl"))
+    votes = {"camera_axes": agreeing - 1, "camera_axes+gripper": 1, "consistent": 10 - agreeing}
+    found = SetDiagnosis("s", 10, "explained", best, (best,), votes, ())
+    assert bool(cautions(found)) == cautious
+    if cautious:
+        assert f"only {agreeing} of 10 episodes" in cautions(found)[0]
+    assert cautions(replace(found, verdict="consistent")) == []
+
+
+def test_the_page_escapes_what_it_shows() -> None:
+    html = page(made_up())
+    assert HOSTILE not in html
+    assert html.count("&lt;script&gt;") >= 3
+    assert 'src="pictures/a.jpg"' in html
+    # The worst first.
+    assert html.index('id="b"') < html.index('id="a ')
+
+
+def test_json_holds_no_number_that_json_does_not_know() -> None:
+    assert plain({"a": np.float32(1.5), 2: (np.nan, np.inf, np.int64(3)), "c": [None, "x", True]}) == {
+        "a": 1.5,
+        "2": [None, None, 3],
+        "c": [None, "x", True],
+    }
+    content = json.loads(json.dumps(as_json(made_up()), allow_nan=False))
+    assert content["episodes"][1]["ranked"][0]["conventions"] == {"camera_axes": "opengl"}
+    assert content["sources"][0]["config_lines"] == ["line three"]
+
+
+# --- the command, on shipped recordings
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "check", *arguments])
+    return int(ended.value.code or 0)
+
+
+def source_config(path: Path, project_root: Path, conventions: dict[str, object] | None = None) -> Path:
+    source = {"kind": "episode_set", "path": str(project_root / "artifacts/shipped/recordings"), "include": [INVERTED]}
+    content = {"curate": {"sources": [source | ({"conventions": conventions} if conventions else {})]}}
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_a_mistake_is_found_and_the_printed_line_repairs_it(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = source_config(tmp_path / "mine.yaml", project_root)
+    assert run(str(config), "--output", str(tmp_path / "wrong")) == 1
+    printed = capsys.readouterr().out
+    line = "curate.sources[0].conventions.extrinsics: base_to_camera"
+    assert line in printed
+    assert f"{INVERTED}  explained" in " ".join(printed.split()).replace(" explained", "  explained")
+    assert (tmp_path / "wrong" / "pictures" / f"{INVERTED}.jpg").stat().st_size > 20_000
+    key, value = line.removeprefix("curate.sources[0].conventions.").split(": ")
+    repaired = source_config(tmp_path / "repaired.yaml", project_root, {key: value})
+    assert run(str(repaired), "--output", str(tmp_path / "right"), "--json", "--no-pictures") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["consistent"] is True
+    assert content["episodes"][0]["verdict"] == "consistent"
+
+
+def test_a_clean_set_is_consistent(project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = project_root / "artifacts/shipped/recordings"
+    assert run("--artifact", str(folder), "--episode", CLEAN, "--output", str(tmp_path)) == 0
+    assert "1 episodes: 1 consistent" in capsys.readouterr().out
+    assert CLEAN in (tmp_path / "index.html").read_text()
+
+
+def test_agibot_samples(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shared_data / "agibot_gesim"
+    if not folder.is_dir():
+        pytest.skip("the AgiBot samples are not here")
+    config = tmp_path / "agibot.yaml"
+    source = {"kind": "agibot_gesim", "path": str(folder), "fps": 30}
+    config.write_text(yaml.safe_dump({"curate": {"sources": [source]}}))
+    assert run(str(config), "--output", str(tmp_path / "out"), "--no-pictures") == 1
+    assert "curate.sources[0].conventions.camera_lag_frames: 2" in capsys.readouterr().out
+    config.write_text(yaml.safe_dump({"curate": {"sources": [source | {"conventions": {"camera_lag_frames": 2}}]}}))
+    assert run(str(config), "--output", str(tmp_path / "out"), "--no-pictures") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["absent.yaml"], "No such configuration file"),
+        (["--artifact", "absent"], "absent"),
+        (["configs/embodiments/so101.yaml"], "configures no source"),
+        (["configs/sources/mcap.yaml", "--set", "curate.sorces=[]"], "unknown key"),
+        (["--artifact", "artifacts/shipped/recordings", "--episode", "nobody"], "No such episode"),
+        (["--artifact", "artifacts/shipped/recordings", "--set", "a=1"], "--set changes a configuration file"),
+    ],
+)
+def test_wrong_usage_ends_with_status_2(
+    arguments: list[str],
+    message: str,
+    project_root: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(project_root)
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_the_arguments_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 2
+    assert run("a.yaml", "--artifact", "b") == 2
+    assert "not allowed with" in capsys.readouterr().err

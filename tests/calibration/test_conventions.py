@@ -1,0 +1,260 @@
+"""Declared conventions: undoing one gives the contract back, and a lag keeps states, cameras and images together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from worldline_core.data.convention_needs import arm_blocks
+from worldline_core.data.conventions import (
+    RecordedConventions,
+    apply_conventions,
+    corrupt,
+    corrupted_image_frames,
+    image_frames,
+)
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import LoadedEpisode, no_masks
+from worldline_core.data.sources.repaired import repair
+
+COUNT = 12
+K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])
+
+
+def random_poses(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    poses = np.tile(np.eye(4), (*shape, 1, 1))
+    poses[..., :3, :3] = Rotation.random(int(np.prod(shape)), random_state=rng).as_matrix().reshape(*shape, 3, 3)
+    poses[..., :3, 3] = rng.normal(size=(*shape, 3))
+    return poses
+
+
+def two_arms(seed: int = 0, **changes: Any) -> Episode:
+    """Tool poses of two arms, three cameras; nothing in it is symmetric."""
+    rng = np.random.default_rng(seed)
+    tools = random_poses(rng, COUNT, 2)
+    opening = rng.uniform(size=(COUNT, 2))
+    quaternions = Rotation.from_matrix(tools[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(COUNT, 2, 4)
+    state = np.concatenate([tools[..., :3, 3], quaternions, opening[..., None]], axis=-1).reshape(COUNT, 16)
+    cameras = {
+        "head": CameraTrack("head", K, random_poses(rng, 1), 96, 64),
+        "left_wrist": CameraTrack("left_wrist", K, random_poses(rng, COUNT), 96, 64),
+        "right_wrist": CameraTrack("right_wrist", K, random_poses(rng, COUNT), 96, 64),
+    }
+    names = tuple(f"{a}/{n}" for a in ("left", "right") for n in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper"))
+    values: dict[str, Any] = {
+        "episode_id": "e", "source": "s", "embodiment": "none", "scene": "s", "task_family": "lift", "instruction": "",
+        "outcome": "unknown", "split": "test", "fps": 10.0, "state": state.astype(np.float32),
+        "action": (state + 0.01).astype(np.float32), "timestamps": np.arange(COUNT) / 10.0, "cameras": cameras,
+        "T_base_ee": tools, "gripper": opening, "state_names": names, "state_kind": "ee_pose",
+    }  # fmt: skip
+    return Episode(**(values | changes))
+
+
+def as_joints(episode: Episode) -> Episode:
+    names = tuple(name.replace("/q", "/joint_") for name in episode.state_names or ())
+    return replace(episode, state_kind="joints", state_names=names, T_base_ee=None, gripper=None)
+
+
+def quaternions_up_to_sign(state: np.ndarray) -> np.ndarray:
+    result = state.astype(np.float64)
+    for start in (3, 11):
+        result[:, start : start + 4] *= np.sign(result[:, start + 3 : start + 4])
+    return result
+
+
+def assert_same(found: Episode, wanted: Episode) -> None:
+    assert found.num_frames == wanted.num_frames
+    if wanted.state_kind == "ee_pose":
+        for a, b in ((found.state, wanted.state), (found.action, wanted.action)):
+            # The action's quaternions are not of unit length; what comes back from a matrix is.
+            same = quaternions_up_to_sign(a), quaternions_up_to_sign(b)
+            for columns in (slice(3, 7), slice(11, 15)):
+                for values in same:
+                    values[:, columns] /= np.linalg.norm(values[:, columns], axis=1, keepdims=True)
+            assert np.allclose(*same, atol=2e-6)
+    else:
+        assert np.allclose(found.state, wanted.state, atol=1e-6)
+        assert np.allclose(found.action, wanted.action, atol=1e-6)
+    for name in ("T_base_ee", "gripper"):
+        a, b = getattr(found, name), getattr(wanted, name)
+        assert (a is None) == (b is None)
+        assert a is None or np.allclose(a, b, atol=1e-9)
+    for view, camera in wanted.cameras.items():
+        assert np.allclose(found.cameras[view].K, camera.K, atol=1e-9)
+        assert np.allclose(found.cameras[view].T_base_camera, camera.T_base_camera, atol=1e-9)
+
+
+MISTAKES: dict[str, dict[str, Any]] = {
+    "extrinsics": {"extrinsics": "base_to_camera"},
+    "camera_axes": {"camera_axes": "opengl"},
+    "extrinsics_unit": {"extrinsics_unit": "mm"},
+    "pose_unit": {"pose_unit": "mm"},
+    "quaternion": {"quaternion": "wxyz"},
+    "euler": {"euler": "moving_xyz"},
+    "arms": {"arms": "exchanged"},
+    "tool_offset": {"tool_offset_z_m": 0.12},
+    "intrinsics": {"intrinsics_size": (480, 640)},
+    "gripper": {"gripper": "inverted"},
+    "head only": {"extrinsics": "base_to_camera", "views": ("head",)},
+    "all at once": {
+        "extrinsics": "base_to_camera", "camera_axes": "opengl", "extrinsics_unit": "mm", "pose_unit": "mm",
+        "quaternion": "wxyz", "euler": "moving_xyz", "arms": "exchanged", "tool_offset_z_m": -0.05,
+        "intrinsics_size": (100, 200), "gripper": "inverted",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("source_offset", [0.0, 0.23])
+def test_a_mistake_is_undone_and_changes_something(name: str, source_offset: float) -> None:
+    conventions = RecordedConventions(**MISTAKES[name])
+    episode = two_arms(conventions={"tool_offset_m": source_offset} if source_offset else {})
+    spoiled = corrupt(episode, conventions)
+    assert_same(apply_conventions(spoiled, conventions), episode)
+    with pytest.raises(AssertionError):
+        assert_same(spoiled, episode)
+
+
+def test_degrees_of_joints() -> None:
+    episode = as_joints(two_arms())
+    conventions = RecordedConventions(angle_unit="deg")
+    spoiled = corrupt(episode, conventions)
+    assert np.allclose(spoiled.state[:, 3], np.degrees(episode.state[:, 3]))
+    assert np.array_equal(spoiled.state[:, 7], episode.state[:, 7])  # an opening is no angle
+    assert_same(apply_conventions(spoiled, conventions), episode)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000))
+def test_reordered_quaternions_and_angles_against_scipy(seed: int) -> None:
+    episode = two_arms(seed)
+    assert episode.T_base_ee is not None
+    rotation = Rotation.from_matrix(episode.T_base_ee[..., :3, :3].reshape(-1, 3, 3))
+    x, y, z, w = rotation.as_quat().T
+    read = Rotation.from_quat(np.stack([w, x, y, z], axis=1))  # written w x y z, read as x y z w
+    spoiled = corrupt(episode, RecordedConventions(quaternion="wxyz")).T_base_ee
+    assert spoiled is not None
+    assert np.allclose(spoiled[..., :3, :3].reshape(-1, 3, 3), read.as_matrix(), atol=1e-9)
+    angles = rotation.as_euler("XYZ")
+    turned = corrupt(episode, RecordedConventions(euler="moving_xyz")).T_base_ee
+    assert turned is not None
+    expected = Rotation.from_euler("xyz", angles).as_matrix()
+    assert np.allclose(turned[..., :3, :3].reshape(-1, 3, 3), expected, atol=1e-7)
+
+
+def test_the_offset_that_a_reader_added_goes_along_the_true_axis() -> None:
+    """A reader that misread the rotation moved the tool along a wrong z: the repaired pose has it along the true one."""
+    flange = two_arms().T_base_ee
+    assert flange is not None
+    true_tool = flange.copy()
+    true_tool[..., :3, 3] += 0.2 * flange[..., :3, 2]
+    x, y, z, w = np.moveaxis(Rotation.from_matrix(flange[..., :3, :3].reshape(-1, 3, 3)).as_quat(), -1, 0)
+    misread = flange.copy()
+    misread[..., :3, :3] = Rotation.from_quat(np.stack([w, x, y, z], 1)).as_matrix().reshape(*flange.shape[:2], 3, 3)
+    misread[..., :3, 3] += 0.2 * misread[..., :3, 2]
+    read = two_arms(T_base_ee=misread, conventions={"tool_offset_m": 0.2})
+    repaired = apply_conventions(read, RecordedConventions(quaternion="wxyz")).T_base_ee
+    assert np.allclose(repaired, true_tool, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(camera_lag=st.integers(-2, 2), image_lag=st.integers(-3, 3), video_frames=st.sampled_from([None, 5]))
+def test_lags_keep_states_cameras_and_images_together(
+    camera_lag: int, image_lag: int, video_frames: int | None
+) -> None:
+    conventions = RecordedConventions(camera_lag_frames=camera_lag, image_lag_frames=image_lag)
+    marks = np.arange(COUNT, dtype=np.float32)
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, 0, 3] = marks
+    healthy = two_arms()
+    state = healthy.state.copy()
+    state[:, 0] = marks
+    cameras = {"left_wrist": replace(healthy.cameras["left_wrist"], T_base_camera=poses)}
+    healthy = replace(healthy, state=state, cameras=cameras, video_frames=video_frames)
+    images = marks[: healthy.num_video_frames]
+    spoiled = corrupt(healthy, conventions)
+    spoiled_images = images[corrupted_image_frames(COUNT, conventions)]
+    both = min(len(spoiled_images), spoiled.num_frames)
+    offset = spoiled.state[:, 0] - spoiled.cameras["left_wrist"].T_base_camera[:, 0, 3]
+    assert (offset == camera_lag).all()
+    assert (spoiled.state[:both, 0] - spoiled_images[:both] == image_lag).all()
+    repaired = apply_conventions(spoiled, conventions)
+    kept = spoiled_images[image_frames(spoiled.num_frames, conventions)]
+    assert repaired.num_video_frames == len(kept)
+    assert np.array_equal(repaired.state[:, 0], repaired.cameras["left_wrist"].T_base_camera[:, 0, 3])
+    assert np.array_equal(repaired.state[: len(kept), 0], kept)
+
+
+def test_repair_of_a_loaded_episode_takes_images_and_masks_along() -> None:
+    images = np.arange(COUNT, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 2, 3), np.uint8)
+    masks = images[..., 0] > 5
+    loaded = LoadedEpisode(two_arms(), ("head",), lambda _: images, lambda _: masks)
+    found = repair(loaded, RecordedConventions(image_lag_frames=2))
+    assert found.episode.num_frames == COUNT - 2
+    assert found.frames("head")[:, 0, 0, 0].tolist() == list(range(2, COUNT))
+    kept = found.robot_masks("head")
+    assert kept is not None
+    assert np.array_equal(kept, masks[2:])
+    assert found.episode.conventions["declared_image_lag_frames"] == "2"
+    assert repair(loaded, RecordedConventions()) is loaded
+    short = LoadedEpisode(two_arms(), ("head",), lambda _: images[:-1], no_masks)
+    with pytest.raises(RejectedInputError, match="Video and states differ in length") as caught:
+        repair(short, RecordedConventions(image_lag_frames=2)).frames("head")
+    assert caught.value.reason == "length_mismatch"
+
+
+@pytest.mark.parametrize(
+    ("changes", "mistake", "needed"),
+    [
+        ({"T_base_ee": None, "gripper": None}, {"quaternion": "wxyz"}, "recorded tool poses"),
+        ({"T_base_ee": None, "gripper": None}, {"tool_offset_z_m": 0.1}, "recorded tool poses"),
+        ({"cameras": {}}, {"extrinsics": "base_to_camera"}, "a calibrated camera"),
+        ({}, {"angle_unit": "deg"}, "joint positions"),
+        ({"state_names": None}, {"gripper": "inverted"}, "names end with gripper"),
+        ({"state_names": None}, {"arms": "exchanged"}, "two arms with equal state blocks"),
+    ],
+)
+def test_a_convention_that_says_nothing_is_refused(
+    changes: dict[str, Any], mistake: dict[str, Any], needed: str
+) -> None:
+    with pytest.raises(RejectedInputError, match=needed) as caught:
+        apply_conventions(two_arms(**changes), RecordedConventions(**mistake))
+    assert caught.value.reason == "convention_not_applicable"
+
+
+def test_a_lag_longer_than_the_episode_is_refused() -> None:
+    with pytest.raises(RejectedInputError, match="fewer than two frames") as caught:
+        apply_conventions(two_arms(), RecordedConventions(camera_lag_frames=11))
+    assert caught.value.reason == "too_short"
+
+
+def test_lines_are_what_a_configuration_reads() -> None:
+    conventions = RecordedConventions(intrinsics_size=(480, 640), views=("head", "left_wrist"), camera_lag_frames=-2)
+    lines = conventions.config_lines("conventions")
+    assert lines == (
+        "conventions.intrinsics_size: [480, 640]",
+        "conventions.camera_lag_frames: -2",
+        "conventions.views: [head, left_wrist]",
+    )
+    import yaml
+
+    values = {line.split(".", 1)[1].split(":")[0]: yaml.safe_load(line.split(": ", 1)[1]) for line in lines}
+    assert RecordedConventions.model_validate(values) == conventions
+    assert RecordedConventions(views=("head",)).config_lines() == ()
+    with pytest.raises(ValidationError, match="no image size"):
+        RecordedConventions(intrinsics_size=(0, 640))
+    with pytest.raises(ValidationError, match="extra"):
+        RecordedConventions.model_validate({"extrinsic": "base_to_camera"})
+
+
+def test_blocks_of_arms() -> None:
+    assert arm_blocks(two_arms()) == (tuple(range(8)), tuple(range(8, 16)))
+    assert arm_blocks(two_arms(state_names=tuple(f"c{i}" for i in range(16)))) == ()

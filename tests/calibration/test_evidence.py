@@ -1,0 +1,282 @@
+"""Single measures against scenes whose answer is known by construction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from worldline_core.calibration.config import CalibrationDoctorConfig, Typical
+from worldline_core.calibration.gripper_evidence import finger_flow, stopped_share
+from worldline_core.calibration.hypotheses import camera_lags, intrinsics_sizes, tool_offset
+from worldline_core.calibration.image_evidence import (
+    log_likelihood,
+    still_view_agreement,
+    wrist_flow_agreement,
+)
+from worldline_core.calibration.measures import refined_peak
+from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
+from worldline_core.calibration.pose_evidence import pose_terms, rms_hand_eye, unrest_log_likelihood
+from worldline_core.calibration.reading import read
+from worldline_core.data.conventions import RecordedConventions
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.geometry.rigid import project_points, rigid_inverse
+
+CONFIG = CalibrationDoctorConfig()
+COUNT, HEIGHT, WIDTH = 30, 64, 96
+K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])
+MOUNT = np.eye(4)
+MOUNT[:3, 3] = [0.0, -0.05, -0.15]
+HEAD = np.eye(4)
+HEAD[:3, :3], HEAD[:3, 3] = np.diag([1.0, -1.0, -1.0]), [0.4, 0.0, 1.2]
+
+
+def tools() -> np.ndarray:
+    time = np.arange(COUNT) / 6
+    poses = np.tile(np.eye(4), (COUNT, 1, 1, 1))
+    turn = np.stack([np.pi + 0.25 * np.sin(time), 0.2 * np.cos(1.4 * time), 0.3 * np.sin(0.8 * time)], 1)
+    poses[:, 0, :3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
+    poses[:, 0, :3, 3] = np.stack([0.4 + 0.15 * np.sin(time), 0.15 * np.sin(1.7 * time), 0.3 + 0.04 * np.cos(time)], 1)
+    return poses
+
+
+def episode(opening: np.ndarray | None = None) -> Episode:
+    grip = np.full((COUNT, 1), 0.5) if opening is None else opening[:, None]
+    track = tools()
+    return Episode(
+        episode_id="e", source="s", embodiment="none", scene="s", task_family="lift", instruction="",
+        outcome="unknown", split="test", fps=8.0, state=grip.astype(np.float32), action=grip.astype(np.float32),
+        timestamps=np.arange(COUNT) / 8, T_base_ee=track, gripper=grip, state_names=("right/gripper",),
+        state_kind="ee_pose", cameras={
+            "head": CameraTrack("head", K, HEAD[None], WIDTH, HEIGHT),
+            "right_wrist": CameraTrack("right_wrist", K, track[:, 0] @ MOUNT, WIDTH, HEIGHT),
+        },
+    )  # fmt: skip
+
+
+def texture(height: int, width: int, coarseness: int = 8) -> np.ndarray:
+    values = np.random.default_rng(4).uniform(30, 220, (height // coarseness + 1, width // coarseness + 1))
+    return cv2.resize(values.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255)
+
+
+def head_pictures(lag: int = 0) -> np.ndarray:
+    """A textured patch that moves with the projected tool over a plain table; `lag`: shows what was then."""
+    patch = texture(22, 22, 4)
+    frames = []
+    for i in range(COUNT):
+        pose = tools()[max(0, i - lag), 0]
+        uv, _ = project_points(pose[None, :3, 3] - 0.07 * pose[None, :3, 2], K, HEAD[None])
+        shift = np.array([[1, 0, uv[0, 0] - 10.5], [0, 1, uv[0, 1] - 10.5]])
+        frame = np.full((HEIGHT, WIDTH), 120.0, np.float32)
+        cv2.warpAffine(patch, shift, (WIDTH, HEIGHT), dst=frame, borderMode=cv2.BORDER_TRANSPARENT)
+        frames.append(frame)
+    return np.stack(frames).astype(np.uint8)
+
+
+def wrist_pictures() -> np.ndarray:
+    """What a wrist camera sees of a textured table at z = 0: the exact homography of the plane."""
+    table = texture(400, 400, 16)
+    T_px_m = np.array([[200.0, 0, 120], [0, 200.0, 200], [0, 0, 1]])  # table metres to texture pixels
+    frames = []
+    for pose in tools()[:, 0] @ MOUNT:
+        T = rigid_inverse(pose)
+        table_to_image = K @ np.stack([T[:3, 0], T[:3, 1], T[:3, 3]], axis=1)
+        frames.append(cv2.warpPerspective(table, table_to_image @ np.linalg.inv(T_px_m), (WIDTH, HEIGHT)))
+    return np.stack(frames).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[str, np.ndarray]:
+    return {"head": head_pictures(), "right_wrist": wrist_pictures()}
+
+
+def test_cells_cover_the_picture() -> None:
+    values = np.arange(2 * 10 * 13, dtype=np.float32).reshape(2, 10, 13)
+    cells = cell_means(values)
+    assert cells.shape == (2, 2, 3)
+    assert cells[1, 1, 2] == pytest.approx(values[1, 4:8, 8:12].mean())
+    assert cell_centres(10, 13)[1, 2].tolist() == [9.5, 5.5]
+    big = np.random.default_rng(0).integers(0, 255, (3, 128, 192, 3), dtype=np.uint8)
+    assert small_gray(big).shape == (3, 64, 96)
+
+
+def test_flow_of_the_tool_agrees_with_a_right_camera_only(seen: dict[str, np.ndarray]) -> None:
+    observation = observe(episode(), seen, None)
+    right = read(observation, RecordedConventions())
+    assert right is not None
+    flow, change, turn = still_view_agreement(observation, right, "head")
+    assert flow > 0.85
+    assert change > 0.4
+    assert abs(turn) < 8
+    angle = np.radians(40)
+    roll = np.eye(4)
+    roll[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    # The camera turned about its axis by 40 degrees, and the tool by as much about the same axis: the patch stays where
+    # it is predicted while its motion is turned.
+    rolled = replace(observation.episode.cameras["head"], T_base_camera=(HEAD @ roll)[None])
+    other = observe(replace(episode(), cameras={"head": rolled}), {"head": seen["head"]}, None)
+    reading = read(other, RecordedConventions())
+    assert reading is not None
+    rolled_flow, _, rolled_turn = still_view_agreement(other, reading, "head")
+    assert rolled_flow < flow - 0.1
+    assert abs(abs(rolled_turn) - 40) < 12
+    mirrored = read(observation, RecordedConventions(camera_axes="opengl", views=("head",)))
+    assert mirrored is not None
+    assert still_view_agreement(observation, mirrored, "head") == (0.0, 0.0, 0.0)  # the tool is behind the camera
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_the_lag_of_pictures_is_where_flow_agrees_best(lag: int) -> None:
+    observation = observe(episode(), {"head": head_pictures(lag)}, None)
+    recorded = read(observation, RecordedConventions())
+    assert recorded is not None
+    found = {k: still_view_agreement(observation, recorded.with_image_lag(k), "head")[0] for k in range(-3, 4)}
+    assert max(found, key=lambda k: found[k]) == lag
+
+
+def test_background_flow_of_a_wrist_camera_tells_its_axes(seen: dict[str, np.ndarray]) -> None:
+    observation = observe(episode(), seen, None)
+    agreement = {}
+    for name, conventions in (
+        ("right", RecordedConventions()),
+        ("opengl", RecordedConventions(camera_axes="opengl")),
+        ("inverse", RecordedConventions(extrinsics="base_to_camera")),
+    ):
+        reading = read(observation, conventions)
+        assert reading is not None
+        agreement[name] = wrist_flow_agreement(observation, reading, "right_wrist")
+    assert agreement["right"] > 0.9
+    assert all(agreement[name] < agreement["right"] - 0.05 for name in ("opengl", "inverse"))
+    assert agreement["opengl"] < 0.5
+
+
+def finger_pictures(opening: np.ndarray, still: CameraTrack) -> np.ndarray:
+    """Two bars at the projected tool point that part as the opening grows."""
+    point = np.linalg.inv(MOUNT)[:3, 3]
+    u, v = (still.K @ (point / point[2]))[:2]
+    frames = []
+    for value in opening:
+        frame = np.full((HEIGHT, WIDTH), 90, np.uint8)
+        for side in (-1, 1):
+            x = u + side * (4 + 14 * value)
+            cv2.rectangle(
+                frame,
+                (round(16 * (x - 3)), round(16 * (v - 12))),
+                (round(16 * (x + 3)), round(16 * (v + 12))),
+                220,
+                -1,
+                shift=4,
+            )
+        frames.append(frame)
+    return np.stack(frames)
+
+
+def test_fingers_that_part_mean_opening() -> None:
+    opening = 0.5 + 0.5 * np.sin(np.arange(COUNT) / 4)
+    recording = episode(opening)
+    pictures = {"right_wrist": finger_pictures(opening, recording.cameras["right_wrist"])}
+    observation = observe(recording, pictures, None)
+    as_written = read(observation, RecordedConventions())
+    inverted = read(observation, RecordedConventions(gripper="inverted"))
+    assert as_written is not None
+    assert inverted is not None
+    right, wrong = (finger_flow(observation, reading, 0, CONFIG) for reading in (as_written, inverted))
+    assert right is not None
+    assert wrong is not None
+    assert right > 0.6
+    assert wrong == pytest.approx(-right)
+    still = observe(episode(), pictures, None)
+    resting = read(still, RecordedConventions())
+    assert resting is not None
+    assert finger_flow(still, resting, 0, CONFIG) is None
+
+
+def test_an_object_stops_a_closing_gripper_never_an_opening_one() -> None:
+    command = np.where(np.arange(COUNT) < 10, 1.0, 0.0)
+    opening = np.where(np.arange(COUNT) < 10, 1.0, 0.6)
+    recording = replace(episode(opening), action=command[:, None].astype(np.float32))
+    observation = observe(recording, {}, None)
+    as_written = read(observation, RecordedConventions())
+    inverted = read(observation, RecordedConventions(gripper="inverted"))
+    assert as_written is not None
+    assert inverted is not None
+    assert stopped_share(as_written, 0) == 1.0
+    assert stopped_share(inverted, 0) == 0.0
+    free = read(observe(episode(opening), {}, None), RecordedConventions())
+    assert free is not None
+    assert stopped_share(free, 0) is None
+
+
+def test_lag_of_camera_poses() -> None:
+    recording = episode()
+    wrist = recording.cameras["right_wrist"]
+    late = wrist.T_base_camera[np.maximum(np.arange(COUNT) - 3, 0)]
+    observation = observe(replace(recording, cameras={"right_wrist": replace(wrist, T_base_camera=late)}), {}, None)
+    reading = read(observation, RecordedConventions())
+    assert reading is not None
+    assert camera_lags(observation, reading, CONFIG)[0] == 3
+    mount, metres, degrees = rms_hand_eye(reading.tools[:-3, 0], late[3:])
+    assert np.allclose(mount, MOUNT, atol=1e-9)
+    assert (metres, degrees) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+def test_sizes_that_put_the_principal_point_into_the_middle() -> None:
+    camera = CameraTrack("head", K, HEAD[None], WIDTH, HEIGHT)
+    assert intrinsics_sizes({"head": camera}) == []
+    vga = replace(camera, K=camera.resized(640, 480).K)
+    assert intrinsics_sizes({"head": vga, "other": vga}) == [(480, 640)]
+    # A principal point somewhat off the middle is a camera's own.
+    off = K.copy()
+    off[:2, 2] += 1.5
+    assert intrinsics_sizes({"head": replace(camera, K=off)}) == []
+    odd = replace(camera, K=camera.resized(211, 170).K)
+    assert intrinsics_sizes({"head": odd}) == [(170, 211)]
+
+
+def test_pose_terms_blame_the_right_thing() -> None:
+    def terms(**mistake: object) -> dict[str, float]:
+        observation = observe(episode(), {}, None)
+        reading = read(observation, RecordedConventions.model_validate(mistake))
+        assert reading is not None
+        return pose_terms(observation, reading, CONFIG)
+
+    assert min(terms().values()) > -0.5
+    assert terms(pose_unit="mm")["hand-eye right_wrist"] < -30
+    assert terms(extrinsics_unit="mm")["camera place head"] > -0.1  # a thousandth is near the base: nothing odd there
+    assert terms(camera_axes="opengl")["faces its tool right_wrist"] == -15.0
+    assert terms(camera_axes="opengl")["hand-eye right_wrist"] > -0.1  # still rigid: only the view direction tells
+    assert terms(intrinsics_size=(480, 640))["intrinsics head"] < -20
+    assert terms(extrinsics="base_to_camera")["hand-eye right_wrist"] < -20
+    large = replace(episode(), T_base_ee=tools() @ np.diag([1.0, 1, 1, 1]))
+    scaled = large.T_base_ee
+    assert scaled is not None
+    scaled[..., :3, 3] *= 1000
+    observation = observe(replace(large, T_base_ee=scaled), {}, None)
+    reading = read(observation, RecordedConventions())
+    assert reading is not None
+    assert pose_terms(observation, reading, CONFIG)["workspace"] == -40.0
+
+
+def test_no_stated_mount_no_offset() -> None:
+    observation = observe(episode(), {}, None)
+    reading = read(observation, RecordedConventions())
+    assert reading is not None
+    assert tool_offset(observation, reading) is None
+
+
+def test_log_likelihoods_fall_with_disagreement() -> None:
+    typical = Typical(value=0.9, samples=20)
+    assert log_likelihood(0.9, typical) == pytest.approx(0.0)
+    assert log_likelihood(0.95, typical) > 0 > log_likelihood(0.8, typical)
+    assert log_likelihood(-0.5, typical) == log_likelihood(0.0, typical) == pytest.approx(10 * np.log(1 - 0.81))
+    assert unrest_log_likelihood(0.0, 0.0, CONFIG) == 0.0
+    assert unrest_log_likelihood(100.0, 90.0, CONFIG) == -60.0
+
+
+def test_peaks_between_frames() -> None:
+    assert refined_peak({k: -((k - 1.3) ** 2) for k in range(-3, 4)}) == pytest.approx(1.3)
+    assert refined_peak({-1: 0.0, 0: 0.1, 1: 0.0}) is None  # too flat to mean anything
+    assert refined_peak({k: float(k) for k in range(-3, 4)}) == 3.0

@@ -1,0 +1,71 @@
+"""The calibration doctor as a detector of the filters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.data.conventions import RecordedConventions, corrupt
+from worldline_core.data.episode import Episode
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.filters.doctor import FilterDoctorConfig, detect_mistake, kinematics_of
+from worldline_core.filters.filter import FilterConfig
+from worldline_core.filters.inspect_episode import inspect
+from worldline_core.filters.signals import Signals, measure
+
+CONFIG = FilterDoctorConfig()
+
+
+@pytest.fixture(scope="module")
+def recording(project_root: Path) -> tuple[Episode, dict[str, np.ndarray], Signals]:
+    episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
+    i = episodes.position("ur5e_pair-test-s1-00002")
+    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
+    return episodes.episode(i), frames, measure(episodes.episode(i), frames)
+
+
+def test_frames_that_are_dropped_anyway_do_not_count(recording: tuple[Episode, dict[str, np.ndarray], Signals]) -> None:
+    episode, _, signals = recording
+    none_bad = np.zeros(episode.num_frames, dtype=bool)
+    assert detect_mistake(episode, signals.gray, none_bad, CONFIG).passed
+    noisy = dict(signals.gray)
+    noisy["head"] = noisy["head"].copy()
+    noise = np.random.default_rng(0).integers(0, 255, noisy["head"].shape, dtype=np.uint8)
+    noisy["head"][18:] = noise[18:]
+    spoilt = detect_mistake(episode, noisy, none_bad, CONFIG)
+    assert (spoilt.passed, spoilt.reason) == (False, "calibration_unexplained")
+    assert "flow head" in str(spoilt.numbers["bad"])
+    bad = none_bad.copy()
+    bad[18:] = True
+    assert detect_mistake(episode, noisy, bad, CONFIG).passed
+    nothing_left = detect_mistake(episode, noisy, ~none_bad, CONFIG)
+    assert nothing_left.passed
+    assert nothing_left.numbers["verdict"] == "too_little_evidence"
+
+
+def test_an_explanation_comes_before_what_it_explains(
+    recording: tuple[Episode, dict[str, np.ndarray], Signals],
+) -> None:
+    episode, frames, _ = recording
+    findings = inspect(
+        FilterConfig(), measure(corrupt(episode, RecordedConventions(extrinsics="base_to_camera")), frames)
+    )
+    failed = [finding for finding in findings if not finding.verdict.passed]
+    assert failed[0].detector == "doctor"
+    assert failed[0].verdict.reason == "calibration"
+    assert failed[0].verdict.numbers["config"] == "curate.sources[].conventions.extrinsics: base_to_camera"
+    assert {"hand_eye", "projection"} & {finding.detector for finding in failed}
+    clean = inspect(FilterConfig(), measure(episode, frames))
+    assert all(finding.verdict.passed for finding in clean)
+    assert clean[-1].detector == "doctor"
+
+
+def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[str, np.ndarray], Signals]) -> None:
+    episode = recording[0]
+    assert kinematics_of(episode) is kinematics_of(episode)
+    assert kinematics_of(replace(episode, embodiment="no_such_robot")) is None
+    three = np.tile(np.eye(4), (episode.num_frames, 3, 1, 1))
+    assert kinematics_of(replace(episode, T_base_ee=three)) is None

@@ -1,0 +1,168 @@
+"""What is measured of an episode before anything is assumed about its conventions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from worldline_core.data.episode import Episode
+from worldline_core.errors import DataError
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.rigid import hand_eye_residual
+
+GRAY_WIDTH = 96
+CELL_PX = 4
+_STILL_CHANGE = 4.0  # grey levels: compression and sensor noise stay below
+
+
+@dataclass(frozen=True)
+class Arm:
+    """`T_tool_mount`: place of the wrist camera in the tool frame where the embodiment states it."""
+
+    name: str
+    wrist_view: str
+    T_tool_mount: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Image motion of one view, in cells of CELL_PX pixels; entry i belongs to the step from image i to i + 1.
+
+    Attributes:
+        flow: (n - 1, r, c, 2) mean optical flow [px]. change: (n - 1, r, c) mean absolute change, of 255.
+        texture: (n - 1, r, c) mean gradient: where there is none, flow is a guess.
+    """
+
+    flow: np.ndarray
+    change: np.ndarray
+    texture: np.ndarray
+
+    @cached_property
+    def moves(self) -> bool:
+        """Whether anything moves at all."""
+        return bool((self.change.max(axis=(1, 2)) > _STILL_CHANGE).sum() >= 4)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One episode, its small grey images by view (n, h, GRAY_WIDTH), its arms and kinematics."""
+
+    episode: Episode
+    gray: Mapping[str, np.ndarray]
+    arms: tuple[Arm, ...]
+    kinematics: ArmKinematics | None
+    _motion: dict[str, Motion] = field(default_factory=dict, repr=False)
+    _stands: dict[str, bool] = field(default_factory=dict, repr=False)
+
+    def motion(self, view: str) -> Motion:
+        """Flow and change of a view; computed once."""
+        if view not in self._motion:
+            self._motion[view] = _motion(self.gray[view])
+        return self._motion[view]
+
+    def stands_still(self, view: str) -> bool:
+        """Whether the recording says that a camera does not move (2 cm, 2 degrees; at any unit of length)."""
+        if view not in self._stands:
+            poses = self.episode.cameras[view].T_base_camera
+            _, metres, degrees = hand_eye_residual(np.eye(4)[None].repeat(len(poses), axis=0), poses)
+            scale = max(1.0, float(np.linalg.norm(poses[0, :3, 3])))
+            self._stands[view] = bool(metres.max() < 0.02 * scale and degrees.max() < 2.0)
+        return self._stands[view]
+
+    @property
+    def num_images(self) -> int:
+        return min((len(images) for images in self.gray.values()), default=0)
+
+    @cached_property
+    def posture(self) -> dict[str, float]:
+        """Joints outside the state as far as the episode notes them (waist, head)."""
+        if self.kinematics is None:
+            return {}
+        noted = {k: v for k, v in self.episode.conventions.items() if isinstance(v, int | float)}
+        return {
+            joint: float(value)
+            for joint in self.kinematics.embodiment.posture
+            for name, value in noted.items()
+            if name in joint
+        }
+
+
+def observe(episode: Episode, frames: Mapping[str, np.ndarray], kinematics: ArmKinematics | None) -> Observation:
+    """Measure an episode.
+
+    Args:
+        frames: by view, uint8 (n, H, W, 3) RGB or (n, h, w) grey; resized to GRAY_WIDTH.
+
+    Raises: DataError when images have another shape or the kinematics belong to another number of arms.
+    """
+    gray = {view: small_gray(images) for view, images in frames.items()}
+    return Observation(episode, gray, _arms(episode, kinematics), kinematics)
+
+
+def small_gray(images: np.ndarray) -> np.ndarray:
+    """uint8 (n, h, GRAY_WIDTH) of RGB (n, H, W, 3) or grey (n, H, W) images."""
+    if images.ndim not in (3, 4) or images.dtype != np.uint8 or (images.ndim == 4 and images.shape[3] != 3):
+        raise DataError(
+            "Images have a wrong shape",
+            expected="uint8 (n, H, W, 3) or (n, H, W)",
+            got=f"{images.dtype} {images.shape}",
+        )
+    if images.ndim == 3 and images.shape[2] == GRAY_WIDTH:
+        return images
+    height = max(2, round(images.shape[1] * GRAY_WIDTH / images.shape[2]))
+    gray = images if images.ndim == 3 else [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    return np.stack([cv2.resize(image, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA) for image in gray])
+
+
+def cell_centres(height: int, width: int) -> np.ndarray:
+    """(r, c, 2) pixel coordinates of the cells' centres."""
+    rows, columns = np.mgrid[: height // CELL_PX, : width // CELL_PX]
+    return np.stack([columns, rows], axis=-1) * float(CELL_PX) + (CELL_PX - 1) / 2
+
+
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """(n, h, w, ...) -> (n, r, c, ...): mean over CELL_PX squares; what is left over at the border is dropped."""
+    n, height, width = values.shape[:3]
+    r, c = height // CELL_PX, width // CELL_PX
+    cut = values[:, : r * CELL_PX, : c * CELL_PX]
+    return cut.reshape(n, r, CELL_PX, c, CELL_PX, *values.shape[3:]).mean(axis=(2, 4), dtype=np.float32)
+
+
+def _motion(gray: np.ndarray) -> Motion:
+    value = gray.astype(np.float32)
+    if len(gray) < 2:
+        empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
+        return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
+    engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    engine.setFinestScale(1)
+    flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(gray)])  # type: ignore[call-overload]
+    across = np.abs(np.diff(value[:-1], axis=2, append=value[:-1, :, -1:]))
+    down = np.abs(np.diff(value[:-1], axis=1, append=value[:-1, -1:]))
+    return Motion(cell_means(flow), cell_means(np.abs(np.diff(value, axis=0))), cell_means(np.maximum(across, down)))
+
+
+def _arms(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
+    if kinematics is None:
+        count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
+        names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))
+        return tuple(Arm(name, f"{name}_wrist", None) for name in names)
+    arms = []
+    for arm in kinematics.embodiment.arms:
+        mount, camera = None, arm.wrist_camera
+        if camera is not None and camera.link == arm.end_effector_link:
+            T_tool_link = np.linalg.inv(arm.T_link_tool.matrix())
+            mount = T_tool_link @ np.asarray(camera.T_link_camera, dtype=np.float64)
+        arms.append(Arm(arm.name, arm.camera_view, mount))
+    if episode.T_base_ee is not None and episode.T_base_ee.shape[1] != len(arms):
+        raise DataError(
+            "Recorded tool poses and embodiment differ in the number of arms",
+            where=f"episode {episode.episode_id}, embodiment {kinematics.embodiment.name}",
+            expected=f"{len(arms)} arms",
+            got=f"{episode.T_base_ee.shape[1]} tool poses a frame",
+        )
+    return tuple(arms)
