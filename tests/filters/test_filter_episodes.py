@@ -17,6 +17,7 @@ from worldline_core.data.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import FilterConfig, filter_episodes
+from worldline_core.filters.signals import tool_poses
 from worldline_core.geometry.rigid import rigid_inverse
 
 HEIGHT, WIDTH, FRAMES, FPS = 64, 96, 33, 8.0
@@ -219,3 +220,12 @@ def test_nothing_left_is_an_error(filtered: tuple[Path, Path, dict[str, Any]], t
 def test_views_that_have_no_frames_are_known(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
     passed = EpisodeSet.open(filtered[1])
     assert passed.rows[passed.position("e06")].views == VIEWS[:2]
+
+
+def test_a_robot_whose_description_is_not_here_is_left_out_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WORLDLINE_DESCRIPTION_AGIBOT_G1", raising=False)
+    state = np.zeros((FRAMES, 16), np.float32)
+    episode, _ = record(0, embodiment="agibot_g1", state=state, action=state, state_kind="joints", state_names=None)
+    poses, arms = tool_poses(replace(episode, T_base_ee=None, gripper=None))
+    assert poses is None
+    assert arms == ()

@@ -13,7 +13,7 @@ from worldline_core.calibration.observation import CELL_PX, Observation, cell_ce
 from worldline_core.calibration.reading import Reading, predict_motion
 from worldline_core.geometry.rigid import project_points, rigid_inverse
 
-_MIN_TRAVEL = 0.15  # of the opening over the episode: less moves no finger visibly
+_MIN_TRAVEL = 0.12  # range of the opening over the episode: less moves no finger visibly, and noise stays below
 _MOVES = 0.02  # of the opening a frame
 _FINGER_REACH_M = 0.06
 _GAP, _REST = 0.1, 0.01  # between opening and command; change of the opening a frame
@@ -93,8 +93,7 @@ def _moves(observation: Observation, reading: Reading, arm: int, config: Calibra
     view = observation.arms[arm].wrist_view
     if reading.gripper is None or view not in observation.gray or view not in reading.cameras:
         return False
-    travel = np.abs(np.diff(reading.gripper[:, arm])).sum()
-    return bool(travel >= _MIN_TRAVEL) and len(observation.gray[view]) > config.min_image_pairs
+    return bool(np.ptp(reading.gripper[:, arm]) >= _MIN_TRAVEL) and len(observation.gray[view]) > config.min_image_pairs
 
 
 def finger_flow(observation: Observation, reading: Reading, arm: int, config: CalibrationDoctorConfig) -> float | None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from worldline_core.data.episode import Episode
-from worldline_core.errors import DataError
+from worldline_core.errors import DataError, UnavailableError
 
 GRAY_WIDTH = 96
 
@@ -112,7 +112,10 @@ def tool_poses(episode: Episode) -> tuple[np.ndarray | None, tuple[ArmModel, ...
 
     if episode.embodiment not in embodiment_names() or episode.state_kind != "joints":
         return None, ()
-    kinematics, arms = _kinematics(episode.embodiment)
+    try:
+        kinematics, arms = _kinematics(episode.embodiment)
+    except UnavailableError:  # the episode is left out of Stage II as missing_kinematics; the others go on
+        return None, ()
     return np.asarray(kinematics.tool_poses(episode.state.astype(np.float64))), arms
 
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -70,25 +72,47 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     parts = output / "run" / "parts"
 
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
-    records: list[tuple[str, Episode, dict[str, Any]]] = []
-    for episode_id in tqdm(
-        sorted(set().union(*predicted.values())), desc="evaluate_video", unit="episode", disable=None
-    ):
+
+    def measure(episode_id: str) -> list[tuple[str, Episode, dict[str, Any]]]:
         episode = recordings.episode(episode_id)
         measurement = EpisodeMeasurement(recordings, tracks, episode_id, config.views, segmenters, lpips)
-        num_frames = 0
+        found: list[tuple[str, Episode, dict[str, Any]]] = []
         for method, rollout in rollouts.items():
             if episode_id in predicted[method]:
                 part = parts / method / f"{episode_id}.json"
                 if not part.exists():
                     write_json_atomic(part, measurement.measure(method, rollout))
-                records.append((method, episode, json.loads(part.read_text())))
-                num_frames = max(num_frames, records[-1][-1]["num_frames"])
+                found.append((method, episode, json.loads(part.read_text())))
+        num_frames = max(content["num_frames"] for _, _, content in found)
         part = parts / TRUE_METHOD / f"{episode_id}.json"
         if not part.exists():
             write_json_atomic(part, measurement.segmenter_accuracy(num_frames))
-        records.append((TRUE_METHOD, episode, json.loads(part.read_text())))
+        return [*found, (TRUE_METHOD, episode, json.loads(part.read_text()))]
+
+    episode_ids = sorted(set().union(*predicted.values()))
+    records: list[tuple[str, Episode, dict[str, Any]]] = []
+    with _workers(on_gpu="sam3" in config.segmenters) as pool:
+        for found in tqdm(
+            pool.map(measure, episode_ids), total=len(episode_ids), desc="evaluate_video", unit="episode", disable=None
+        ):
+            records += found
     return _write(config, records, segmenters, lpips_reason, output)
+
+
+@contextmanager
+def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
+    """One thread a core, each an episode at a time: decoding, GrabCut and small networks do not fill the cores alone.
+
+    Networks run on one thread then, so that results do not depend on the number of cores.
+    """
+    import torch
+
+    count = 1 if on_gpu else torch.get_num_threads()
+    pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(torch.get_num_threads() // count,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _open_lpips(folder: Path | None) -> tuple[Any | None, str | None]:
