@@ -100,7 +100,7 @@ def _codec() -> dict[str, Any]:
 
 
 def _packages() -> list[dict[str, Any]]:
-    extras = {"mujoco": "sim (worldline record)"}
+    extras = {"mujoco": "sim (worldline record)", "h5py": "hdf5 (HDF5 sources)"}
     findings = []
     for package, purpose in extras.items():
         present = importlib.util.find_spec(package) is not None

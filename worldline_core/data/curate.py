@@ -14,7 +14,14 @@ from pydantic import Field
 from tqdm import tqdm
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.curate_checks import check_camera, check_joints, check_times, check_values, stride_to
+from worldline_core.data.curate_checks import (
+    check_camera,
+    check_joints,
+    check_split,
+    check_times,
+    check_values,
+    stride_to,
+)
 from worldline_core.data.episode import Episode, Split
 from worldline_core.data.episode_index import read_index, read_quarantine
 from worldline_core.data.episode_parts import part_name
@@ -22,12 +29,14 @@ from worldline_core.data.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.data.resize import Fit, fitted
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
 from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
 from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
 from worldline_core.data.sources.lerobot import LeRobotSource, LeRobotSourceConfig
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig
 from worldline_core.data.sources.repaired import RepairedSource
+from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.undistort import PinholeSource
 from worldline_core.data.video import PixelFormat
 from worldline_core.errors import CalibrationError, DataError
@@ -37,8 +46,10 @@ SourceConfig = Annotated[
     EpisodeSetSourceConfig
     | LeRobotSourceConfig
     | AgibotGesimSourceConfig
+    | AgibotWorldSourceConfig
     | DroidAnnotationSourceConfig
-    | McapSourceConfig,
+    | McapSourceConfig
+    | RobotwinSourceConfig,
     Field(discriminator="kind"),
 ]
 
@@ -105,10 +116,14 @@ def _reader(config: SourceConfig, root: Path) -> EpisodeSource:
             return LeRobotSource(config, root)
         case AgibotGesimSourceConfig():
             return AgibotGesimSource(config, root)
+        case AgibotWorldSourceConfig():
+            return AgibotWorldSource(config, root)
         case DroidAnnotationSourceConfig():
             return DroidAnnotationSource(config, root)
         case McapSourceConfig():
             return McapSource(config, root)
+        case RobotwinSourceConfig():
+            return RobotwinSource(config, root)
 
 
 def curate(config: CurateConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -120,7 +135,8 @@ def curate(config: CurateConfig, inputs: Mapping[str, Path], output: Path) -> di
     Returns:
         {"found", "kept", "quarantined", "reasons", "splits"}; kept + quarantined = found.
 
-    Raises: DataError when a source cannot be opened, nothing is kept, or a scene is both in training and in test.
+    Raises: DataError when a source cannot be opened, nothing is kept, or a scene is both in training and in test;
+        ConfigError when recordings for evaluation only are assigned to training.
     """
     listed = _list_inputs(config, inputs)
     if EpisodeSetWriter.finished(output):
@@ -258,6 +274,7 @@ def _prepare(
         split=split,
         primary_view=config.primary_view or episode.primary_view,
     )
+    check_split(prepared)
     return prepared, frames, masks, fingerprint
 
 

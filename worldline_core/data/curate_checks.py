@@ -7,10 +7,30 @@ import numpy as np
 from worldline_core.data.episode import CameraTrack, Episode
 from worldline_core.data.recorded_poses import camera_pose
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.errors import ConfigError
 
 # No joint of a manipulator turns further; larger numbers are degrees or encoder ticks.
 MAX_JOINT_RAD = 4 * np.pi
 _GRIPPER_MARGIN = 0.05
+TRAINING_SPLITS = ("train", "validation")
+EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
+"""Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
+
+
+def check_split(episode: Episode) -> None:
+    """Raises: ConfigError when an episode of an evaluation-only layout is given a split that trains or selects.
+
+    The layout is noted in the episode itself, so a set that was made of such recordings earlier is refused as well.
+    """
+    layout = episode.conventions.get("layout")
+    if layout in EVALUATION_LAYOUTS and episode.split in TRAINING_SPLITS:
+        raise ConfigError(
+            "Recordings for evaluation only were assigned to training",
+            where=f"episode {episode.episode_id}, scene {episode.scene} ({layout})",
+            expected="split test or ood_test",
+            got=episode.split,
+            next_step="change curate.splits, or leave these scenes out of its patterns",
+        )
 
 
 def check_values(episode: Episode) -> None:

@@ -27,8 +27,15 @@ from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
+AGIBOT_CAMERAS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
+"""View -> AgiBot's name of the camera, in file names of every layout."""
+GRIPPER_STATE_RAW = GripperRange(closed=120.0, open=35.0)
+"""Readings of AgiBot World's `state/effector/position`, checked on images."""
+GRIPPER_COMMAND_RAW = GripperRange(closed=1.0, open=0.0)
+TOOL_OFFSET_RAW_M = 0.23
+"""From the arm's end link to between the fingertips of AgiBot World's hands, along +z."""
+
 _FOLDER_V1 = {"head": "head_color", "left_wrist": "hand_left_color", "right_wrist": "hand_right_color"}
-_NAME_V1 = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
 _IMAGE_V2 = {"head": "cur_head.png", "left_wrist": "cur_left.png", "right_wrist": "cur_right.png"}
 _POSTURE_V2 = ("head_yaw", "head_pitch", "waist_pitch", "waist_lift")
 
@@ -39,9 +46,9 @@ class AgibotGesimSourceConfig(ForeignSourceConfig):
     kind: Literal["agibot_gesim"] = "agibot_gesim"
     fps: float = Field(gt=0)
     embodiment: str = "agibot_g1"
-    gripper_v1: GripperRange = GripperRange(closed=120.0, open=35.0)
+    gripper_v1: GripperRange = GRIPPER_STATE_RAW
     gripper_v2: GripperRange = GripperRange(closed=119.0, open=0.2)
-    tool_offset_v1_m: float = 0.23
+    tool_offset_v1_m: float = TOOL_OFFSET_RAW_M
     tool_offset_v2_m: float = 0.15
     distortions: dict[str, LensConfig] = Field(default={}, description="view -> lens, where images are distorted")
 
@@ -96,7 +103,7 @@ class AgibotGesimSource:
             )
         cameras: dict[str, CameraTrack] = {}
         recorded: dict[str, CameraPose] = {}
-        for view, name in _NAME_V1.items():
+        for view, name in AGIBOT_CAMERAS.items():
             height, width = _read_png(images[view][0]).shape[:2]
             K = _array(folder / f"intrinsic_{name}.npy", (3, 3)).astype(np.float64)
             track = _array(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)).astype(np.float64)
@@ -135,7 +142,7 @@ class AgibotGesimSource:
         commands = _array(folder / "actions_0.npy", (num_frames, 16))
         ends = _array(folder / "state_eef_poses_0.npy", (num_frames, 14))
         opening, overshoot = config.gripper_v2.opening(joints[:, 14:16])
-        commanded, command_overshoot = GripperRange(closed=1.0, open=0.0).opening(commands[:, [7, 15]])
+        commanded, command_overshoot = GRIPPER_COMMAND_RAW.opening(commands[:, [7, 15]])
         left, right = slice(0, 7), slice(7, 14)
         state = np.concatenate([joints[:, left], opening[:, :1], joints[:, right], opening[:, 1:]], axis=1)
         action = np.concatenate([commands[:, :7], commanded[:, :1], commands[:, 8:15], commanded[:, 1:]], axis=1)

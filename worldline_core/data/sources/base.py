@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.config.base import StrictModel
 from worldline_core.data.conventions import RecordedConventions
+from worldline_core.data.curate_checks import TRAINING_SPLITS
 from worldline_core.data.episode import Episode, Outcome, Split, TaskFamily
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.distortion import Distortion, DistortionModel
@@ -73,6 +74,18 @@ class ForeignSourceConfig(SourceConfigBase):
     scene: str | None = Field(default=None, description="scene of all episodes; default: one scene an episode folder")
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
+
+
+class EvaluationSourceConfig(ForeignSourceConfig):
+    """A source that results are compared on, and that therefore never trains or selects a model."""
+
+    @model_validator(mode="after")
+    def _not_for_training(self) -> EvaluationSourceConfig:
+        if self.split in TRAINING_SPLITS:
+            raise ValueError(
+                f"these recordings are for evaluation only: split {self.split} is refused, use test or ood_test"
+            )
+        return self
 
 
 class LensConfig(StrictModel):

@@ -14,18 +14,19 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.conventions import along_tool_z
+from worldline_core.data.curate_checks import EVALUATION_LAYOUTS
 from worldline_core.data.episode import Episode
 from worldline_core.data.lerobot_v3 import read_json
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.data.source_paths import inside
-from worldline_core.data.sources.base import ForeignSourceConfig, LoadedEpisode, no_masks
+from worldline_core.data.sources.base import EvaluationSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.video import decode_video, video_size
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
 
 _DIGITS = re.compile(r"(\d+)")
 
 
-class DroidAnnotationSourceConfig(ForeignSourceConfig):
+class DroidAnnotationSourceConfig(EvaluationSourceConfig):
     """`views` names the videos of an episode in order; None leaves one out."""
 
     kind: Literal["droid_annotation"] = "droid_annotation"
@@ -92,7 +93,7 @@ class DroidAnnotationSource:
             gripper=opening,
             state_names=(*(f"right/joint_{index}" for index in range(1, 8)), "right/gripper"),
             conventions={
-                "layout": "droid annotation",
+                "layout": EVALUATION_LAYOUTS[0],
                 "action": "commanded joints" if command is not None else "repeats the state: no commands are published",
                 "tool_offset_m": config.tool_offset_m,
                 "gripper_overshoot": overshoot,

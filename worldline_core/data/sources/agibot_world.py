@@ -1,0 +1,297 @@
+"""AgiBot World as published: HDF5 proprioception, one mp4 and two JSON files of camera parameters a view.
+
+    task_info/task_<task>.json                                   instructions and labelled steps of all episodes
+    proprio_stats/<task>/<episode>/proprio_stats.h5              timestamp [ns], state/*, action/*
+    observations/<task>/<episode>/videos/<camera>_color.mp4
+    parameters/<task>/<episode>/parameters/camera/<camera>_{intrinsic_params,extrinsic_params_aligned}.json
+
+Joints are left then right [rad]; poses are of the arm's end link (xyz [m], quaternion xyzw) in the base frame of the
+extrinsics, which are camera-to-base with OpenCV axes, one a frame or one for all. The gripper's state reads about 35 open
+.. 120 closed, its command 0 open .. 1 closed. Episodes with dexterous hands (12 effector values) are quarantined: their
+state is not the two-gripper layout of this embodiment.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from worldline_core.data.conventions import along_tool_z
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.hdf5 import Hdf5File, open_hdf5, require_h5py
+from worldline_core.data.lerobot_v3 import read_json
+from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import inside
+from worldline_core.data.sources.agibot_gesim import (
+    AGIBOT_CAMERAS,
+    GRIPPER_COMMAND_RAW,
+    GRIPPER_STATE_RAW,
+    TOOL_OFFSET_RAW_M,
+)
+from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
+from worldline_core.data.video import decode_video, video_size
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.pose_formats import pose_from_quaternion_xyzw
+
+View = Literal["head", "left_wrist", "right_wrist"]
+_STATE_NAMES = tuple(
+    f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")
+)
+_POSTURE = {"head": ("head_yaw_rad", "head_pitch_rad"), "waist": ("waist_pitch_rad", "waist_lift_m")}
+_DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+
+
+class AgibotWorldSourceConfig(ForeignSourceConfig):
+    """A folder with `observations`, `parameters`, `proprio_stats` and `task_info`.
+
+    Episodes of one task share a scene unless `scene` says otherwise: a task is recorded at one place, and a split by
+    episode would test on what was trained on.
+    """
+
+    kind: Literal["agibot_world"] = "agibot_world"
+    fps: float = Field(default=30.0, gt=0, description="rate that videos and timestamps must have")
+    embodiment: str = "agibot_g1"
+    views: tuple[View, ...] = Field(
+        default=("head", "left_wrist", "right_wrist"), min_length=1, description="views that must be there"
+    )
+    gripper_state: GripperRange = GRIPPER_STATE_RAW
+    gripper_command: GripperRange = GRIPPER_COMMAND_RAW
+    tool_offset_m: float = TOOL_OFFSET_RAW_M
+    distortions: dict[View, LensConfig] = Field(
+        default={},
+        description="view -> lens. Recorded coefficients are not applied: whether the published images still have the "
+        "distortion is not documented; the largest is noted in the episode's conventions",
+    )
+
+
+class AgibotWorldSource:
+    """Reads every `<task>/<episode>` that `proprio_stats` or `observations` has a folder of; ids are label-task-episode.
+
+    Arrays are read an episode at a time, videos when their frames are asked for.
+    """
+
+    def __init__(self, config: AgibotWorldSourceConfig, root: Path) -> None:
+        require_h5py()
+        self._config = config
+        self._root = root
+        found = {
+            (folder.parent.name, folder.name)
+            for part in ("proprio_stats", "observations")
+            for folder in (root / part).glob("*/*")
+            if folder.is_dir()
+        }
+        self._episodes = {f"{config.label}-{task}-{episode}": (task, episode) for task, episode in found}
+        self._task_info: tuple[str, dict[str, Any]] | None = None
+
+    def episode_ids(self) -> list[str]:
+        return sorted(self._episodes)
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        config = self._config
+        task, number = self._episodes[episode_id]
+        info = self._info(task, number)
+        videos = {
+            view: inside(self._root, f"observations/{task}/{number}/videos/{AGIBOT_CAMERAS[view]}_color.mp4")
+            for view in config.views
+        }
+        sizes = {view: self._size(path) for view, path in videos.items()}
+        path = inside(self._root, f"proprio_stats/{task}/{number}/proprio_stats.h5")
+        with open_hdf5(path) as file:
+            positions = file.array("state/end/position", (None, 2, 3))
+            length = len(positions)
+            quaternions = file.array("state/end/orientation", (length, 2, 4))
+            state, opening, overshoot = self._vector(file, "state", length, config.gripper_state, path)
+            action, _, command_overshoot = self._vector(file, "action", length, config.gripper_command, path)
+            times = file.times_ns("timestamp", length)
+            posture = {
+                name: float(file.array(f"state/{part}/position", (length, 2))[0, i])
+                for part, names in _POSTURE.items()
+                if file.has(f"state/{part}/position")
+                for i, name in enumerate(names)
+            }
+        with rejected_as("nan_state", path):
+            ends = pose_from_quaternion_xyzw(positions, quaternions)
+        cameras: dict[str, CameraTrack] = {}
+        recorded: dict[str, CameraPose] = {}
+        distortion = 0.0
+        for view in config.views:
+            cameras[view], recorded[view], largest = self._camera(task, number, view, sizes[view], length)
+            distortion = max(distortion, largest)
+        episode = Episode(
+            episode_id=episode_id,
+            source=config.label,
+            embodiment=config.embodiment,
+            scene=config.scene or f"{config.label}-{task}",
+            task_family=config.task_family,
+            instruction=str(info.get("task_name") or "").strip(),
+            outcome=config.outcome,
+            split=config.split,
+            fps=config.fps,
+            state=state.astype(np.float32),
+            action=action.astype(np.float32),
+            timestamps=times,
+            cameras=cameras,
+            T_base_ee=along_tool_z(ends, config.tool_offset_m),
+            gripper=opening,
+            primary_view=config.views[0],
+            state_names=_STATE_NAMES,
+            conventions={
+                "layout": "agibot_world",
+                "tool_offset_m": config.tool_offset_m,
+                "gripper_overshoot": overshoot + command_overshoot,
+                "distortion_not_applied": distortion if not config.distortions else 0.0,
+                "steps": _steps(info),
+                **posture,
+                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+            },
+        )
+        return LoadedEpisode(
+            episode,
+            config.views,
+            lambda view: decode_video(videos[view], length),
+            no_masks,
+            {view: lens.distortion for view, lens in config.distortions.items()},
+        )
+
+    def _vector(
+        self, file: Hdf5File, track: str, length: int, gripper: GripperRange, path: Path
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """(N, 16) in the embodiment's order, the openings (N, 2), and how many readings were clipped."""
+        joints = file.array(f"{track}/joint/position", (length, 14))
+        effector = file.array(f"{track}/effector/position", (length, None))
+        if effector.shape[1] != 2:
+            raise RejectedInputError(
+                "invalid_gripper",
+                "Effectors are no two grippers",
+                where=f"{path}, {track}/effector/position",
+                expected="2 values a frame, left and right gripper",
+                got=f"{effector.shape[1]} (12: dexterous hands)",
+                evidence={"values": int(effector.shape[1])},
+            )
+        opening, overshoot = gripper.opening(effector)
+        vector = np.concatenate([joints[:, :7], opening[:, :1], joints[:, 7:], opening[:, 1:]], axis=1)
+        return vector, opening, overshoot
+
+    def _size(self, path: Path) -> tuple[int, int]:
+        """(height, width) of a video of the right rate."""
+        height, width, rate = video_size(path)
+        if abs(rate - self._config.fps) > 0.02:
+            raise RejectedInputError(
+                "wrong_fps",
+                "Video has another frame rate",
+                where=path,
+                expected=f"{self._config.fps} fps",
+                got=f"{rate:.3f} fps",
+                evidence={"expected_fps": self._config.fps, "found_fps": rate},
+            )
+        return height, width
+
+    def _camera(
+        self, task: str, number: str, view: str, size: tuple[int, int], length: int
+    ) -> tuple[CameraTrack, CameraPose, float]:
+        """The track, its recorded poses, and the largest recorded distortion coefficient."""
+        folder = f"parameters/{task}/{number}/parameters/camera/{AGIBOT_CAMERAS[view]}"
+        intrinsic_path = inside(self._root, f"{folder}_intrinsic_params.json")
+        extrinsic_path = inside(self._root, f"{folder}_extrinsic_params_aligned.json")
+        record = read_json(intrinsic_path)
+        intrinsic = record.get("intrinsic") if isinstance(record, dict) else None
+        fx, fy, cx, cy = (_number(intrinsic, key, intrinsic_path) for key in ("fx", "fy", "ppx", "ppy"))
+        height, width = size
+        if not (0 < cx < width and 0 < cy < height):
+            raise RejectedInputError(
+                "missing_calibration",
+                "Principal point lies outside of the image: the calibration is of another image size",
+                where=intrinsic_path,
+                expected=f"inside of {width}x{height}",
+                got=(cx, cy),
+                evidence={"view": view, "ppx": cx, "ppy": cy, "width": width, "height": height},
+            )
+        coefficients = [abs(_number(intrinsic, key, intrinsic_path)) for key in _DISTORTION if key in (intrinsic or {})]
+        pose = camera_pose(
+            view,
+            _extrinsics(extrinsic_path, length),
+            extrinsics="camera_to_base",
+            axes="opencv",
+            where=extrinsic_path,
+        )
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return CameraTrack.from_pose(view, K, pose, width=width, height=height), pose, max(coefficients, default=0.0)
+
+    def _info(self, task: str, number: str) -> dict[str, Any]:
+        """What `task_info` says about an episode; the last task's file is kept, episodes are read in order of tasks."""
+        path = inside(self._root, f"task_info/task_{task}.json")
+        if self._task_info is None or self._task_info[0] != task:
+            listed = read_json(path)
+            rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
+            self._task_info = task, {str(row.get("episode_id")): row for row in rows}
+        info = self._task_info[1].get(number)
+        if info is None:
+            raise RejectedInputError(
+                "missing_column",
+                "Task information does not name the episode",
+                where=path,
+                expected=f"an entry with episode_id {number}",
+                got=f"{len(self._task_info[1])} entries",
+            )
+        return info
+
+
+def _extrinsics(path: Path, length: int) -> np.ndarray:
+    """(N or 1, 4, 4) camera-to-base."""
+    listed = read_json(path)
+    if not isinstance(listed, list) or len(listed) not in (1, length):
+        got = len(listed) if isinstance(listed, list) else type(listed).__name__
+        raise RejectedInputError(
+            "length_mismatch",
+            "Extrinsics and states differ in length",
+            where=path,
+            expected=f"a list of {length} (or 1)",
+            got=got,
+            evidence={"states": length, "extrinsics": got},
+        )
+    matrices = np.tile(np.eye(4), (len(listed), 1, 1))
+    try:
+        matrices[:, :3, :3] = [item["extrinsic"]["rotation_matrix"] for item in listed]
+        matrices[:, :3, 3] = [item["extrinsic"]["translation_vector"] for item in listed]
+    except (KeyError, TypeError) as error:
+        raise RejectedInputError(
+            "missing_column",
+            "Extrinsics lack a field",
+            where=path,
+            expected="extrinsic.rotation_matrix and extrinsic.translation_vector in each entry",
+            got=repr(error),
+        ) from error
+    except ValueError as error:
+        raise RejectedInputError(
+            "invalid_extrinsics",
+            "Extrinsics have a wrong shape",
+            where=path,
+            expected="(3, 3) and (3,)",
+            got=str(error),
+        ) from error
+    return matrices
+
+
+def _number(record: Any, key: str, path: Path) -> float:
+    value = record.get(key) if isinstance(record, dict) else None
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise RejectedInputError(
+            "missing_column", "Intrinsics lack a number", where=path, expected=f"intrinsic.{key}", got=repr(value)
+        )
+    if not np.isfinite(value):
+        raise RejectedInputError(
+            "singular_intrinsics", "Intrinsics are not finite", where=path, expected="a number", got=f"{key}: {value}"
+        )
+    return float(value)
+
+
+def _steps(info: dict[str, Any]) -> str:
+    """The labelled steps (first and last frame, text, skill) as JSON, as they were published."""
+    label = info.get("label_info")
+    steps = label.get("action_config") if isinstance(label, dict) else None
+    return json.dumps(steps if isinstance(steps, list) else [], ensure_ascii=False, sort_keys=True)

@@ -1,0 +1,208 @@
+"""RoboTwin 2 episodes: one HDF5 file each, with camera matrices and end poses. For evaluation only.
+
+    <task>/<setting>/data/episode<N>.hdf5
+    <task>/<setting>/instructions/episode<N>.json                {"seen": [...], "unseen": [...]}, where generated
+
+Cameras: `intrinsic_cv` (N, 3, 3), `extrinsic_cv` (N, 3, 4) world-to-camera with OpenCV axes, `cam2world_gl` (N, 4, 4)
+camera-to-world with OpenGL axes; the two must agree. End poses: xyz [m] and quaternion wxyz in the simulation's world,
+gripper along their +x, 0.12 m behind its centre. Grippers: 0 closed .. 1 open. One joint track is recorded; the action
+repeats it. Images are JPEG files that OpenCV wrote from RGB arrays, so their channels come out of OpenCV as RGB.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from worldline_core.data.curate_checks import EVALUATION_LAYOUTS
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.hdf5 import Hdf5File, open_hdf5, require_h5py
+from worldline_core.data.lerobot_v3 import read_json
+from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import inside
+from worldline_core.data.sources.base import EvaluationSourceConfig, GripperRange, LoadedEpisode, no_masks
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
+
+_DIGITS = re.compile(r"(\d+)")
+_ARMS = ("left", "right")
+_GRIPPER = GripperRange(closed=0.0, open=1.0)
+_MAX_DISAGREEMENT = 1e-3
+_END_FROM_TOOL = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""The end pose's x (out of the gripper) becomes the tool's z, its y the tool's x."""
+
+
+class RobotwinSourceConfig(EvaluationSourceConfig):
+    """The files state no rate, so it is declared here (the simulation's rate divided by the setting's `save_freq`)."""
+
+    kind: Literal["robotwin"] = "robotwin"
+    fps: float = Field(gt=0)
+    embodiment: str = "robotwin_aloha_agilex"
+    views: dict[str, str] = Field(
+        default={"head": "head_camera", "left_wrist": "left_camera", "right_wrist": "right_camera"},
+        min_length=1,
+        description="view -> camera of the file",
+    )
+    tool_offset_m: float = Field(default=0.12, description="end pose to gripper centre along the end pose's +x")
+    channels: Literal["as_written", "standard"] = Field(
+        default="as_written", description="standard: for images that were encoded again with the usual channel order"
+    )
+
+
+class RobotwinSource:
+    """Reads every `episode*.hdf5` below the root; images are decoded when their frames are asked for."""
+
+    def __init__(self, config: RobotwinSourceConfig, root: Path) -> None:
+        require_h5py()
+        self._config = config
+        self._root = root
+        found = sorted(root.rglob("episode*.hdf5"))
+        self._files = {"-".join([config.label, *p.relative_to(root).with_suffix("").parts]): p for p in found}
+
+    def episode_ids(self) -> list[str]:
+        return sorted(self._files, key=lambda name: [int(t) if t.isdigit() else t for t in _DIGITS.split(name)])
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        config = self._config
+        path = inside(self._root, str(self._files[episode_id].relative_to(self._root)))
+        cameras: dict[str, CameraTrack] = {}
+        recorded: dict[str, CameraPose] = {}
+        with open_hdf5(path) as file:
+            ends, grippers, blocks = [], [], []
+            length = len(file.array("endpose/left_endpose", (None, 7)))
+            for arm in _ARMS:
+                end = file.array(f"endpose/{arm}_endpose", (length, 7))
+                joints = file.array(f"joint_action/{arm}_arm", (length, None))
+                with rejected_as("nan_state", f"{path}, {arm} end pose"):
+                    ends.append(pose_from_quaternion_wxyz(end[:, :3], end[:, 3:]))
+                grippers.append(file.array(f"endpose/{arm}_gripper", (length,)))
+                blocks.append((joints, file.array(f"joint_action/{arm}_gripper", (length,))))
+
+            for view, camera in config.views.items():
+                cameras[view], recorded[view] = self._camera(file, path, view, camera, length)
+        opening, overshoot = _GRIPPER.opening(np.stack(grippers, axis=1))
+        clipped = [(joints, *_GRIPPER.opening(gripper)) for joints, gripper in blocks]
+        state = np.concatenate([part for joints, grip, _ in clipped for part in (joints, grip[:, None])], axis=1)
+        names = [
+            f"{arm}/{name}"
+            for arm, (joints, _) in zip(_ARMS, blocks, strict=True)
+            for name in (*(f"joint_{j + 1}" for j in range(joints.shape[1])), "gripper")
+        ]
+        # From between the fingertips, with +z out of the gripper, to the recorded end pose.
+        T_end_tool = _END_FROM_TOOL.copy()
+        T_end_tool[0, 3] = config.tool_offset_m
+        setting = "-".join(path.relative_to(self._root).parts[:-2])
+        episode = Episode(
+            episode_id=episode_id,
+            source=config.label,
+            embodiment=config.embodiment,
+            scene=config.scene or f"{config.label}-{setting}-{path.stem}",
+            task_family=config.task_family,
+            instruction=self._instruction(path),
+            outcome=config.outcome,
+            split=config.split,
+            fps=config.fps,
+            state=state.astype(np.float32),
+            action=state.astype(np.float32),
+            timestamps=np.arange(length) / config.fps,
+            cameras=cameras,
+            T_base_ee=np.stack(ends, axis=1) @ T_end_tool,
+            gripper=opening,
+            primary_view=next(iter(config.views)),
+            state_names=tuple(names),
+            conventions={
+                "layout": EVALUATION_LAYOUTS[1],
+                "action": "repeats the state: one joint track is recorded",
+                "base_frame": "world of the simulation",
+                "tool_offset_m": config.tool_offset_m,
+                "gripper_overshoot": overshoot + sum(count for *_, count in clipped),
+                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+            },
+        )
+        return LoadedEpisode(episode, tuple(config.views), lambda view: self._frames(path, view, length), no_masks)
+
+    def _camera(
+        self, file: Hdf5File, path: Path, view: str, camera: str, length: int
+    ) -> tuple[CameraTrack, CameraPose]:
+        group = f"observation/{camera}"
+        found = file.names("observation")
+        if camera not in found:
+            raise RejectedInputError(
+                "missing_view",
+                "File lacks a camera",
+                where=path,
+                expected=camera,
+                got=", ".join(found) or "none",
+                evidence={"missing": [view], "found": found},
+            )
+        first = file.encoded_images(f"{group}/rgb", length, stop=1)[0]
+        intrinsics = file.array(f"{group}/intrinsic_cv", (length, 3, 3))
+        if np.ptp(intrinsics, axis=0).max() > 1e-6:
+            raise RejectedInputError(
+                "singular_intrinsics",
+                "Camera matrix changes during the episode",
+                where=f"{path}, {group}/intrinsic_cv",
+                expected="one K an episode",
+                got=f"changes of up to {np.ptp(intrinsics, axis=0).max():.3g} pixels",
+                evidence={"view": view, "largest_change": float(np.ptp(intrinsics, axis=0).max())},
+            )
+        world_to_camera = np.tile(np.eye(4), (length, 1, 1))
+        world_to_camera[:, :3] = file.array(f"{group}/extrinsic_cv", (length, 3, 4))
+        where = f"{path}, {group}/extrinsic_cv"
+        pose = camera_pose(view, world_to_camera, extrinsics="base_to_camera", axes="opencv", where=where)
+        model = file.array(f"{group}/cam2world_gl", (length, 4, 4))
+        other = camera_pose(view, model, axes="opengl", where=f"{path}, {group}/cam2world_gl")
+        disagreement = float(np.abs(pose.T_base_camera - other.T_base_camera).max())
+        if disagreement > _MAX_DISAGREEMENT:
+            raise RejectedInputError(
+                "invalid_extrinsics",
+                "The two recorded camera matrices disagree",
+                where=where,
+                expected="extrinsic_cv = the inverse of cam2world_gl, up to the axes",
+                got=f"{disagreement:.3g} apart",
+                evidence={"view": view, "disagreement": disagreement, "largest_allowed": _MAX_DISAGREEMENT},
+            )
+        height, width = self._decode(first, f"{path}, {group}/rgb, frame 0").shape[:2]
+        return CameraTrack.from_pose(view, intrinsics[0], pose, width=width, height=height), pose
+
+    def _frames(self, path: Path, view: str, length: int) -> np.ndarray:
+        key = f"observation/{self._config.views[view]}/rgb"
+        with open_hdf5(path) as file:
+            images = file.encoded_images(key, length)
+        decoded = [self._decode(image, f"{path}, {key}, frame {n}") for n, image in enumerate(images)]
+        sizes = sorted({image.shape for image in decoded})
+        if len(sizes) != 1:
+            raise RejectedInputError(
+                "unreadable", "Images differ in size", where=f"{path}, {key}", expected="one size", got=sizes
+            )
+        return np.stack(decoded)
+
+    def _decode(self, content: bytes, where: str) -> np.ndarray:
+        """uint8 (H, W, 3) RGB."""
+        try:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+        except cv2.error as error:
+            raise RejectedInputError("unreadable", "Image cannot be decoded", where=where, got=str(error)) from error
+        if image is None:
+            raise RejectedInputError("unreadable", "Image cannot be decoded", where=where, expected="a JPEG file")
+        return image if self._config.channels == "as_written" else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def _instruction(self, path: Path) -> str:
+        """The first of the seen instructions; they are generated apart from the recording and may not be there."""
+        relative = path.relative_to(self._root).parent.parent / "instructions" / f"{path.stem}.json"
+        file = inside(self._root, str(relative))
+        if not file.is_file():
+            return ""
+        record = read_json(file)
+        seen = record.get("seen") if isinstance(record, dict) else None
+        if not isinstance(seen, list) or not seen:
+            raise RejectedInputError(
+                "missing_column", "Instructions lack the seen ones", where=file, expected='{"seen": [...]}', got=record
+            )
+        return str(seen[0])
