@@ -5,26 +5,29 @@ SHELL := /bin/bash
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
 
-.PHONY: demo test test-slow lint install record clean
+.PHONY: demo test test-slow lint install install-scale record clean
 
 demo: install
 	$(RUN) worldline pipeline --preset tiny
 
-test: install
+test: install-scale
 	$(RUN) pytest
 
 # Deployment against a real server and worker, and the largest model classes: minutes.
-test-slow: install
+test-slow: install-scale
 	$(RUN) pytest -m slow --timeout=600
 
-lint: install
+lint: install-scale
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
 	$(RUN) lint-imports
 	$(RUN) pyright
 
 install: $(filter .bootstrap/bin/uv,$(UV))
-	$(UV) sync --frozen --extra sim
+	$(UV) sync --frozen --inexact --extra sim
+
+install-scale: install
+	$(UV) sync --frozen --inexact --extra sim --group scale
 
 .bootstrap/bin/uv:
 	python3 -m venv .bootstrap

@@ -13,10 +13,12 @@ import yaml
 
 from worldline_core.calibration.doctor import diagnose
 from worldline_core.data.conventions import RecordedConventions, corrupt, corrupted_image_frames
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.filters.filter import FilterConfig, filter_episodes
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 

@@ -15,7 +15,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_index import read_index, write_index
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.resize import resize_masks
@@ -281,7 +282,7 @@ def test_a_killed_curation_continues_to_the_same_bytes(tmp_path: Path, sample: M
     settings = config(raw)
     curate(settings, {}, tmp_path / "undisturbed")
     script = (
-        "import sys; from pathlib import Path; from worldline_core.data.curate import CurateConfig, curate;"
+        "import sys; from pathlib import Path; from worldline_core.data.curate import curate; from worldline_core.data.curate_config import CurateConfig;"
         "curate(CurateConfig.model_validate_json(sys.argv[1]), {}, Path(sys.argv[2]))"
     )
     killed = tmp_path / "killed"

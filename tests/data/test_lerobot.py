@@ -11,7 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video import encode_video
 from worldline_core.errors import ConfigError, DataError

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.mcap_io import write_episode_mcap, write_rollout_mcap
 from worldline_core.data.mcap_reader import read_episode_mcap

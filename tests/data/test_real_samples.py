@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.recorded_poses import camera_pose, with_rigid_poses

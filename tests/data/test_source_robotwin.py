@@ -14,7 +14,8 @@ from pydantic import ValidationError
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 

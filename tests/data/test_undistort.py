@@ -14,7 +14,8 @@ import pytest
 from mcap.reader import make_reader
 from pydantic import ValidationError
 
-from worldline_core.data.curate import CurateConfig, curate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode import CameraTrack
 from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.data.mcap_io import write_episode_mcap

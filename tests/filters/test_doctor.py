@@ -12,7 +12,7 @@ from worldline_core.data.conventions import RecordedConventions, corrupt
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.filters.doctor import FilterDoctorConfig, detect_mistake, kinematics_of
-from worldline_core.filters.filter import FilterConfig
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.inspect_episode import inspect
 from worldline_core.filters.signals import Signals, measure
 

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.filters.filter import FilterConfig, filter_episodes
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import tool_poses
 from worldline_core.geometry.rigid import rigid_inverse
 

@@ -90,7 +90,8 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
         ConfigError: the file has no such section, or a mistake in it.
         DataError: a source cannot be opened.
     """
-    from worldline_core.data.curate import CurateConfig, open_source
+    from worldline_core.data.curate_config import CurateConfig
+    from worldline_core.data.sources.open import open_source
 
     values = apply_overrides(read_yaml(path), overrides)
     if not values.get("curate"):

@@ -15,47 +15,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-from pydantic import Field
 from tqdm import tqdm
 
-from worldline_core.config.base import StrictModel
 from worldline_core.data.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
 from worldline_core.data.episode_parts import part_name
 from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.data.lerobot_v3 import write_table
 from worldline_core.errors import DataError
-from worldline_core.filters.base_motion import BaseMotionConfig
-from worldline_core.filters.calibration import CalibrationConfig
-from worldline_core.filters.corrupted import CorruptedConfig
-from worldline_core.filters.doctor import FilterDoctorConfig
-from worldline_core.filters.inspect_episode import Finding, inspect
-from worldline_core.filters.projection import ProjectionConfig
-from worldline_core.filters.reset import ResetConfig
-from worldline_core.filters.signals import measure
-from worldline_core.filters.static import StaticConfig
-from worldline_core.filters.time_alignment import TimeAlignmentConfig
-from worldline_core.filters.verdict import runs
+from worldline_core.filters.examine import examine
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.store.atomic import write_json_atomic
-
-
-class FilterConfig(StrictModel):
-    """Thresholds of all detectors."""
-
-    required_views: tuple[str, ...] | None = Field(
-        default=None, description="views that Stage II needs; null: head and one wrist view for each arm"
-    )
-    min_segment_frames: int = Field(default=17, ge=2, description="shorter stretches are dropped")
-    static: StaticConfig = StaticConfig()
-    reset: ResetConfig = ResetConfig()
-    corrupted: CorruptedConfig = CorruptedConfig()
-    base_motion: BaseMotionConfig = BaseMotionConfig()
-    calibration: CalibrationConfig = CalibrationConfig()
-    time_alignment: TimeAlignmentConfig = TimeAlignmentConfig()
-    projection: ProjectionConfig = ProjectionConfig()
-    doctor: FilterDoctorConfig = FilterDoctorConfig()
-
 
 FINDINGS_FILE = "findings.parquet"
 _FINDINGS = pa.schema(
@@ -92,7 +62,7 @@ def filter_episodes(config: FilterConfig, inputs: Mapping[str, Path], output: Pa
     for i, row in enumerate(tqdm(episodes.rows, desc="filter", unit="episode", disable=None)):
         path = verdicts / f"{part_name(row.episode_id)}.json"
         if not path.is_file():
-            write_json_atomic(path, _examine(config, episodes, i))
+            write_json_atomic(path, examine(config, episodes, i))
         result = json.loads(path.read_text())
         findings += result["findings"]
         if result["reason"] is not None:
@@ -133,62 +103,6 @@ def _count(reasons: Any) -> dict[str, int]:
     for reason in reasons:
         counts[reason] = counts.get(reason, 0) + 1
     return dict(sorted(counts.items()))
-
-
-def _examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any]:
-    """Everything the detectors say about one episode, as JSON."""
-    row = episodes.rows[i]
-    try:
-        episode = episodes.episode(i)
-        frames = {view: episodes.frames(i, view) for view in row.views}
-    except DataError as error:
-        return _rejected("unreadable", str(error).replace(str(episodes.root), ""), {}, [])
-    if row.video_frames < config.min_segment_frames:
-        evidence = {"video_frames": row.video_frames, "threshold_frames": config.min_segment_frames}
-        return _rejected("too_short", "Fewer images than the shortest clip", evidence, [])
-    findings = inspect(config, measure(episode, frames))
-    listed = [_finding_row(row.episode_id, finding) for finding in findings]
-    whole = [f for f in findings if f.stage == 1 and not f.verdict.passed]
-    if whole:
-        return _rejected(whole[0].verdict.reason, _detail(whole[0]), dict(whole[0].verdict.numbers), listed)
-    bad = np.zeros(row.video_frames, dtype=bool)
-    for finding in findings:
-        if finding.verdict.bad_frames is not None:
-            bad |= finding.verdict.bad_frames
-    segments = [(a, b) for a, b in runs(~bad) if b - a >= config.min_segment_frames]
-    if not segments:
-        blame = max(findings, key=lambda f: 0 if f.verdict.bad_frames is None else int(f.verdict.bad_frames.sum()))
-        return _rejected(blame.verdict.reason, _detail(blame), dict(blame.verdict.numbers), listed)
-    stage2 = next((f.verdict.reason for f in findings if f.stage == 2 and not f.verdict.passed), None)
-    return {
-        "reason": None,
-        "segments": segments,
-        "stage1_ok": row.primary_view in row.views,
-        "stage2_reason": stage2,
-        "findings": listed,
-    }
-
-
-def _rejected(reason: str, detail: str, evidence: dict[str, Any], findings: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"reason": reason, "detail": detail, "evidence": evidence, "findings": findings}
-
-
-def _detail(finding: Finding) -> str:
-    where = f" in view {finding.view}" if finding.view else ""
-    return f"Detector {finding.detector}{where}"
-
-
-def _finding_row(episode_id: str, finding: Finding) -> dict[str, Any]:
-    verdict = finding.verdict
-    return {
-        "episode_id": episode_id,
-        "detector": finding.detector,
-        "view": finding.view,
-        "stage": finding.stage,
-        "passed": bool(verdict.passed),
-        "cut_frames": 0 if verdict.bad_frames is None else int(verdict.bad_frames.sum()),
-        "numbers": json.dumps(dict(verdict.numbers), sort_keys=True),
-    }
 
 
 def _segment_rows(row: EpisodeRow, dataset: str, result: dict[str, Any]) -> list[EpisodeRow]:

@@ -25,7 +25,7 @@ from worldline_core.filters.verdict import Verdict
 from worldline_core.geometry.rigid import inside_image, project_points, rigid_inverse, rotation_angle_deg
 
 if TYPE_CHECKING:
-    from worldline_core.filters.filter import FilterConfig
+    from worldline_core.filters.filter_config import FilterConfig
 
 # A wrist camera swings: turning by one radian shows about as much change as travelling this far.
 _METRES_PER_RADIAN = 0.15

@@ -9,12 +9,12 @@ from pydantic import Field, model_validator
 
 from worldline_core.actions.render_actions import RenderActionsConfig
 from worldline_core.config.base import StrictModel
-from worldline_core.data.curate import CurateConfig
+from worldline_core.data.curate_config import CurateConfig
 from worldline_core.distillation.distill import DistillConfig
 from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
 from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
-from worldline_core.filters.filter import FilterConfig
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.import_backbone import ImportBackboneConfig
 from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig

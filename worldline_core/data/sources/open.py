@@ -1,0 +1,61 @@
+"""Open a configured source: the kinds there are, and the reader of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
+from worldline_core.data.sources.base import EpisodeSource
+from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
+from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
+from worldline_core.data.sources.lerobot import LeRobotSource, LeRobotSourceConfig
+from worldline_core.data.sources.mcap import McapSource, McapSourceConfig
+from worldline_core.data.sources.repaired import RepairedSource
+from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
+from worldline_core.data.undistort import PinholeSource
+from worldline_core.errors import DataError
+
+SourceConfig = Annotated[
+    EpisodeSetSourceConfig
+    | LeRobotSourceConfig
+    | AgibotGesimSourceConfig
+    | AgibotWorldSourceConfig
+    | DroidAnnotationSourceConfig
+    | McapSourceConfig
+    | RobotwinSourceConfig,
+    Field(discriminator="kind"),
+]
+
+
+def open_source(config: SourceConfig, root: Path) -> EpisodeSource:
+    """The reader of a configured source: it repairs what the configuration declares as departing from the contract, and
+    takes out lens distortion.
+
+    Raises: DataError when the folder is missing or not of that kind.
+    """
+    if not root.exists():
+        raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
+    source = _reader(config, root)
+    return PinholeSource(RepairedSource(source, config.conventions) if config.conventions.departures else source)
+
+
+def _reader(config: SourceConfig, root: Path) -> EpisodeSource:
+    match config:
+        case EpisodeSetSourceConfig():
+            return EpisodeSetSource(config, root)
+        case LeRobotSourceConfig():
+            return LeRobotSource(config, root)
+        case AgibotGesimSourceConfig():
+            return AgibotGesimSource(config, root)
+        case AgibotWorldSourceConfig():
+            return AgibotWorldSource(config, root)
+        case DroidAnnotationSourceConfig():
+            return DroidAnnotationSource(config, root)
+        case McapSourceConfig():
+            return McapSource(config, root)
+        case RobotwinSourceConfig():
+            return RobotwinSource(config, root)

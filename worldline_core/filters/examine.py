@@ -1,0 +1,72 @@
+"""Everything the detectors say about one episode, as JSON: which of its frames may be used, or why none."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.errors import DataError
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.filters.inspect_episode import Finding, inspect
+from worldline_core.filters.signals import measure
+from worldline_core.filters.verdict import runs
+
+
+def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any]:
+    """The verdict on row i: {"reason", "detail", "evidence", "findings"} of a dropped episode (reason is a code), or
+    {"reason": None, "segments" (start, stop pairs), "stage1_ok", "stage2_reason", "findings"} of a kept one."""
+    row = episodes.rows[i]
+    try:
+        episode = episodes.episode(i)
+        frames = {view: episodes.frames(i, view) for view in row.views}
+    except DataError as error:
+        return _rejected("unreadable", str(error).replace(str(episodes.root), ""), {}, [])
+    if row.video_frames < config.min_segment_frames:
+        evidence = {"video_frames": row.video_frames, "threshold_frames": config.min_segment_frames}
+        return _rejected("too_short", "Fewer images than the shortest clip", evidence, [])
+    findings = inspect(config, measure(episode, frames))
+    listed = [_finding_row(row.episode_id, finding) for finding in findings]
+    whole = [f for f in findings if f.stage == 1 and not f.verdict.passed]
+    if whole:
+        return _rejected(whole[0].verdict.reason, _detail(whole[0]), dict(whole[0].verdict.numbers), listed)
+    bad = np.zeros(row.video_frames, dtype=bool)
+    for finding in findings:
+        if finding.verdict.bad_frames is not None:
+            bad |= finding.verdict.bad_frames
+    segments = [(a, b) for a, b in runs(~bad) if b - a >= config.min_segment_frames]
+    if not segments:
+        blame = max(findings, key=lambda f: 0 if f.verdict.bad_frames is None else int(f.verdict.bad_frames.sum()))
+        return _rejected(blame.verdict.reason, _detail(blame), dict(blame.verdict.numbers), listed)
+    stage2 = next((f.verdict.reason for f in findings if f.stage == 2 and not f.verdict.passed), None)
+    return {
+        "reason": None,
+        "segments": segments,
+        "stage1_ok": row.primary_view in row.views,
+        "stage2_reason": stage2,
+        "findings": listed,
+    }
+
+
+def _rejected(reason: str, detail: str, evidence: dict[str, Any], findings: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"reason": reason, "detail": detail, "evidence": evidence, "findings": findings}
+
+
+def _detail(finding: Finding) -> str:
+    where = f" in view {finding.view}" if finding.view else ""
+    return f"Detector {finding.detector}{where}"
+
+
+def _finding_row(episode_id: str, finding: Finding) -> dict[str, Any]:
+    verdict = finding.verdict
+    return {
+        "episode_id": episode_id,
+        "detector": finding.detector,
+        "view": finding.view,
+        "stage": finding.stage,
+        "passed": bool(verdict.passed),
+        "cut_frames": 0 if verdict.bad_frames is None else int(verdict.bad_frames.sum()),
+        "numbers": json.dumps(dict(verdict.numbers), sort_keys=True),
+    }
