@@ -15,12 +15,17 @@ from typing import Any
 
 import numpy as np
 
+from worldline_core.data.hdf5_heap import check_entries
+from worldline_core.data.limits import MAX_ARRAY_BYTES, MAX_FRAMES, regular_file, too_large
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath
 from worldline_core.errors import UnavailableError
 
-MAX_ARRAY_BYTES = 1 << 30
-"""An hour at 30 Hz of 100 float64 columns is 0.1 GB; what declares more than 1 GB is damaged or hostile."""
-_DAMAGED = (OSError, RuntimeError, KeyError, ValueError)
+_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
+_MAX_TEXT = 1 << 20
+# Encoded images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
+_BLOCK_IMAGES = 16
+_BLOCK_BYTES = 64 << 20
 
 
 def require_h5py() -> Any:
@@ -40,9 +45,10 @@ def require_h5py() -> Any:
 class Hdf5File:
     """An open file; made by `open_hdf5`."""
 
-    def __init__(self, path: Path, handle: Any) -> None:
+    def __init__(self, path: AnyPath, local: Path, handle: Any) -> None:
         self._h5py = require_h5py()
         self._path = path
+        self._local = local
         self._handle = handle
 
     def names(self, group: str) -> list[str]:
@@ -102,12 +108,70 @@ class Hdf5File:
         exact = raw.dtype.kind != "f"
         return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
 
-    def encoded_images(self, key: str, length: int, stop: int | None = None) -> list[bytes]:
-        """The first `stop` (default: all) of a dataset (length,) of encoded images, as bytes each.
+    def width(self, key: str) -> int:
+        """Columns of a dataset (N, columns); 1 for (N,).
 
-        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, path_traversal.
+        Raises: RejectedInputError: missing_column, length_mismatch (another number of axes), unreadable, too_large,
+            path_traversal.
         """
+        shape = self._dataset(key).shape
+        if len(shape) not in (1, 2):
+            self._check_shape(key, shape, (None, None))
+        return int(shape[1]) if len(shape) == 2 else 1
+
+    def is_flat(self, key: str) -> bool:
+        """Whether a dataset has one axis.
+
+        Raises: RejectedInputError as `width`.
+        """
+        return self._dataset(key).ndim == 1
+
+    def text(self, key: str) -> str | None:
+        """A text stored as a dataset of one entry; None where there is none.
+
+        Raises: RejectedInputError: unreadable (no text), too_large, path_traversal.
+        """
+        if not self.has(key):
+            return None
         dataset = self._dataset(key)
+        if dataset.size != 1:
+            raise self._rejected("unreadable", "Dataset is no single text", key, "one entry", dataset.shape)
+        with self._reading(key):
+            if dataset.dtype.kind == "O" and (dataset.chunks is None or dataset.ndim == 1):
+                check_entries(dataset, 0, 1, self._local, f"{self._path}, {key}")
+            value = dataset[()] if dataset.shape == () else dataset[(0,) * dataset.ndim]
+        return self._as_text(value, key)
+
+    def attribute(self, group: str, name: str) -> str | None:
+        """An attribute of a group ("/" for the file's own) as text; None where there is none.
+
+        Raises: RejectedInputError: unreadable, too_large, path_traversal.
+        """
+        with self._reading(f"{group}, attribute {name}"):
+            node = self._handle if group == "/" else self._node(group)
+            value = None if node is None else node.attrs.get(name)
+        return None if value is None else self._as_text(value, f"{group}, attribute {name}")
+
+    def _as_text(self, value: Any, where: str) -> str:
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
+        if isinstance(value, bytes):
+            value = value.decode("utf-8", "replace")
+        if not isinstance(value, str | int | float | np.number | np.bool_):
+            raise self._rejected("unreadable", "Entry is no text", where, "a text or a number", type(value).__name__)
+        text = str(value)
+        if len(text) > _MAX_TEXT:
+            raise too_large(
+                "Text is too long", where=f"{self._path}, {where}", limit=_MAX_TEXT, got=len(text), unit="letters"
+            )
+        return text
+
+    def image_files(self, key: str, length: int) -> Iterator[bytes]:
+        """A dataset (length,) of encoded images, as bytes each, a few in memory at a time.
+
+        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, too_large, path_traversal.
+        """
+        dataset = self._dataset(key, whole=False)
         fixed = dataset.dtype.kind == "S"
         variable = self._h5py.check_vlen_dtype(dataset.dtype) == np.dtype(np.uint8)
         if dataset.ndim != 1 or not (fixed or variable):
@@ -115,8 +179,14 @@ class Hdf5File:
                 "unreadable", "Images are not stored as encoded bytes", key, "(N,) byte strings", dataset.dtype
             )
         self._check_shape(key, dataset.shape, (length,))
-        with self._reading(key):
-            return [bytes(item) for item in dataset[:stop]]
+        rows = dataset.chunks[0] if dataset.chunks else _BLOCK_IMAGES
+        rows = max(1, min(rows, _BLOCK_BYTES // max(dataset.dtype.itemsize, 1)))
+        for start in range(0, length, rows):
+            with self._reading(key):
+                if variable:
+                    check_entries(dataset, start, min(start + rows, length), self._local, f"{self._path}, {key}")
+                block = [bytes(item) for item in dataset[start : start + rows]]
+            yield from block
 
     def _node(self, key: str) -> Any:
         """The object at `key`, or None. Links are refused unfollowed: a soft one may lead to one out of the file."""
@@ -129,7 +199,8 @@ class Hdf5File:
             node = node[part]
         return node
 
-    def _dataset(self, key: str) -> Any:
+    def _dataset(self, key: str, *, whole: bool = True) -> Any:
+        """The dataset at `key`; with `whole` it is small enough to be read at once."""
         with self._reading(key):
             node = self._node(key)
             if not isinstance(node, self._h5py.Dataset):
@@ -139,9 +210,15 @@ class Hdf5File:
                 raise self._rejected(
                     "path_traversal", "Dataset lies in other files", key, "data in this file", "external storage"
                 )
-            if node.nbytes > MAX_ARRAY_BYTES:
-                raise self._rejected(
-                    "unreadable", "Dataset is too large", key, f"at most {MAX_ARRAY_BYTES} bytes", node.nbytes
+            # A chunk is unpacked as a whole, whatever little of it is wanted.
+            chunk = int(np.prod(node.chunks or (), dtype=np.float64)) * node.dtype.itemsize if node.chunks else 0
+            largest = max(int(node.nbytes) if whole else 0, chunk)
+            where = f"{self._path}, {key}"
+            if largest > MAX_ARRAY_BYTES:
+                raise too_large("Dataset is too large", where=where, limit=MAX_ARRAY_BYTES, got=largest, unit="bytes")
+            if not whole and node.size > MAX_FRAMES:
+                raise too_large(
+                    "Dataset claims too many images", where=where, limit=MAX_FRAMES, got=node.size, unit="images"
                 )
             return node
 
@@ -171,16 +248,15 @@ class Hdf5File:
 
 
 @contextmanager
-def open_hdf5(path: Path) -> Iterator[Hdf5File]:
+def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
     """A file, open for reading while the context lasts.
 
-    Raises: RejectedInputError (missing_file, unreadable); UnavailableError without h5py.
+    Raises: RejectedInputError (missing_file, special_file, unreadable); UnavailableError without h5py.
     """
     h5py = require_h5py()
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "File is missing", where=str(path))
+    local = regular_file(path)
     try:
-        handle = h5py.File(path, "r", locking=False)
+        handle = h5py.File(local, "r", locking=False)
     except _DAMAGED as error:
         raise RejectedInputError(
             "unreadable",
@@ -191,4 +267,4 @@ def open_hdf5(path: Path) -> Iterator[Hdf5File]:
             next_step="copy the file again; it may be truncated",
         ) from error
     with handle:
-        yield Hdf5File(path, handle)
+        yield Hdf5File(path, local, handle)

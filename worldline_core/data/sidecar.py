@@ -12,8 +12,12 @@ import pyarrow as pa
 
 from worldline_core.data.episode import CameraTrack
 from worldline_core.data.episode_parts import Part
-from worldline_core.data.lerobot_v3 import read_json, read_table, write_table
+from worldline_core.data.json_file import read_json, well_formed
+from worldline_core.data.lerobot_v3 import write_table
+from worldline_core.data.limits import MAX_ARRAY_BYTES, check_image_size, too_large
+from worldline_core.data.parquet_file import read_table
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import is_file
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
 
@@ -105,7 +109,7 @@ def contract(part: Part) -> dict[str, Any]:
         "views": {view: {"height": size[0], "width": size[1]} for view, size in part.image_sizes.items()},
         "state_kind": part["state_kind"],
         "state_names": part["state_names"],
-        "action": "commanded targets, same layout as the state",
+        "action": "none" if part["state_kind"] == "none" else "commanded targets, same layout as the state",
         "units": {"angle": "rad", "length": "m", "time": "s", "image": "px"},
         "gripper": "0 closed .. 1 open",
         "camera_axes": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
@@ -120,6 +124,8 @@ class Sidecar:
     def __init__(self, root: Path) -> None:
         self.root = root / FOLDER
         self.contract: dict[str, Any] = read_json(self.root / "contract.json")
+        if not isinstance(self.contract, dict):
+            raise DataError("Sidecar's contract is no mapping", where=str(self.root), got=type(self.contract).__name__)
         if self.contract.get("version") != CONTRACT_VERSION:
             raise DataError(
                 "Sidecar has another version",
@@ -127,13 +133,22 @@ class Sidecar:
                 expected=CONTRACT_VERSION,
                 got=self.contract.get("version"),
             )
+        names = self.contract.get("state_names")
+        kind = self.contract.get("state_kind")
+        if not isinstance(kind, str) or not (names is None or isinstance(names, list)):
+            raise DataError(
+                "Sidecar does not say what the state is",
+                where=str(self.root),
+                expected="state_kind (a text) and state_names (a list or null)",
+                got=f"{kind!r} and {str(names)[:100]}",
+            )
         self._rows: dict[str, dict[int, list[dict[str, Any]]]] = {}
 
     def _of(self, name: str, schema: pa.Schema, episode_index: int, *, optional: bool) -> list[dict[str, Any]]:
         if name not in self._rows:
             path = self.root / name
             grouped: dict[int, list[dict[str, Any]]] = {}
-            if path.is_file() or not optional:
+            if is_file(path) or not optional:
                 for row in read_table(path, schema.names).to_pylist():
                     grouped.setdefault(row["episode_index"], []).append(row)
             self._rows[name] = grouped
@@ -158,27 +173,53 @@ class Sidecar:
         return result
 
     def mask(self, episode_index: int, view: str) -> np.ndarray | None:
-        """bool (N, H, W) robot mask, or None where the recording has none."""
+        """bool (N, H, W) robot mask, or None where the recording has none.
+
+        Raises: RejectedInputError (unreadable, too_large) for bits that are no mask of their shape.
+        """
+        where = f"{self.root}, episode {episode_index}, view {view}, robot mask"
         for row in self._of("robot_masks.parquet", _MASKS, episode_index, optional=True):
             if row["view"] == view:
-                shape = tuple(row["shape"])
-                packed = np.frombuffer(zlib.decompress(row["bits"]), np.uint8)
-                return np.unpackbits(packed, count=int(np.prod(shape))).reshape(shape).astype(bool)
+                with well_formed(where, "packed bits of (N, H, W), compressed with zlib"):
+                    count, height, width = (int(size) for size in row["shape"])
+                    check_image_size(width, height, where)
+                    bits = count * height * width
+                    if not 0 < bits <= 8 * MAX_ARRAY_BYTES:
+                        raise too_large(
+                            "Mask is too large", where=where, limit=8 * MAX_ARRAY_BYTES, got=bits, unit="bits"
+                        )
+                    packed = np.frombuffer(_unpacked(row["bits"], -(-bits // 8)), np.uint8)
+                    return np.unpackbits(packed, count=bits).reshape(count, height, width).astype(bool)
         return None
 
     def trajectory(self, episode_index: int) -> dict[str, np.ndarray] | None:
-        """Full-length state, action and tool poses where they go beyond what the dataset holds, else None."""
+        """Full-length state, action and tool poses where they go beyond what the dataset holds, else None.
+
+        Raises: RejectedInputError (unreadable) for numbers that do not fit their counts.
+        """
         rows = self._of("trajectories.parquet", _TRAJECTORIES, episode_index, optional=True)
         if not rows:
             return None
-        row = rows[0]
-        num_frames, num_arms = row["num_frames"], row["num_arms"]
-        result: dict[str, np.ndarray] = {
-            "state": np.asarray(row["state"], np.float32).reshape(num_frames, -1),
-            "action": np.asarray(row["action"], np.float32).reshape(num_frames, -1),
-        }
-        if row["T_base_ee"] is not None:
-            result["T_base_ee"] = np.asarray(row["T_base_ee"], np.float64).reshape(num_frames, num_arms, 4, 4)
-        if row["gripper"] is not None:
-            result["gripper"] = np.asarray(row["gripper"], np.float64).reshape(num_frames, num_arms)
-        return result
+        with well_formed(f"{self.root}, episode {episode_index}, trajectory", "numbers of N frames and A arms"):
+            row = rows[0]
+            num_frames, num_arms = row["num_frames"], row["num_arms"]
+            result: dict[str, np.ndarray] = {
+                "state": np.asarray(row["state"], np.float32).reshape(num_frames, -1),
+                "action": np.asarray(row["action"], np.float32).reshape(num_frames, -1),
+            }
+            if row["T_base_ee"] is not None:
+                result["T_base_ee"] = np.asarray(row["T_base_ee"], np.float64).reshape(num_frames, num_arms, 4, 4)
+            if row["gripper"] is not None:
+                result["gripper"] = np.asarray(row["gripper"], np.float64).reshape(num_frames, num_arms)
+            return result
+
+
+def _unpacked(packed: bytes, length: int) -> bytes:
+    """Exactly `length` bytes: a compressed kilobyte could become a gigabyte."""
+    try:
+        content = zlib.decompressobj().decompress(packed, length + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if len(content) != length:
+        raise ValueError(f"{len(content)} bytes or more instead of {length}")
+    return content

@@ -1,0 +1,69 @@
+"""A small corpus with every kind of damage: all accounted for, each by the reason that is true (benchmarks/corruption.py
+does the same with thousands of recordings)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+
+from worldline_core.data.curate import curate
+from worldline_core.data.episode_index import read_quarantine
+from worldline_core.data.rejection import REASONS
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.recorder.corrupted import lerobot_v21
+from worldline_core.recorder.corrupted.corpus import confusion, is_right, outcomes, read_corpus, write_corpus
+from worldline_core.recorder.corrupted.labels import Label
+
+
+def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: Path) -> None:
+    written, config = write_corpus(tmp_path, healthy=2, each=1, seed=3)
+    labels, again = read_corpus(tmp_path)
+    assert labels == written
+    assert again == config
+    assert len({label.kind for label in labels}) >= 40
+
+    counts = curate(config, {}, tmp_path / "curated")
+    assert counts["found"] == len(labels) == counts["kept"] + counts["quarantined"]
+    filtered = filter_episodes(FilterConfig(), {"episodes": tmp_path / "curated"}, tmp_path / "filtered")
+    assert filtered["found"] == counts["kept"] == filtered["kept"] + filtered["quarantined"]
+
+    found = outcomes(tmp_path / "curated", tmp_path / "filtered")
+    assert set(found) == {label.episode_id for label in labels}
+    wrong = {label.kind for label in labels if not is_right(label, found[label.episode_id])}
+    assert not wrong, {key: dict(ended) for key, ended in confusion(labels, found).items() if key[1] in wrong}
+
+    rows = read_quarantine(tmp_path / "curated")
+    assert {row.reason for row in rows} <= set(REASONS)
+    assert not any(str(tmp_path) in row.detail + row.evidence for row in rows), (
+        "a set must not name this machine's folders"
+    )
+    assert all(row.detail.strip() for row in rows)
+
+
+def test_the_damage_depends_on_the_seed_alone(tmp_path: Path) -> None:
+    content = {}
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        root = tmp_path / name / "corpus" / "set"
+        lerobot_v21.write(root, 1, 1, np.random.default_rng(seed))
+        files = sorted(path for path in root.rglob("*") if path.is_file() and not path.is_symlink())
+        content[name] = [(path.relative_to(root), path.read_bytes()) for path in files]
+    assert content["a"] == content["b"]
+    assert content["a"] != content["c"]
+
+
+def test_an_outcome_counts_only_at_the_stage_that_has_to_find_it() -> None:
+    from worldline_core.recorder.corrupted.corpus import Outcome
+
+    label = Label("e", "layout", "still", "filter", ("static",))
+    assert is_right(label, Outcome("filter", "static"))
+    assert not is_right(label, Outcome("curate", "static"))
+    assert not is_right(label, Outcome("filter", "corrupted"))
+    assert not is_right(label, None)
+    clean = Label("e", "layout", "clean")
+    assert is_right(clean, Outcome("stage2", "missing_view"))
+    assert not is_right(clean, Outcome("filter", "static"))

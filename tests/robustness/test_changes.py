@@ -1,0 +1,186 @@
+"""Datasets that change while they are read, and places where nothing can be written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from worldline_core.data import curate_shard
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_index import read_index, read_quarantine
+from worldline_core.data.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.file_watch import note_file, unchanged_files
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import LoadedEpisode
+from worldline_core.data.video import encode_video
+from worldline_core.recorder.corrupted.content import FPS, pictures
+from worldline_core.store.digest import digest_folder
+
+Make = Callable[[int], tuple[Path, CurateConfig]]
+
+
+def during(episode: str, change: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `change` happen once the values of an episode were read, and before its pictures are."""
+    check = curate_shard.check_episode
+
+    def changed(config: CurateConfig, loaded: LoadedEpisode) -> None:
+        check(config, loaded)
+        if loaded.episode.episode_id == episode:
+            change()
+
+    monkeypatch.setattr(curate_shard, "check_episode", changed)
+
+
+def quarantined(output: Path) -> dict[str, str]:
+    return {row.episode_id: row.reason for row in read_quarantine(output)}
+
+
+def test_a_table_rewritten_while_its_episode_is_read(
+    dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, config = dataset(3)
+    table = root / "data/chunk-000/episode_000001.parquet"
+    during("set-000001", lambda: pq.write_table(pq.read_table(table).slice(0, 20), table), monkeypatch)
+    curate(config, {}, tmp_path / "out")
+    assert quarantined(tmp_path / "out") == {"set-000001": "changed_while_reading"}
+    (row,) = read_quarantine(tmp_path / "out")
+    assert "episode_000001.parquet" in row.detail
+    assert str(tmp_path) not in row.detail
+    assert [row.episode_id for row in read_index(tmp_path / "out")] == ["set-000000", "set-000002"]
+
+
+def test_a_video_cut_while_its_episode_is_read(dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The size and time of change say so, although what the decoder meets is a truncated video."""
+    root, config = dataset(3)
+    video = next((root / "videos/chunk-000").glob("*top/episode_000001.mp4"))
+    during("set-000001", lambda: os.truncate(video, 900), monkeypatch)
+    curate(config, {}, tmp_path / "out")
+    assert quarantined(tmp_path / "out") == {"set-000001": "changed_while_reading"}
+
+
+def test_a_video_replaced_by_an_equally_long_one(
+    dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, config = dataset(3)
+    video = next((root / "videos/chunk-000").glob("*wrist/episode_000001.mp4"))
+
+    def exchange() -> None:
+        other = video.with_suffix(".new.mp4")
+        encode_video(other, pictures(np.random.default_rng(99)), FPS, preset="ultrafast")
+        other.replace(video)
+
+    during("set-000001", exchange, monkeypatch)
+    curate(config, {}, tmp_path / "out")
+    assert quarantined(tmp_path / "out") == {"set-000001": "changed_while_reading"}
+
+
+def test_a_file_that_becomes_a_link_between_check_and_use(
+    dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, config = dataset(3)
+    video = next((root / "videos/chunk-000").glob("*top/episode_000001.mp4"))
+    secret = tmp_path / "secret.mp4"
+    encode_video(secret, pictures(np.random.default_rng(7)), FPS, preset="ultrafast")
+
+    def swap() -> None:
+        video.unlink()
+        video.symlink_to(secret)
+
+    during("set-000001", swap, monkeypatch)
+    curate(config, {}, tmp_path / "out")
+    assert quarantined(tmp_path / "out") in (
+        {"set-000001": "changed_while_reading"},
+        {"set-000001": "path_traversal"},
+    )
+    assert not list((tmp_path / "out" / "run").rglob("*.mp4"))
+
+
+def test_the_list_of_episodes_replaced_in_the_middle_of_the_run(
+    dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows read before it changed no longer belong to the files: what comes after is not trusted."""
+    root, config = dataset(4)
+    listing = root / "meta/episodes.jsonl"
+    during("set-000001", lambda: listing.write_text(listing.read_text() + "\n"), monkeypatch)
+    curate(config, {}, tmp_path / "out")
+    assert quarantined(tmp_path / "out") == dict.fromkeys(
+        ("set-000001", "set-000002", "set-000003"), "changed_while_reading"
+    )
+
+
+def test_nothing_changed_nothing_said(dataset: Make, tmp_path: Path) -> None:
+    root, config = dataset(3)
+    curate(config, {}, tmp_path / "first")
+    assert quarantined(tmp_path / "first") == {}
+    for path in root.rglob("*"):
+        os.utime(path)  # a copy, say: between two runs a dataset may change
+    curate(config, {}, tmp_path / "second")
+    assert digest_folder(tmp_path / "first") == digest_folder(tmp_path / "second")
+
+
+def test_a_watched_block(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_text("one")
+    with unchanged_files("e"):
+        note_file(file)
+    with pytest.raises(RejectedInputError, match="Files changed") as caught, unchanged_files("e"):
+        note_file(file)
+        file.write_text("three")
+    assert caught.value.evidence == {"files": 1, "other_finding": None}
+    gone = tmp_path / "b"
+    gone.write_text("one")
+    with pytest.raises(RejectedInputError, match="Files changed"), unchanged_files("e"):
+        note_file(gone)
+        gone.unlink()
+        raise RejectedInputError("missing_file", "it is gone")
+    with pytest.raises(ZeroDivisionError, match="division"), unchanged_files("e"):
+        note_file(tmp_path / "never")
+        _ = 1 / 0
+
+
+def test_a_full_disk_ends_the_run_and_what_is_done_stays(
+    dataset: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is no fault of the recordings: none of them may be quarantined for it."""
+    _, config = dataset(4)
+    add, calls = EpisodeSetWriter.add, []
+
+    def full(self: EpisodeSetWriter, *arguments: object, **named: object) -> None:
+        calls.append(1)
+        if len(calls) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        add(self, *arguments, **named)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EpisodeSetWriter, "add", full)
+        with pytest.raises(Exception, match="No space left on device"):
+            curate(config, {}, tmp_path / "out")
+    assert not (tmp_path / "out" / "index.parquet").exists()
+    counts = curate(config, {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (4, 4)
+    curate(config, {}, tmp_path / "undisturbed")
+    assert digest_folder(tmp_path / "out") == digest_folder(tmp_path / "undisturbed")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written(dataset: Make, tmp_path: Path) -> None:
+    _, config = dataset(2)
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    with pytest.raises(PermissionError, match="locked"):
+        curate(config, {}, locked / "out")
+
+
+def test_a_file_where_the_output_folder_should_be(dataset: Make, tmp_path: Path) -> None:
+    _, config = dataset(2)
+    (tmp_path / "out").write_text("not a folder")
+    with pytest.raises((NotADirectoryError, FileExistsError), match="out"):
+        curate(config, {}, tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "not a folder"

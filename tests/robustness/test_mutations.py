@@ -1,0 +1,72 @@
+"""Blind damage to small real files of every layout: reading ends in episodes or in an error of this project."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+
+from worldline_core.data.sources.open import SourceConfig
+from worldline_core.recorder.corrupted import mutations
+from worldline_core.recorder.corrupted.mutations import attack, mutations_of, read_everything
+from worldline_core.recorder.corrupted.one_of_each import write_one_of_each
+
+LAYOUTS = (
+    "lerobot_v21",
+    "lerobot_v3",
+    "episode_set",
+    "agibot_world",
+    "agibot_gesim",
+    "droid_annotation",
+    "mcap",
+    "robotwin",
+    "robomind",
+    "video_folder",
+)
+CASES = 60
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SourceConfig]:
+    written = write_one_of_each(tmp_path_factory.mktemp("layouts"))
+    return {name: TypeAdapter(SourceConfig).validate_python(source) for name, source in written.items()}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_damage_ends_in_a_named_error(sources: dict[str, SourceConfig], layout: str) -> None:
+    config = sources[layout]
+    read_everything(config, config.path)
+    unexpected = list(attack(config, config.path, CASES, seed=1))
+    assert not unexpected, unexpected
+    read_everything(config, config.path)
+
+
+def test_every_layout_is_damaged(sources: dict[str, SourceConfig]) -> None:
+    assert set(sources) == set(LAYOUTS)
+
+
+def test_an_error_that_is_not_ours_is_found(sources: dict[str, SourceConfig], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search itself: a reader that stumbles over a missing key is caught at it."""
+
+    def careless(config: SourceConfig, root: Path) -> None:
+        for path in root.rglob("*.json"):
+            _ = json.loads(path.read_text())["fps"]
+
+    monkeypatch.setattr(mutations, "read_everything", careless)
+    config = sources["lerobot_v21"]
+    found = list(attack(config, config.path, 60, seed=0))
+    assert {error.error.split(":")[0] for error in found} & {"KeyError", "TypeError", "JSONDecodeError"}
+
+
+def test_damage_depends_on_the_seed_alone_and_changes_something() -> None:
+    content = json.dumps({"a": [1, 2, {"b": "c"}], "d": None}).encode()
+    for mutate in {*mutations_of(Path("x.json")), *mutations_of(Path("x.mp4"))}:
+        first, second = (mutate(content, np.random.default_rng(4)) for _ in range(2))
+        assert first == second
+        results = {mutate(content, np.random.default_rng(seed)) for seed in range(30)}
+        assert len(results) > 10, mutate.__name__

@@ -1,0 +1,1 @@
+"""Corrupted recordings at known labels, in the layouts of several sources: what the accounting of curation is held against."""
