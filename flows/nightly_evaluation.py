@@ -31,6 +31,8 @@ def nightly_evaluation(
     done: dict[str, ArtifactReference] = {}
     for node in without_training(plan(settings, Path.cwd())):
         inputs = {name: done[source] if isinstance(source, str) else source for name, source in node.inputs.items()}
-        done[node.name] = artifact_task(node.step)(node.config, inputs, store_root=artifacts.resolve(), name=node.name)
+        done[node.name] = artifact_task(node.step)(
+            node.config, inputs, store_root=artifacts.resolve(), name=node.name, runner=settings.runner
+        )
     scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
     return compare_nights(scores, artifacts.resolve() / "nightly")

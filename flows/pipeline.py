@@ -27,5 +27,7 @@ def pipeline(
     done: dict[str, ArtifactReference] = {}
     for node in plan(settings, Path.cwd()):
         inputs = {name: done[source] if isinstance(source, str) else source for name, source in node.inputs.items()}
-        done[node.name] = artifact_task(node.step)(node.config, inputs, store_root=artifacts.resolve(), name=node.name)
+        done[node.name] = artifact_task(node.step)(
+            node.config, inputs, store_root=artifacts.resolve(), name=node.name, runner=settings.runner
+        )
     return done["report"]

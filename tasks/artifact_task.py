@@ -10,8 +10,11 @@ from prefect import Task
 from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 
+from tasks.shard_mapper import shard_mapper
 from worldline_core.config.base import StrictModel
+from worldline_core.data.source_paths import SourceFolder, is_remote, parse_location
 from worldline_core.pipeline.steps import Step, get_step, run_step
+from worldline_core.scale.runner_config import RunnerConfig
 from worldline_core.store.store import ArtifactStore
 
 
@@ -19,7 +22,7 @@ class ArtifactReference(StrictModel):
     """What travels between tasks: where an artifact lies and what is in it. Small, JSON, no data."""
 
     step: str
-    path: Path
+    path: SourceFolder
     digest: str
 
 
@@ -48,8 +51,10 @@ class ArtifactTask:
         *,
         store_root: Path,
         name: str | None = None,
+        runner: RunnerConfig | None = None,
     ) -> ArtifactReference:
-        """Run the step (or find it done). ``name`` is what Prefect shows; the step's name by default."""
+        """Run the step (or find it done). ``name`` is what Prefect shows; the step's name by default. ``runner`` says
+        where a step that maps its episodes works on them."""
         store = ArtifactStore(store_root)
         references = {key: _reference(value, store) for key, value in inputs.items()}
         finished = store.find(self.step.name, _key(store, self.step, config, references)) is not None
@@ -59,17 +64,23 @@ class ArtifactTask:
             config.model_dump(mode="json"),
             {key: value.model_dump(mode="json") for key, value in references.items()},
             str(store.root),
+            (runner or RunnerConfig()).model_dump(mode="json"),
         )
         return ArtifactReference.model_validate(result)
 
 
 def _run_step(
-    step_name: str, config: dict[str, Any], inputs: dict[str, dict[str, Any]], store_root: str
+    step_name: str,
+    config: dict[str, Any],
+    inputs: dict[str, dict[str, Any]],
+    store_root: str,
+    runner: dict[str, Any],
 ) -> dict[str, Any]:
     """The body of every task: plain JSON in and out, so that any task runner can carry it."""
-    folders = {name: Path(value["path"]) for name, value in inputs.items()}
+    folders = {name: parse_location(value["path"]) for name, value in inputs.items()}
     model = get_step(step_name).load_config().model_validate(config)
-    artifact = run_step(ArtifactStore(Path(store_root)), step_name, model, folders)
+    mapper = shard_mapper(RunnerConfig.model_validate(runner))
+    artifact = run_step(ArtifactStore(Path(store_root)), step_name, model, folders, mapper)
     return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest).model_dump(mode="json")
 
 
@@ -88,7 +99,9 @@ def _key(store: ArtifactStore, step: Step, config: StrictModel, inputs: Mapping[
 def _reference(value: Path | ArtifactReference, store: ArtifactStore) -> ArtifactReference:
     if isinstance(value, ArtifactReference):
         return value
-    return ArtifactReference(step="folder", path=value.resolve(), digest=store.input_digest(value))
+    return ArtifactReference(
+        step="folder", path=value if is_remote(value) else value.resolve(), digest=store.input_digest(value)
+    )
 
 
 def artifact_task(step_name: str) -> ArtifactTask:

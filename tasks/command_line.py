@@ -35,6 +35,10 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
         help="feed this folder instead of the artifact that the preset would use",
     )  # fmt: skip
     parser.add_argument(
+        "--runner", choices=("auto", "serial", "processes", "dask", "ray"),
+        help="where work on many episodes runs (short for: --set runner.kind=...)",
+    )  # fmt: skip
+    parser.add_argument(
         "--node", help="which node of the run, when a step occurs more than once (rollout.shipped_stage2)"
     )
 
@@ -44,25 +48,32 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     step = get_step(step_name)
     store = ArtifactStore(arguments.artifacts)
     preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "tiny"
+    from tasks.shard_mapper import shard_mapper
     from worldline_core.pipeline.sources import source_inputs
+    from worldline_core.scale.runner_config import RunnerConfig
 
+    overrides = [*arguments.overrides, *([f"runner.kind={arguments.runner}"] if arguments.runner else [])]
+    runner = load_config(RunnerConfig, preset=preset, path=arguments.config, overrides=overrides, section="runner")
+    mapper = shard_mapper(runner)
     if arguments.inputs or step_name == "curate":
         config = load_config(
-            step.load_config(), preset=preset, path=arguments.config, overrides=arguments.overrides, section=step_name
+            step.load_config(), preset=preset, path=arguments.config, overrides=overrides, section=step_name
         )
         inputs = source_inputs(config, Path.cwd()) if step_name == "curate" else {}
-        return run_step(store, step_name, config, inputs | dict(_parse_input(text) for text in arguments.inputs))
+        return run_step(
+            store, step_name, config, inputs | dict(_parse_input(text) for text in arguments.inputs), mapper
+        )
 
     from worldline_core.pipeline.config import PipelineConfig
     from worldline_core.pipeline.plan import plan, run_node
 
-    whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=overrides)
     nodes = plan(whole, Path.cwd())
     candidates = [node.name for node in nodes if node.step == step_name]
     name = arguments.node or (step_name if step_name in candidates or not candidates else "")
     if not name:
         raise ConfigError(f"{step_name} occurs more than once in this run", expected=f"--node with one of {candidates}")
-    return run_node(name, nodes, store)
+    return run_node(name, nodes, store, mapper)
 
 
 def _parse_input(text: str) -> tuple[str, Path]:

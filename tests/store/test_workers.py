@@ -37,6 +37,10 @@ def process(root: Path, rank: int, *, distributed: bool, results: Queue[Any], po
     os.environ.update(WORLD_SIZE="2", RANK=str(rank), MASTER_PORT=str(port))
     artifact = ArtifactStore(root).run("work", 1, work, WorkConfig(seconds=1.0), {}, distributed=distributed)
     results.put((rank, str(artifact.path), artifact.digest, artifact.cached))
+    results.close()
+    results.join_thread()
+    # Without the clean-up that a fork inherits from tests that ran before: servers, clients and pools of the parent.
+    os._exit(0)
 
 
 def launch(root: Path, *, distributed: bool) -> list[tuple[int, str, str, bool]]:

@@ -3,59 +3,41 @@
 from __future__ import annotations
 
 import json
+import uuid
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field
 from tqdm import tqdm
 
-from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
-from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.render_config import RenderActionsConfig
+from worldline_core.actions.render_shard import RenderShard, note_crash, opened, render_shard, result_path
 from worldline_core.actions.track_counts import TrackCounts, add_counts
-from worldline_core.actions.tracks import ActionTracks, shard_name, write_index, write_shard
-from worldline_core.config import StrictModel
-from worldline_core.data.episode import Episode
+from worldline_core.actions.tracks import ActionTracks, shard_name, write_index
 from worldline_core.data.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.contact_sheet import evenly_spaced
 from worldline_core.exports.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.exports.overlays import OverlayStyle
 from worldline_core.exports.pictures import png_bytes
-from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, cut, run_jobs
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
-
-class RenderActionsConfig(StrictModel):
-    """What is projected, and how much is drawn.
-
-    Attributes:
-        source: `action` projects the commands (what a simulator is driven by), `state` the measured joints.
-        without_mount: what wrist cameras without a known mount follow.
-        description_paths: by embodiment, a kinematic description that is the user's own file.
-        preview_height: of one view in the previews, pixels; small frames are enlarged by a whole factor up to it.
-        sigma_px_ref: of the heat in the previews, pixels on the 384 x 512 reference canvas.
-    """
-
-    source: Literal["action", "state"] = "action"
-    without_mount: Literal["recorded", "first_frame_mount"] = "recorded"
-    description_paths: dict[str, str] = Field(default_factory=dict)
-    previews: int = Field(3, ge=0)
-    preview_height: int = Field(256, ge=32)
-    preview_rows: int = Field(4, ge=1)
-    sigma_px_ref: float = Field(SIGMA_PX_REFERENCE, gt=0)
-    episodes_per_shard: int = Field(256, ge=1)
+__all__ = ["RenderActionsConfig", "render_actions"]
 
 
-def render_actions(config: RenderActionsConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+def render_actions(
+    config: RenderActionsConfig, inputs: Mapping[str, Path], output: Path, mapper: ShardMapper | None = None
+) -> dict[str, Any]:
     """Compute the tracks of every episode of `inputs["episodes"]`.
 
     An episode whose tracks cannot be computed goes to `quarantine.parquet` with a reason; the rest goes on. Interrupted
-    work continues at the first shard that is not written.
+    work continues with the shards that are not written.
+
+    Args:
+        mapper: what does the shards, by default this process. The tracks do not depend on it.
 
     Returns:
         Counts: episodes found, with tracks, quarantined; samples, masked ones by cause, and gripper overshoot by arm
@@ -63,17 +45,16 @@ def render_actions(config: RenderActionsConfig, inputs: Mapping[str, Path], outp
 
     Raises:
         ConfigError: no input `episodes`.
+        UnreachableInputError: episodes could not be read for a reason that passes.
     """
     if "episodes" not in inputs:
         raise ConfigError("render_actions needs an EpisodeSet", expected="input episodes", got=sorted(inputs))
     episodes = EpisodeSet.open(inputs["episodes"])
-    kinematics = _KinematicsByName(config)
+    shards = _compute_all(config, episodes, output, mapper or SerialMapper())
     rows: list[dict[str, Any]] = []
     rejected: list[QuarantineRow] = []
     counts: dict[str, list[TrackCounts]] = {}
-    for number, start in enumerate(tqdm(range(0, len(episodes), config.episodes_per_shard), "tracks", disable=None)):
-        positions = range(start, min(start + config.episodes_per_shard, len(episodes)))
-        shard = _shard(config, episodes, positions, number, kinematics, output)
+    for shard in shards:
         rows += shard["rows"]
         rejected += [QuarantineRow(**row) for row in shard["rejected"]]
         for embodiment, numbers in shard["counts"].items():
@@ -95,79 +76,39 @@ def render_actions(config: RenderActionsConfig, inputs: Mapping[str, Path], outp
     return summary
 
 
-class _KinematicsByName:
-    """Kinematics of each embodiment, built once; a failure is remembered, not repeated."""
+def _compute_all(
+    config: RenderActionsConfig, episodes: EpisodeSet, output: Path, mapper: ShardMapper
+) -> Iterator[dict[str, Any]]:
+    """Write every shard that is not there yet; yields what is known of each, in order."""
+    run, text, folder = uuid.uuid4().hex, config.model_dump_json(), str(episodes.root)
+    pieces = cut(range(len(episodes)), config.episodes_per_shard)
+    shards = [RenderShard(n, run, text, folder, str(output), p[0], p[-1] + 1) for n, p in enumerate(pieces)]
 
-    def __init__(self, config: RenderActionsConfig) -> None:
-        self.config = config
-        self._built: dict[str, ArmKinematics | WorldLineError] = {}
+    def unfinished() -> list[RenderShard]:
+        return [s for s in shards if not (result_path(output, s.number).is_file() and _shard_file(output, s).is_file())]
 
-    def get(self, name: str) -> ArmKinematics:
-        if name not in self._built:
-            try:
-                embodiment = load_embodiment(name, self.config.description_paths.get(name))
-                self._built[name] = ArmKinematics(embodiment)
-            except (ConfigError, DataError, UnavailableError) as error:
-                self._built[name] = error
-        result = self._built[name]
-        if isinstance(result, WorldLineError):
-            raise result
-        return result
-
-
-def _reason(error: WorldLineError) -> str:
-    if isinstance(error, CalibrationError):
-        return "no_calibration"
-    if isinstance(error, UnavailableError):
-        return "kinematics_unavailable"
-    return "unknown_embodiment" if isinstance(error, ConfigError) else "invalid_controls"
-
-
-def _shard(
-    config: RenderActionsConfig,
-    episodes: EpisodeSet,
-    positions: range,
-    number: int,
-    kinematics: _KinematicsByName,
-    output: Path,
-) -> dict[str, Any]:
-    """Tracks of some episodes into one shard: index rows, rejected episodes, counts (remembered for a restart)."""
-    done = output / "run" / f"shard-{number:05d}.json"
-    if done.is_file() and (output / shard_name(number)).is_file():
-        return json.loads(done.read_text(encoding="utf-8"))
-    tracks: list[EpisodeTracks] = []
-    rejected: list[dict[str, str]] = []
-    counts: dict[str, list[TrackCounts]] = {}
-    for position in positions:
-        row = episodes.rows[position]
+    with tqdm(total=len(episodes), desc="tracks", unit="episode", disable=None) as progress:
+        todo = unfinished()
+        progress.update(len(episodes) - sum(map(len, todo)))
         try:
-            episode = episodes.episode(position)
-            built = kinematics.get(episode.embodiment) if _needs_kinematics(episode) else None
-            computed, numbers = compute_tracks(
-                episode, built, controls=config.source, without_mount=config.without_mount
-            )
-        except (DataError, ConfigError, UnavailableError) as error:
-            evidence = {"expected": str(error.expected), "got": str(error.got)}
-            rejected.append(
-                {
-                    "episode_id": row.episode_id,
-                    "source": row.source,
-                    "reason": _reason(error),
-                    "detail": error.what,
-                    "evidence": json.dumps(evidence, sort_keys=True),
-                }
-            )
-            continue
-        tracks.append(computed)
-        counts.setdefault(episode.embodiment, []).append(numbers)
-    rows = write_shard(output, number, tracks)
-    result = {"rows": rows, "rejected": rejected, "counts": {name: add_counts(c) for name, c in counts.items()}}
-    write_json_atomic(done, result)
-    return result
+            run_jobs(mapper, render_shard, todo, done=progress.update, crashed=note_crash)
+            # A shard with an episode that ends its process is made again, without that episode.
+            run_jobs(mapper, render_shard, unfinished(), done=progress.update, crashed=note_crash)
+        finally:
+            opened.cache_clear()
+    if left := unfinished():
+        raise DataError(
+            "Tracks of some episodes could not be computed",
+            where=str(output),
+            got=", ".join(shard.label for shard in left[:5]),
+            next_step="run the step again; if it stays, look at the machine's memory",
+        )
+    for shard in shards:
+        yield json.loads(result_path(output, shard.number).read_text(encoding="utf-8"))
 
 
-def _needs_kinematics(episode: Episode) -> bool:
-    return episode.T_base_ee is None
+def _shard_file(output: Path, shard: RenderShard) -> Path:
+    return output / shard_name(shard.number)
 
 
 def _camera_motion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

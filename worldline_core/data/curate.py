@@ -2,162 +2,126 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.curate_episode import check_episode, prepare_episode
+from worldline_core.data.curate_shard import (
+    CurateShard,
+    ListedEpisode,
+    account,
+    curate_shard,
+    open_writer,
+    opened_source,
+    quarantine_crashed,
+)
+from worldline_core.data.curation_rules import decided_findings
 from worldline_core.data.episode_index import read_index, read_quarantine
-from worldline_core.data.episode_parts import part_name
-from worldline_core.data.episode_set_writer import EpisodeSetWriter
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.sources.base import EpisodeSource
-from worldline_core.data.sources.open import open_source
-from worldline_core.errors import CalibrationError, DataError
-from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.data.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
+from worldline_core.data.json_file import read_json
+from worldline_core.data.listed_ids import unique_identity
+from worldline_core.data.source_table import write_source_table
+from worldline_core.data.source_weights import write_source_weights
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, cut, run_jobs
+from worldline_core.scale.shard_manifest import (
+    check_account,
+    read_merged_manifest,
+    read_shard_manifests,
+    write_merged_manifest,
+)
 
 
-@dataclass(frozen=True)
-class _Input:
-    """One listed episode: the id it gets in the set, and where it is read from."""
-
-    identity: str
-    source: EpisodeSource
-    label: str
-    root: Path
-    listed_id: str
-    repeated: bool
-
-
-def curate(config: CurateConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+def curate(
+    config: CurateConfig, inputs: Mapping[str, Path], output: Path, mapper: ShardMapper | None = None
+) -> dict[str, Any]:
     """Read all sources into an EpisodeSet at `output`.
 
     Args:
         inputs: "source.<n>" -> folder of sources[n]; a source that is not named is read from its configured path.
+        mapper: what does the shards, by default this process. The set does not depend on it.
 
     Returns:
-        {"found", "kept", "quarantined", "reasons", "splits"}; kept + quarantined = found.
+        {"found", "kept", "quarantined", "reasons", "splits", "videos" (copied and encoded)}; kept + quarantined = found.
 
     Raises: DataError when a source cannot be opened, nothing is kept, or a scene is both in training and in test;
-        ConfigError when recordings for evaluation only are assigned to training.
+        ConfigError when recordings for evaluation only are assigned to training; UnreachableInputError when inputs
+        could not be read for a reason that passes (what is done stays, the next call does the rest).
     """
-    listed = _list_inputs(config, inputs)
-    if EpisodeSetWriter.finished(output):
-        return _counts(output, len(listed))
-    writer = EpisodeSetWriter(
-        output,
-        fps=config.fps,
-        image_size=config.image_size,
-        video_crf=config.video_crf,
-        video_preset=config.video_preset,
-        pixel_format=config.pixel_format,
-    )
-    for item in tqdm(listed, desc="curate", unit="episode", disable=None):
-        if not writer.has(item.identity):
-            _process(config, item, writer, output)
-    _quarantine_duplicates(listed, writer, output)
-    _check_scenes_disjoint(writer)
-    writer.close()
-    return _counts(output, len(listed))
-
-
-def _list_inputs(config: CurateConfig, inputs: Mapping[str, Path]) -> list[_Input]:
-    listed: list[_Input] = []
-    seen: set[str] = set()
-    for number, source_config in enumerate(config.sources):
-        root = inputs.get(f"source.{number}", source_config.path)
-        source = open_source(source_config, root)
-        for episode_id in filter(source_config.includes, source.episode_ids()):
-            repeated = episode_id in seen
-            identity = f"{episode_id}#source.{number}" if repeated else episode_id
-            seen.add(identity)
-            listed.append(_Input(identity, source, source_config.label, root, episode_id, repeated))
-    return listed
-
-
-def _process(config: CurateConfig, item: _Input, writer: EpisodeSetWriter, output: Path) -> None:
-    """Keep or quarantine one episode."""
+    mapper = mapper or SerialMapper()
     try:
-        if item.repeated:
-            raise RejectedInputError(
-                "duplicate_id", "Another source has an episode of this id", where=item.label, got=item.listed_id
-            )
-        loaded = item.source.load(item.listed_id)
-        check_episode(config, loaded)
-        prepared = prepare_episode(config, loaded)
-        write_bytes_atomic(_fingerprint_path(output, item.identity), prepared.fingerprint.encode())
-        writer.add(prepared.episode, prepared.frames, prepared.masks or None)
-    except RejectedInputError as error:
-        writer.quarantine(item.identity, item.label, error.reason, _portable(error, item), error.evidence)
-    except CalibrationError as error:
-        writer.quarantine(item.identity, item.label, "invalid_extrinsics", _portable(error, item), {})
-    except DataError as error:
-        writer.quarantine(item.identity, item.label, "unreadable", _portable(error, item), {})
+        shards = _shards(config, inputs, output, mapper.episodes_per_shard)
+        identities = [episode.identity for shard in shards for episode in shard.episodes]
+        if not EpisodeSetWriter.finished(output):
+            _work(config, shards, identities, output, mapper)
+        _describe(config, shards, output)
+    finally:
+        opened_source.cache_clear()
+    return _counts(output, identities)
 
 
-def _portable(error: DataError, item: _Input) -> str:
-    """The message with paths counted from the source's folder: a set must not depend on where its sources lay."""
-    text = str(error)
-    for root in (item.root.resolve(), item.root):
-        text = text.replace(f"{root}/", "").replace(str(root), item.label)
-    return text
+def _shards(config: CurateConfig, inputs: Mapping[str, Path], output: Path, size: int) -> list[CurateShard]:
+    """Every episode that the sources list, in their order, cut into shards of one source each."""
+    shards: list[CurateShard] = []
+    seen: set[str] = set()
+    run, text = uuid.uuid4().hex, config.model_dump_json()
+    for number, source_config in enumerate(config.sources):
+        root = str(inputs.get(f"source.{number}", source_config.path))
+        source = opened_source(run, text, number, root)
+        episodes: list[ListedEpisode] = []
+        for listed_id in filter(source_config.includes, source.episode_ids()):
+            repeated = listed_id in seen
+            identity = unique_identity(listed_id, number, seen)
+            seen |= {identity, listed_id}
+            episodes.append(ListedEpisode(identity, listed_id, repeated))
+        for piece in cut(episodes, size):
+            shards.append(CurateShard(len(shards), run, text, number, root, str(output), tuple(piece)))
+    return shards
 
 
-def _fingerprint_path(output: Path, identity: str) -> Path:
-    return output / "run" / "fingerprints" / f"{part_name(identity)}.txt"
+def _work(
+    config: CurateConfig, shards: list[CurateShard], identities: list[str], output: Path, mapper: ShardMapper
+) -> None:
+    writer = open_writer(config, output)
+    todo = [shard for shard in shards if not all(writer.has(episode.identity) for episode in shard.episodes)]
+    with tqdm(total=len(identities), desc="curate", unit="episode", disable=None) as progress:
+        progress.update(len(identities) - sum(len(shard) for shard in todo))
+        run_jobs(mapper, curate_shard, todo, done=progress.update, crashed=quarantine_crashed)
+    _take_out(config, shards, writer, output)
+    write_merged_manifest(output, account(writer, output, identities, read_shard_manifests(output)))
+    writer.close()
 
 
-def _quarantine_duplicates(listed: list[_Input], writer: EpisodeSetWriter, output: Path) -> None:
-    """Of episodes with the same content the first listed is kept."""
-    kept_ids = {part["episode_id"] for part in writer.kept()}
-    first: dict[str, str] = {}
-    for item in listed:
-        if item.identity not in kept_ids:
-            continue
-        original = first.setdefault(_fingerprint_path(output, item.identity).read_text(), item.identity)
-        if original != item.identity:
-            writer.quarantine(
-                item.identity,
-                item.label,
-                "duplicate",
-                f"Same frames, states and actions as episode {original}",
-                {"duplicate_of": original},
-            )
-            writer.discard(item.identity)
+def _take_out(config: CurateConfig, shards: list[CurateShard], writer: EpisodeSetWriter, output: Path) -> None:
+    """Quarantine what the rules over the whole set refuse: duplicates, leaking scenes.
+
+    Raises: DataError when a scene is both learnt from and tested on.
+    """
+    labels = {episode.identity: config.sources[shard.source].label for shard in shards for episode in shard.episodes}
+    kept = {part["episode_id"]: part for part in writer.kept()}
+    findings = decided_findings(config, [kept[identity] for identity in labels if identity in kept], output)
+    for row in findings.rows:
+        writer.quarantine(row.episode_id, labels[row.episode_id], row.reason, row.detail, row.numbers)
+        writer.discard(row.episode_id)
 
 
-def _check_scenes_disjoint(writer: EpisodeSetWriter) -> None:
-    """Raises: DataError when a scene that is trained or validated on is also tested on."""
-    scenes: dict[str, set[str]] = {}
-    for part in writer.kept():
-        scenes.setdefault(part["split"], set()).add(part["scene"])
-    for learning in ("train", "validation"):
-        for testing in ("test", "ood_test"):
-            shared = sorted(scenes.get(learning, set()) & scenes.get(testing, set()))
-            if shared:
-                raise DataError(
-                    f"Scenes are both in {learning} and in {testing}",
-                    where="curate.splits",
-                    expected="disjoint scenes",
-                    got=", ".join(shared[:10]) + (" ..." if len(shared) > 10 else ""),
-                    next_step="give each scene one split",
-                )
+def _describe(config: CurateConfig, shards: list[CurateShard], output: Path) -> None:
+    """Write what the finished set does not say of itself: its sources with their licences, their weights in training."""
+    listed: list[list[str]] = [[] for _ in config.sources]
+    for shard in shards:
+        listed[shard.source] += [episode.identity for episode in shard.episodes]
+    rows = read_index(output)
+    write_source_table(output, config, listed, rows, read_quarantine(output))
+    write_source_weights(output, rows, config.sampling)
 
 
-def _counts(output: Path, found: int) -> dict[str, Any]:
+def _counts(output: Path, identities: list[str]) -> dict[str, Any]:
     rows, rejected = read_index(output), read_quarantine(output)
-    if len(rows) + len(rejected) != found:
-        raise DataError(
-            "Inputs were lost between sources and set",
-            where=str(output),
-            expected=f"kept + quarantined = {found}",
-            got=f"{len(rows)} + {len(rejected)}",
-            next_step="remove the unfinished folder and curate again",
-        )
+    kept, quarantined = {row.episode_id for row in rows}, {row.episode_id for row in rejected}
+    check_account(len(identities), kept, quarantined, read_merged_manifest(output), output)
     reasons: dict[str, int] = {}
     for rejection in rejected:
         reasons[rejection.reason] = reasons.get(rejection.reason, 0) + 1
@@ -165,9 +129,10 @@ def _counts(output: Path, found: int) -> dict[str, Any]:
     for row in rows:
         splits[row.split] = splits.get(row.split, 0) + 1
     return {
-        "found": found,
+        "found": len(identities),
         "kept": len(rows),
         "quarantined": len(rejected),
         "reasons": dict(sorted(reasons.items())),
         "splits": dict(sorted(splits.items())),
+        "videos": {name: count for name, count in read_json(output / VIDEOS_FILE).items() if name != "codecs"},
     }

@@ -18,6 +18,7 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.import_backbone import ImportBackboneConfig
 from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.scale.runner_config import RunnerConfig
 from worldline_core.training.encode_latents import EncodeLatentsConfig
 from worldline_core.training.stage1 import Stage1Config
 from worldline_core.training.stage2 import Stage2Config
@@ -65,6 +66,9 @@ class PipelineConfig(StrictModel):
     evaluate_policy: PolicyEvaluationConfig
     evaluate_planning: PlanningConfig | None = None
     report: ReportConfig
+    runner: RunnerConfig = Field(
+        default=RunnerConfig(), description="where work on many episodes runs; changes no result and no cache key"
+    )
 
     @model_validator(mode="after")
     def _references_exist(self) -> PipelineConfig:

@@ -14,7 +14,10 @@ from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.pipeline.config import PipelineConfig, RolloutRun
 from worldline_core.pipeline.sources import source_inputs
 from worldline_core.pipeline.steps import get_step, run_step
+from worldline_core.scale.mapping import ShardMapper
 from worldline_core.store.store import Artifact, ArtifactStore
+from worldline_core.training.clip_input import FrameInput
+from worldline_core.training.stage import StageConfig
 
 
 @dataclass(frozen=True)
@@ -43,21 +46,33 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
         config.encode_latents,
         {"episodes": "filter", "tokenizer": models["tokenizer"]},
     )
-    data: dict[str, str | Path] = {"latents": "encode_latents", "episodes": "filter"}
+
+    def clips(stage: StageConfig) -> dict[str, str | Path]:
+        """A stage's episodes, and what makes latents of their clips: the cache, or the tokenizer itself."""
+        if isinstance(stage.input, FrameInput):
+            return {"episodes": "filter", "tokenizer": models["tokenizer"]}
+        return {"episodes": "filter", "latents": "encode_latents"}
+
     base: dict[str, str | Path] = {"base": models["base"]} if "base" in models else {}
-    yield Node("train_stage1", "train_stage1", config.train_stage1, {**data, **base})
+    yield Node("train_stage1", "train_stage1", config.train_stage1, {**clips(config.train_stage1), **base})
     teacher: dict[str, str | Path] = {"teacher": models["teacher"]} if "teacher" in models else {}
     yield Node(
         "train_stage2",
         "train_stage2",
         config.train_stage2,
-        {**data, "tracks": "render_actions", "stage1": "train_stage1", **teacher},
+        {**clips(config.train_stage2), "tracks": "render_actions", "stage1": "train_stage1", **teacher},
     )
     yield Node(
         "distill",
         "distill",
         config.distill,
-        {**data, "tracks": "render_actions", "stage2": "train_stage2", "tokenizer": models["tokenizer"]},
+        {
+            "latents": "encode_latents",
+            "episodes": "filter",
+            "tracks": "render_actions",
+            "stage2": "train_stage2",
+            "tokenizer": models["tokenizer"],
+        },
     )
     if config.curate_banks is not None:
         yield Node("curate.banks", "curate", config.curate_banks, source_inputs(config.curate_banks, project))
@@ -108,7 +123,7 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
         }
         # Outcomes stay with the recordings and are opened after the choice: curation never sees them.
         if config.curate_banks is not None:
-            inputs["sealed"] = project / config.curate_banks.sources[0].path
+            inputs["sealed"] = source_inputs(config.curate_banks, project)["source.0"]
         yield Node("evaluate_planning", "evaluate_planning", config.evaluate_planning, inputs)
         scores["evaluate_planning"] = "evaluate_planning"
     trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")
@@ -133,7 +148,7 @@ def find_artifacts(nodes: list[Node], store: ArtifactStore) -> dict[str, Artifac
     return found
 
 
-def run_node(name: str, nodes: list[Node], store: ArtifactStore) -> Artifact:
+def run_node(name: str, nodes: list[Node], store: ArtifactStore, mapper: ShardMapper | None = None) -> Artifact:
     """Run one node on the finished artifacts of those before it.
 
     Raises:
@@ -154,13 +169,13 @@ def run_node(name: str, nodes: list[Node], store: ArtifactStore) -> Artifact:
             got=f"missing: {', '.join(missing)}",
             next_step=f"run `worldline task {missing[0]}` with the same preset first, or `worldline pipeline`",
         )
-    return run_step(store, node.step, node.config, inputs)
+    return run_step(store, node.step, node.config, inputs, mapper)
 
 
 def _resolve(node: Node, found: Mapping[str, Artifact]) -> dict[str, Path] | None:
     inputs: dict[str, Path] = {}
     for name, source in node.inputs.items():
-        if isinstance(source, Path):
+        if not isinstance(source, str):
             inputs[name] = source
         elif source in found:
             inputs[name] = found[source].path

@@ -6,14 +6,17 @@ Functions and configs are named, not imported: listing the steps costs nothing, 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from worldline_core.config.base import StrictModel
 from worldline_core.errors import ConfigError
-from worldline_core.store.store import Artifact, ArtifactStore, StepFunction
+from worldline_core.store.store import Artifact, ArtifactStore
+
+if TYPE_CHECKING:
+    from worldline_core.scale.mapping import ShardMapper
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,10 @@ class Step:
     summary: str = ""
     distributed: bool = False
     """Whether the processes that torchrun starts share its work."""
+    mapped: bool = False
+    """Whether its function takes a `mapper` and hands it shards of episodes."""
 
-    def load_function(self) -> StepFunction:
+    def load_function(self) -> Callable[..., dict[str, Any]]:
         return getattr(importlib.import_module(self.module), self.function)
 
     def load_config(self) -> type[StrictModel]:
@@ -63,31 +68,34 @@ def _matches(name: str, pattern: str) -> bool:
 _STEPS = (
     Step(
         "curate",
-        2,
+        3,
         "worldline_core.data.curate",
         "curate",
         "CurateConfig",
         (),
         ("source.*",),
         summary="read recordings of any source into one EpisodeSet",
+        mapped=True,
     ),
     Step(
         "filter",
-        2,
+        3,
         "worldline_core.filters.filter",
         "filter_episodes",
         "FilterConfig",
         ("episodes",),
         summary="drop static, reset, corrupted, moving-base, misaligned and badly calibrated segments",
+        mapped=True,
     ),
     Step(
         "render_actions",
-        2,
+        3,
         "worldline_core.actions.render_actions",
         "render_actions",
         "RenderActionsConfig",
         ("episodes",),
         summary="project the controls into every view: action tracks and overlay previews",
+        mapped=True,
     ),
     Step(
         "encode_latents",
@@ -141,8 +149,8 @@ _STEPS = (
         "worldline_core.training.stage1",
         "train_stage1",
         "Stage1Config",
-        ("latents", "episodes"),
-        ("base",),
+        ("episodes",),
+        ("latents", "tokenizer", "base"),
         summary="Stage I: action-free, text-conditioned video prediction",
         distributed=True,
     ),
@@ -152,8 +160,8 @@ _STEPS = (
         "worldline_core.training.stage2",
         "train_stage2",
         "Stage2Config",
-        ("latents", "tracks", "episodes", "stage1"),
-        ("teacher",),
+        ("tracks", "episodes", "stage1"),
+        ("latents", "tokenizer", "teacher"),
         summary="Stage II: action-driven three-view prediction on successes and failures",
         distributed=True,
     ),
@@ -209,7 +217,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        2,
+        3,
         "worldline_core.report.report",
         "report",
         "ReportConfig",
@@ -228,14 +236,25 @@ def get_step(name: str) -> Step:
     return STEPS[name]
 
 
-def run_step(store: ArtifactStore, name: str, config: StrictModel, inputs: Mapping[str, Path]) -> Artifact:
-    """Run one step on the store (or find its finished artifact)."""
+def run_step(
+    store: ArtifactStore,
+    name: str,
+    config: StrictModel,
+    inputs: Mapping[str, Path],
+    mapper: ShardMapper | None = None,
+) -> Artifact:
+    """Run one step on the store (or find its finished artifact).
+
+    Args:
+        mapper: what works on the episodes of a step that maps them; by default this process.
+    """
     step = get_step(name)
     step.check_inputs(inputs)
+    options = {"mapper": mapper} if step.mapped else {}
     return store.run(
         step.name,
         step.version,
-        lambda c, i, o: step.load_function()(c, i, o),
+        lambda c, i, o: step.load_function()(c, i, o, **options),
         config,
         inputs,
         distributed=step.distributed,

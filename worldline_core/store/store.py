@@ -22,6 +22,7 @@ from typing import Any
 
 from worldline_core.config.base import StrictModel
 from worldline_core.errors import ArtifactError
+from worldline_core.scale.remote import is_remote, remote_digest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
 from worldline_core.store.lock import exclusive_lock
@@ -71,9 +72,15 @@ class ArtifactStore:
     def input_digest(self, path: Path) -> str:
         """Digest of an input: read from the manifest of an artifact, computed for any other folder.
 
+        Of a location in an object store the listing counts (names, sizes, and the store's own digests or times of
+        change): its files are not read twice.
+
         Raises:
             ArtifactError: the folder does not exist.
+            UnreachableInputError: the store does not answer.
         """
+        if is_remote(path):
+            return remote_digest(path)
         if not path.is_dir():
             raise ArtifactError("An input folder does not exist", where=path, next_step="run the step that makes it")
         manifest = path / MANIFEST_NAME
@@ -108,7 +115,7 @@ class ArtifactStore:
             return found
         folder = self.root / step / key
         partial = folder.with_name(f"{key}.partial")
-        sources = {name: path.resolve() for name, path in inputs.items()}
+        sources = {name: path if is_remote(path) else path.resolve() for name, path in inputs.items()}
         announcement = self.root / step / f".{key}.workers"
         if is_helper():
             done = wait_for_announcement(announcement, lambda: self.find(step, key))
@@ -189,7 +196,7 @@ def _manifest_digest(path: Path) -> str:
 
 def _portable(path: Path, root: Path) -> str:
     """Paths in manifests are relative to the artifacts' root, so that a checkout can be moved."""
-    return os.path.relpath(path.resolve(), root)
+    return str(path) if is_remote(path) else os.path.relpath(path.resolve(), root)
 
 
 def _seeds(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,0 +1,236 @@
+"""Shards of a step mapped by Prefect's task runners: processes of this machine, Dask or Ray.
+
+The step stays one task of its flow; inside, a small flow has one task a shard, named after it. Few shards are handed out
+at a time, so memory does not grow with the number of episodes.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
+
+from worldline_core.errors import UnavailableError
+from worldline_core.scale.mapping import Job, Outcome, SerialMapper, ShardMapper, WorkerDiedError, retry_pauses
+from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.transient import is_transient
+
+_DEATHS = frozenset(
+    {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
+)
+"""How the runners say that a worker ended without an answer (concurrent.futures, distributed, ray)."""
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def shard_mapper(config: RunnerConfig) -> ShardMapper:
+    """What does mapped work as configured."""
+    return (
+        SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds)
+        if config.kind == "serial"
+        else (PrefectMapper(config))
+    )
+
+
+class PrefectMapper:
+    """Does shards in a Prefect flow. `auto` does few episodes in this process, without Prefect."""
+
+    def __init__(self, config: RunnerConfig) -> None:
+        self.config = config
+
+    @property
+    def episodes_per_shard(self) -> int:
+        return self.config.episodes_per_shard
+
+    def map[J: Job, R](
+        self,
+        function: Callable[[J], R],
+        jobs: Sequence[J],
+        take: Callable[[Outcome[J, R]], None],
+        *,
+        one_at_a_time: bool = False,
+    ) -> None:
+        config = self.config
+        few = config.kind == "auto" and (sum(map(len, jobs)) < config.serial_below or self._workers() == 1)
+        # What killed a worker must not get the chance to kill this process.
+        if not jobs or (few and not one_at_a_time):
+            SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds).map(function, jobs, take)
+            return
+        waiting = deque(jobs)
+        limit = 1 if one_at_a_time else config.in_flight or 2 * self._workers()
+        while waiting:  # a process pool that lost a worker is at its end: the next round has a new one
+            self._round(function, waiting, take, limit)
+
+    def _workers(self) -> int:
+        return self.config.workers or len(os.sched_getaffinity(0))
+
+    def _round(
+        self,
+        function: Callable[[Any], Any],
+        waiting: deque[Any],
+        take: Callable[[Outcome[Any, Any]], None],
+        limit: int,
+    ) -> None:
+        """One flow, until no job waits or the runner has lost a worker."""
+        # Read when Prefect is imported: without a server of its own it starts one, which takes a while on a busy machine.
+        os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
+        os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+        from prefect import Flow, Task
+
+        work = Task(
+            fn=do_shard,
+            name="shard",
+            retries=self.config.retries,
+            retry_delay_seconds=retry_pauses(self.config.retries, self.config.retry_seconds),
+            retry_condition_fn=_may_pass,
+            persist_result=False,
+            log_prints=False,
+        )
+        room = int(self.config.remote_cache_gb * 2**30)
+
+        def hand_out(job: Any) -> Any:
+            return work.with_options(task_run_name=job.label).submit(pickle.dumps((function, job)), room)
+
+        first = waiting[0].label
+        name = first.rsplit(" shard", 1)[0]
+        shards = Flow(
+            fn=_shards,
+            name=f"{name} shards",
+            flow_run_name=f"{name}: {len(waiting)} shards from {first}",
+            task_runner=self._task_runner(min(self._workers(), limit)),
+            persist_result=False,
+        )
+        token = _round.set(_Round(waiting, hand_out, take, limit))
+        try:
+            with _single_threaded_children():
+                shards()
+        finally:
+            _round.reset(token)
+
+    def _task_runner(self, workers: int) -> Any:
+        match self.config.kind:
+            case "dask":
+                return _dask_runner(workers, self.config.address)
+            case "ray":
+                return _ray_runner(workers, self.config.address)
+            case _:
+                from prefect.task_runners import ProcessPoolTaskRunner
+
+                return ProcessPoolTaskRunner(max_workers=workers)
+
+
+@dataclass(frozen=True)
+class _Round:
+    waiting: deque[Any]
+    hand_out: Callable[[Any], Any]
+    take: Callable[[Outcome[Any, Any]], None]
+    limit: int
+
+
+# Prefect sends the flow along with every task: its function must not hold the jobs.
+_round: ContextVar[_Round] = ContextVar("_round")
+
+
+def _shards() -> None:
+    """The body of the flow: hand out a bounded number of jobs, take what comes back in their order."""
+    current = _round.get()
+    handed_out: deque[tuple[Any, Any]] = deque()
+    broken = False
+    while handed_out or (current.waiting and not broken):
+        while current.waiting and not broken and len(handed_out) < current.limit:
+            job = current.waiting.popleft()
+            handed_out.append((job, current.hand_out(job)))
+        job, future = handed_out.popleft()
+        outcome = _outcome(job, future)
+        broken = broken or isinstance(outcome.error, WorkerDiedError)
+        current.take(outcome)
+
+
+def do_shard(payload: bytes, remote_cache_bytes: int) -> Any:
+    """The body of every shard's task, in a worker: one thread for each worker, since there is one worker for each core."""
+    import cv2
+
+    from worldline_core.scale.remote import process_cache
+
+    cv2.setNumThreads(1)
+    process_cache().max_bytes = remote_cache_bytes
+    function, job = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    return function(job)
+
+
+def _may_pass(_task: Any, _run: Any, state: Any) -> bool:
+    """Only what may pass is tried again: a network, a busy store; never bad data."""
+    error = state.result(raise_on_failure=False)
+    return isinstance(error, BaseException) and is_transient(error)
+
+
+def _outcome[J: Job](job: J, future: Any) -> Outcome[J, Any]:
+    try:
+        return Outcome(job, future.result())
+    except Exception as error:  # noqa: BLE001 - handed to the caller, which knows what ends the run
+        if type(error).__name__ not in _DEATHS:
+            return Outcome(job, error=error)
+        died = WorkerDiedError(
+            "A worker ended without an answer",
+            where=job.label,
+            got="a crash in compiled code, or killed for its memory",
+        )
+        return Outcome(job, error=died)
+
+
+def _dask_runner(workers: int, address: str | None) -> Any:
+    try:
+        from dask import config as dask_config
+        from prefect_dask.task_runners import DaskTaskRunner
+    except ImportError as error:
+        raise _missing("dask", error) from error
+    # Doing a shard again after its worker died is this module's business.
+    dask_config.set({"distributed.scheduler.allowed-failures": 0})
+    if address is not None:
+        return DaskTaskRunner(address=address)
+    cluster = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    return DaskTaskRunner(cluster_kwargs=cluster)
+
+
+def _ray_runner(workers: int, address: str | None) -> Any:
+    try:
+        from prefect_ray import RayTaskRunner
+    except ImportError as error:
+        raise _missing("ray", error) from error
+    if address is not None:
+        return RayTaskRunner(address=address)
+    # Ray's workers are nice to all others, up to getting nothing on a busy machine; here they are the work.
+    os.environ.setdefault("RAY_worker_niceness", "0")
+    return RayTaskRunner(init_kwargs={"num_cpus": workers, "include_dashboard": False})
+
+
+def _missing(extra: str, error: ImportError) -> UnavailableError:
+    return UnavailableError(
+        f"The runner {extra} needs libraries that are not installed",
+        where="runner.kind",
+        expected=f"the extra `{extra}`",
+        got=str(error),
+        next_step=f"uv sync --extra {extra} (or pip install 'worldline[{extra}]'), or runner.kind=processes",
+    )
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Processes that are started within inherit one thread each for linear algebra; read when they import numpy."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

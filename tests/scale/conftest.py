@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # workers import the jobs of these tests by name
+
+
+@pytest.fixture(scope="session")
+def prefect_server() -> Iterator[None]:
+    from prefect.testing.utilities import prefect_test_harness
+
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), *filter(None, [before])])
+    with prefect_test_harness(server_startup_timeout=120):
+        yield
+    if before is None:
+        del os.environ["PYTHONPATH"]
+    else:
+        os.environ["PYTHONPATH"] = before
+
+
+@pytest.fixture(scope="session")
+def store_server() -> Iterator[object]:
+    pytest.importorskip("moto", reason="the dependency group `scale` is not installed")
+    s3fs = pytest.importorskip("s3fs")
+    from object_store import CREDENTIALS, ObjectStore
+
+    server = ObjectStore()
+    settings = CREDENTIALS | {"AWS_ENDPOINT_URL": server.url}
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    s3fs.S3FileSystem.clear_instance_cache()
+    yield server
+    server.close()
+    s3fs.S3FileSystem.clear_instance_cache()
+    for name, value in before.items():
+        if value is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = value
+
+
+@pytest.fixture
+def store(store_server: object) -> Iterator[object]:
+    from worldline_core.scale.remote import process_cache
+
+    process_cache().clear()
+    yield store_server
+    store_server.misbehave = lambda method, path: None  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="session")
+def make_sample() -> Callable[..., tuple]:
+    """The synthetic episodes of the tests of data."""
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location("data_samples", Path(__file__).parents[1] / "data" / "conftest.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.make_sample
+
+
+@pytest.fixture
+def sample(make_sample: Callable[..., tuple]) -> Callable[..., tuple]:
+    return make_sample

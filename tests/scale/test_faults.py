@@ -1,0 +1,174 @@
+"""What is tried again, what ends a run, and that nothing is lost from the account."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.scale import transient
+from worldline_core.scale.crashes import portable_message
+from worldline_core.scale.mapping import ends_the_run
+from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.shard_manifest import (
+    InputRow,
+    check_account,
+    read_shard_manifests,
+    write_shard_manifest,
+)
+from worldline_core.scale.transient import UnreachableInputError, is_transient, with_retries
+
+
+class ClientError(Exception):
+    """As botocore's: the status is in the response."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(f"status {status}")
+        self.response = {"ResponseMetadata": {"HTTPStatusCode": status}}
+
+
+class ClientPayloadError(Exception):
+    __module__ = "aiohttp.client_exceptions"
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ConnectionResetError("reset"), True),
+        (TimeoutError("slow"), True),
+        (OSError(errno.EIO, "I/O error"), True),
+        (OSError(errno.ESTALE, "stale handle"), True),
+        (ClientError(503), True),
+        (ClientError(429), True),
+        (ClientPayloadError("cut"), True),
+        (UnreachableInputError("away"), True),
+        (ClientError(404), False),
+        (ClientError(403), False),
+        (FileNotFoundError(errno.ENOENT, "none"), False),
+        (PermissionError(errno.EACCES, "no"), False),
+        (OSError("file signature not found"), False),  # h5py, of a damaged file
+        (RejectedInputError("truncated_video", "cut"), False),
+        (ValueError("bad"), False),
+    ],
+)
+def test_only_what_passes_is_tried_again(error: Exception, expected: bool) -> None:
+    assert is_transient(error) is expected
+
+
+def test_a_readers_own_words_do_not_hide_the_network() -> None:
+    def read() -> None:
+        try:
+            raise OSError(errno.ESTALE, "stale file handle")
+        except OSError as error:
+            raise RejectedInputError("unreadable", "Parquet file cannot be read") from error
+
+    with pytest.raises(RejectedInputError, match="Parquet file cannot be read") as caught:
+        read()
+    assert is_transient(caught.value)
+
+
+def test_attempts_are_counted_and_bad_data_gets_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[float] = []
+    monkeypatch.setattr(transient.time, "sleep", waited.append)
+    calls: list[str] = []
+
+    def fails(error: Exception, times: int) -> Any:
+        def action() -> str:
+            calls.append("call")
+            if len(calls) <= times:
+                raise error
+            return "read"
+
+        return action
+
+    assert with_retries(fails(ConnectionResetError(), 3), "a file") == "read"
+    assert waited == [0.2, 0.4, 0.8]
+    calls.clear()
+    with pytest.raises(UnreachableInputError, match="A store could not be reached"):
+        with_retries(fails(ConnectionResetError(), 99), "a file")
+    assert len(calls) == transient.ATTEMPTS
+    calls.clear()
+    with pytest.raises(ValueError, match="bad"):
+        with_retries(fails(ValueError("bad"), 99), "a file")
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ConfigError("wrong"), True),
+        (UnavailableError("h5py"), True),
+        (OSError(errno.ENOSPC, "full"), True),
+        (UnreachableInputError("away"), False),
+        (DataError("bad"), False),
+        (MemoryError(), False),
+    ],
+)
+def test_what_ends_a_run(error: Exception, expected: bool) -> None:
+    assert ends_the_run(error) is expected
+
+
+def rows(*statuses: str) -> list[InputRow]:
+    return [
+        InputRow(f"e{n}", "s", status, None if status == "kept" else "too_short", "", 10, 0.5, 0.4)  # type: ignore[arg-type]
+        for n, status in enumerate(statuses)
+    ]
+
+
+def test_the_account_is_complete_or_an_error(tmp_path: Path) -> None:
+    whole = rows("kept", "quarantined", "kept")
+    check_account(3, {"e0", "e2"}, {"e1"}, whole, tmp_path)
+    for found, kept, quarantined, account in (
+        (4, {"e0", "e2"}, {"e1"}, whole),  # an input in no row
+        (3, {"e0"}, {"e1"}, whole),  # kept by the account, not in the index
+        (3, {"e0", "e2"}, {"e1"}, whole[:2]),
+        (3, {"e0", "e1"}, {"e2"}, whole),  # the other way round
+        (3, {"e0", "e2"}, {"e1"}, [*whole[:2], whole[0]]),  # one twice
+    ):
+        with pytest.raises(DataError, match="Inputs were lost"):
+            check_account(found, kept, quarantined, account, tmp_path)
+
+
+def test_shards_are_merged_and_the_row_with_the_work_counts(tmp_path: Path) -> None:
+    first, second = rows("kept", "quarantined")
+    unknown = InputRow("e0", "s", "kept", None, "", 10)
+    write_shard_manifest(tmp_path, "shard-1", [unknown, second])
+    write_shard_manifest(tmp_path, "shard-2", [first])
+    assert read_shard_manifests(tmp_path) == {"e0": first, "e1": second}
+    assert all(path.relative_to(tmp_path).parts[0] == "run" for path in tmp_path.rglob("*.parquet"))
+
+
+def test_messages_say_nothing_of_this_machine() -> None:
+    text = "cannot open '/home/user/data set/x.mp4' (Decoder object at 0x7f3a9c00ab10): /tmp/a/b.parquet"
+    cleaned = portable_message(text)
+    assert "/home" not in cleaned
+    assert "0x7f3a" not in cleaned
+    assert cleaned.endswith("b.parquet")
+
+
+def test_runner_settings() -> None:
+    assert RunnerConfig().kind == "auto"
+    with pytest.raises(ValidationError, match="an address is that of a Dask or Ray cluster"):
+        RunnerConfig.model_validate({"kind": "processes", "address": "tcp://10.0.0.1:8786"})
+    with pytest.raises(ValidationError, match="Input should be 'auto'"):
+        RunnerConfig.model_validate({"kind": "slurm"})
+
+
+def test_the_runner_is_no_part_of_a_key() -> None:
+    from worldline_core.config import load_config
+    from worldline_core.pipeline.config import PipelineConfig
+    from worldline_core.pipeline.plan import plan
+
+    plain, dask = (
+        plan(load_config(PipelineConfig, preset="tiny", overrides=overrides), Path.cwd())
+        for overrides in ((), ("runner.kind=dask", "runner.episodes_per_shard=3"))
+    )
+    assert [json.dumps(node.config.model_dump(mode="json")) for node in plain] == [
+        json.dumps(node.config.model_dump(mode="json")) for node in dask
+    ]

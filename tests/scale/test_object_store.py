@@ -1,0 +1,201 @@
+"""Recordings in an S3-compatible store: the same set as from a folder, through every misbehaviour of the store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from object_store import ObjectStore
+
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import find_files, inside, local_file, parse_location
+from worldline_core.scale import transient
+from worldline_core.scale.mapping import SerialMapper
+from worldline_core.scale.remote import RemoteCache, process_cache
+from worldline_core.scale.shard_manifest import read_merged_manifest
+from worldline_core.scale.transient import UnreachableInputError
+from worldline_core.store.digest import digest_folder
+from worldline_core.store.store import ArtifactStore
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+Make = Callable[..., tuple]
+
+
+@pytest.fixture
+def recordings(tmp_path: Path, sample: Make) -> Path:
+    with EpisodeSetWriter(tmp_path / "raw", video_crf=8) as writer:
+        for number in range(5):
+            writer.add(*sample(number))
+    return tmp_path / "raw"
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transient, "FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr(transient.pauses, "__defaults__", (transient.ATTEMPTS, 0.01))
+
+
+def config(path: object, **changes: Any) -> CurateConfig:
+    source = {"kind": "episode_set", "path": str(path), "name": "raw"}
+    return CurateConfig.model_validate({"sources": [source], "image_size": (16, 24), "fps": 8, **changes})
+
+
+def curated_digest(configured: CurateConfig, output: Path) -> str:
+    curate(configured, {}, output, SerialMapper(2, retries=1, retry_seconds=0.01))
+    return digest_folder(output)
+
+
+def test_a_set_in_the_store_gives_the_bytes_of_one_in_a_folder(
+    tmp_path: Path, recordings: Path, store: ObjectStore
+) -> None:
+    url = store.upload(recordings, "same")
+    assert curated_digest(config(url), tmp_path / "remote") == curated_digest(config(recordings), tmp_path / "local")
+
+
+def test_a_missing_and_a_damaged_object_cost_their_episodes_only(
+    tmp_path: Path, recordings: Path, store: ObjectStore
+) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(recordings, damaged)
+    video = next((damaged / "datasets").rglob("*head*/**/*.mp4"))
+    video.write_bytes(video.read_bytes()[:2000])
+    with pytest.raises(Exception, match="No episode was kept"):
+        curate(config(store.upload(damaged, "damaged")), {}, tmp_path / "out")
+    rows = EpisodeSetWriter(tmp_path / "out").rejected()
+    assert {row.reason for row in rows} <= {"truncated_video", "unreadable"}
+    assert all("worldline-remote" not in row.detail and "127.0.0.1" not in row.detail for row in rows)
+
+
+@pytest.mark.parametrize("fault", ["busy", "broken", "hang up"])
+def test_a_store_that_flickers_changes_nothing(
+    tmp_path: Path, recordings: Path, store: ObjectStore, fault: str
+) -> None:
+    url = store.upload(recordings, f"flicker-{fault.replace(' ', '-')}")
+    count = 0
+
+    def every_third(method: str, path: str) -> str | None:
+        nonlocal count
+        count += 1
+        return fault if count % 3 == 0 else None
+
+    store.misbehave = every_third
+    remote = curated_digest(config(url), tmp_path / "remote")
+    assert count > 10
+    assert remote == curated_digest(config(recordings), tmp_path / "local")
+
+
+def test_a_store_that_stays_away_is_no_reason_to_quarantine(
+    tmp_path: Path, recordings: Path, store: ObjectStore
+) -> None:
+    url = store.upload(recordings, "away")
+    store.misbehave = lambda method, path: "broken" if method == "GET" and path.endswith(".mp4") else None
+    with pytest.raises(UnreachableInputError, match="shards could not read all of their inputs"):
+        curated_digest(config(url), tmp_path / "out")
+    writer = EpisodeSetWriter(tmp_path / "out")
+    assert (writer.kept(), writer.rejected()) == ([], [])
+    store.misbehave = lambda method, path: None
+    assert curated_digest(config(url), tmp_path / "out") == curated_digest(config(recordings), tmp_path / "local")
+    assert {row.status for row in read_merged_manifest(tmp_path / "out")} == {"kept"}
+
+
+@pytest.mark.parametrize("relative", ["../other/x.mp4", "a/../../x", "/etc/passwd", "s3://other/x", "a\0b"])
+def test_metadata_cannot_lead_out_of_the_location(relative: str) -> None:
+    root = parse_location("memory://bucket/set")
+    with pytest.raises(RejectedInputError, match="Path leads outside of the dataset folder"):
+        inside(root, relative)
+    assert str(inside(root, "videos/x.mp4")).endswith("set/videos/x.mp4")
+
+
+def test_copies_stay_within_their_bound(tmp_path: Path, store: ObjectStore) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    for number in range(6):
+        (folder / f"{number}.bin").write_bytes(bytes([number]) * 1000)
+    root = parse_location(store.upload(folder, "bound"))
+    cache = RemoteCache(tmp_path / "cache", max_bytes=2500)
+    for number in (0, 1, 0, 2, 3, 0, 4, 5):
+        copy = cache.fetch(root / f"{number}.bin")
+        assert copy.read_bytes() == bytes([number]) * 1000
+        assert sum(path.stat().st_size for path in cache.folder.rglob("*") if path.is_file()) <= 2500
+    assert cache.fetched_bytes == 7000  # 0 was asked for three times: once it was still there
+    cache.clear()
+    assert not cache.folder.exists()
+
+
+def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "a.bin").write_bytes(b"x" * 5000)
+    root = parse_location(store.upload(tmp_path / "files", "cut"))
+    fetched = 0
+    whole = root.fs.get_file
+
+    def cut(source: str, target: str) -> None:
+        nonlocal fetched
+        fetched += 1
+        whole(source, target)
+        if fetched < 3:
+            Path(target).write_bytes(b"x" * 100)
+
+    monkeypatch.setattr(root.fs, "get_file", cut)
+    assert local_file(root / "a.bin").stat().st_size == 5000
+    assert fetched == 3
+    process_cache().clear()
+
+
+def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
+    artifacts = ArtifactStore(tmp_path / "artifacts")
+    url = parse_location(store.upload(recordings, "key"))
+    first = artifacts.input_digest(url)
+    fetched = [path for method, path in store.requests if method == "GET" and "/key/" in path]
+    assert fetched == []  # the listing says enough
+    store.upload(recordings, "key")
+    url.fs.invalidate_cache()
+    assert artifacts.input_digest(url) == first
+    (recordings / "index.parquet").write_bytes(b"other")
+    store.upload(recordings, "key")
+    url.fs.invalidate_cache()
+    assert artifacts.input_digest(url) != first
+
+
+def test_files_are_found_as_in_a_folder(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
+    url = parse_location(store.upload(recordings, "find"))
+    for pattern in ("*.mp4", "*/*.parquet", "meta/*.json"):
+        local = [path.relative_to(recordings).as_posix() for path in find_files(recordings, pattern)]
+        assert [path.relative_to(url).as_posix() for path in find_files(url, pattern)] == local
+        assert local
+
+
+def test_a_set_can_be_opened_where_it_is(recordings: Path, store: ObjectStore) -> None:
+    opened, local = EpisodeSet.open(parse_location(store.upload(recordings, "open"))), EpisodeSet.open(recordings)
+    assert [row.episode_id for row in opened.rows] == [row.episode_id for row in local.rows]
+    assert (opened.frames(2, "head") == local.frames(2, "head")).all()
+    assert (opened.episode(1).state == local.episode(1).state).all()
+
+
+REAL = {
+    "agibot_gesim": ("agibot_gesim", {"kind": "agibot_gesim", "fps": 30.0}),
+    "droid": ("droid_ctrl_world", {"kind": "droid_annotation"}),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_samples_come_through_the_store(tmp_path: Path, store: ObjectStore, name: str) -> None:
+    folder, settings = REAL[name]
+    if not (SHARED / folder).is_dir():
+        pytest.skip("the real samples are not beside this checkout (../shared/data)")
+    url = store.upload(SHARED / folder, f"real-{name}")
+
+    def configured(path: object) -> CurateConfig:
+        source = {**settings, "path": str(path), "name": name}
+        return CurateConfig.model_validate({"sources": [source], "image_size": (48, 64), "min_frames": 1})
+
+    remote, local = (curate(configured(path), {}, tmp_path / str(n)) for n, path in enumerate((url, SHARED / folder)))
+    assert json.dumps(remote) == json.dumps(local)
+    assert digest_folder(tmp_path / "0") == digest_folder(tmp_path / "1")

@@ -1,0 +1,102 @@
+"""A set pushed to an object store comes back with the same digest, also after interruptions; anything else is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from object_store import BUCKET, ObjectStore
+
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import parse_location
+from worldline_core.errors import ArtifactError
+from worldline_core.exports.publish import pull, push
+from worldline_core.exports.publish_content import FILE_LIST
+from worldline_core.scale import transient
+from worldline_core.scale.transient import UnreachableInputError
+from worldline_core.store.digest import digest_folder
+
+
+@pytest.fixture
+def finished(tmp_path: Path, sample: Callable[..., tuple]) -> Path:
+    with EpisodeSetWriter(tmp_path / "set", video_crf=8) as writer:
+        for number in range(2):
+            writer.add(*sample(number))
+    return tmp_path / "set"
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transient.pauses, "__defaults__", (transient.ATTEMPTS, 0.01))
+
+
+@pytest.mark.parametrize("kind", ["store", "folder"])
+def test_there_and_back(tmp_path: Path, finished: Path, store: ObjectStore, kind: str) -> None:
+    where = f"s3://{BUCKET}/there" if kind == "store" else str(tmp_path / "there")
+    store.upload(tmp_path / "nothing", "x")  # makes the bucket
+    pushed = push(finished, where)
+    pulled = pull(where, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(finished)
+    assert pulled.files == pushed.files
+    assert (tmp_path / "back" / "run" / "card" / "README.md").is_file()
+    assert [row.episode_id for row in EpisodeSet.open(tmp_path / "back").rows] == ["episode-000", "episode-001"]
+    with pytest.raises(ArtifactError, match="Folder exists already"):
+        pull(where, tmp_path / "back")
+    assert push(finished, where).moved_files == 0
+
+
+def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
+    store.upload(tmp_path / "nothing", "x")
+    where = f"s3://{BUCKET}/interrupted"
+    sent: list[str] = []
+
+    def stops(method: str, path: str) -> str | None:
+        if method == "PUT" and "/interrupted/" in path:
+            sent.append(path)
+            return "broken" if len(set(sent)) > 3 else None
+        return None
+
+    store.misbehave = stops
+    with pytest.raises(UnreachableInputError, match="A store could not be reached"):
+        push(finished, where)
+    store.misbehave = lambda method, path: None
+    with pytest.raises(ArtifactError, match="No finished EpisodeSet is published here"):
+        pull(where, tmp_path / "back")
+    pushed = push(finished, where)
+    assert pushed.moved_files == pushed.files - 3
+    pull(where, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(finished)
+
+
+def test_a_changed_object_is_noticed(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
+    store.upload(tmp_path / "nothing", "x")
+    where = parse_location(f"s3://{BUCKET}/changed")
+    push(finished, str(where))
+    (where / "index.parquet").write_bytes(b"other")
+    with pytest.raises(ArtifactError, match="A published file is not that of the set"):
+        pull(str(where), tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+def test_a_list_cannot_write_outside(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
+    store.upload(tmp_path / "nothing", "x")
+    where = parse_location(f"s3://{BUCKET}/outside")
+    push(finished, str(where))
+    content = json.loads((where / FILE_LIST).read_text())
+    content["files"][0]["path"] = "../../escaped.txt"
+    (where / FILE_LIST).write_text(json.dumps(content))
+    with pytest.raises(RejectedInputError, match="Path leads outside of the dataset folder"):
+        pull(str(where), tmp_path / "back")
+    assert not (tmp_path / "escaped.txt").exists()
+
+
+def test_other_peoples_files_are_left_alone(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "thesis.txt").write_text("keep")
+    where = store.upload(tmp_path / "notes", "others")
+    with pytest.raises(ArtifactError, match="The location holds files that are not of this set"):
+        push(finished, where)
+    assert (parse_location(where) / "thesis.txt").read_text() == "keep"

@@ -1,0 +1,201 @@
+"""The same set and the same index, whatever did the work, in whatever pieces, and however often it was killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tasks.shard_mapper import shard_mapper
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_index import read_index, read_quarantine
+from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.scale.mapping import SerialMapper
+from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.shard_manifest import read_merged_manifest
+from worldline_core.store.digest import digest_folder
+
+pytestmark = pytest.mark.usefixtures("prefect_server")
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory, make_sample: Callable[..., tuple]) -> Path:
+    """Two sources: an episode with a value that is no number, one whose id the other has as well, one that is a copy."""
+    root = tmp_path_factory.mktemp("recordings")
+    for name, numbers in (("first", range(COUNT - 4)), ("second", range(COUNT - 5, COUNT - 1))):
+        with EpisodeSetWriter(root / name, video_crf=8) as writer:
+            for number in numbers:
+                episode, frames, masks = make_sample(number, num_frames=24)
+                if number == 2:
+                    episode.state[3, 1] = np.nan
+                writer.add(episode, frames, masks)
+            if name == "second":
+                writer.add(*make_sample(3, num_frames=24, episode_id="a-copy"))
+    return root
+
+
+def config(recordings: Path) -> CurateConfig:
+    sources = [{"kind": "episode_set", "path": str(recordings / name)} for name in ("first", "second")]
+    return CurateConfig.model_validate({"sources": sources, "image_size": (16, 24), "fps": 8})
+
+
+def both_digests(recordings: Path, output: Path, mapper: Any) -> tuple[str, str]:
+    """Of the curated set and of its filtered index."""
+    curate(config(recordings), {}, output / "set", mapper)
+    strict = FilterConfig.model_validate({"min_segment_frames": 2})
+    filter_episodes(strict, {"episodes": output / "set"}, output / "index", mapper)
+    return digest_folder(output / "set"), digest_folder(output / "index")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    output = tmp_path_factory.mktemp("undisturbed")
+    digests = both_digests(recordings, output, SerialMapper())
+    rows = read_merged_manifest(output / "set")
+    assert len(rows) == COUNT + 1
+    rejected = {row.episode_id: row.reason for row in read_quarantine(output / "set")}
+    assert rejected["episode-002"] == "nan_state"
+    assert rejected["episode-007#source.1"] == "duplicate_id"
+    assert rejected["a-copy"] == "duplicate"
+    assert {row.episode_id: row.reason for row in rows if row.status == "quarantined"} == rejected
+    assert {row.episode_id for row in rows if row.status == "kept"} == {
+        r.episode_id for r in read_index(output / "set")
+    }
+    assert all(row.seconds is not None and row.seconds > 0 for row in rows)
+    assert len(read_merged_manifest(output / "index")) == len(rows) - len(rejected)
+    return digests
+
+
+def runner(kind: str, **settings: Any) -> RunnerConfig:
+    return RunnerConfig.model_validate({"kind": kind, "episodes_per_shard": 3, **settings})
+
+
+@pytest.mark.parametrize("size", [1, 5, 100])
+def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, size: int) -> None:
+    assert both_digests(recordings, tmp_path, SerialMapper(size)) == undisturbed
+
+
+@pytest.mark.parametrize(
+    ("kind", "workers"),
+    [
+        pytest.param("processes", 1, marks=pytest.mark.slow),
+        ("processes", 2),
+        ("dask", 2),
+        pytest.param("ray", 2, marks=pytest.mark.slow),
+    ],
+)
+def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, kind: str, workers: int) -> None:
+    if kind in ("dask", "ray"):
+        pytest.importorskip(f"prefect_{kind}")
+    assert both_digests(recordings, tmp_path, shard_mapper(runner(kind, workers=workers))) == undisturbed
+
+
+def test_in_a_flow_the_shards_are_tasks_with_names(
+    recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
+) -> None:
+    from prefect import flow
+    from prefect.client.orchestration import get_client
+
+    from tasks.artifact_task import ArtifactReference, artifact_task
+    from worldline_core.pipeline.sources import source_inputs
+
+    configured, settings = config(recordings), runner("processes", workers=2, episodes_per_shard=5)
+
+    @flow
+    def one_step() -> ArtifactReference:
+        inputs = source_inputs(configured, tmp_path)
+        return artifact_task("curate")(configured, inputs, store_root=tmp_path / "artifacts", runner=settings)
+
+    assert one_step().digest == undisturbed[0]
+    wanted = {f"curate shard {number}" for number in range(3)} | {"curate"}
+    deadline = time.monotonic() + 60
+    with get_client(sync_client=True) as client:
+        while not wanted <= (found := {run.name for run in client.read_task_runs(limit=200)}):
+            assert time.monotonic() < deadline, found
+            time.sleep(0.5)
+        assert "curate: 3 shards from curate shard 0" in {run.name for run in client.read_flow_runs(limit=200)}
+
+
+def test_killed_in_the_middle_and_resumed_elsewhere(
+    recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
+) -> None:
+    """The whole group of processes is killed when some episodes are done; other shards in this process do the rest."""
+    from prefect.settings import PREFECT_API_URL
+
+    (tmp_path / "config.json").write_text(config(recordings).model_dump_json())
+    settings = runner("processes", workers=2, episodes_per_shard=2, in_flight=2)
+    (tmp_path / "runner.json").write_text(settings.model_dump_json())
+    output = tmp_path / "set"
+    command = [sys.executable, str(Path(__file__).with_name("curate_command.py"))]
+    process = subprocess.Popen(
+        [*command, str(tmp_path / "config.json"), str(tmp_path / "runner.json"), str(output)],
+        env=os.environ | {"PREFECT_API_URL": str(PREFECT_API_URL.value())},
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    parts = output / "run" / "episodes" / "parts"
+    wanted = random.Random(3).randrange(1, 4)  # noqa: S311
+    deadline = time.monotonic() + 240
+    while not (parts.is_dir() and len([p for p in parts.iterdir() if not p.name.startswith(".")]) >= wanted):
+        assert process.poll() is None, "ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not EpisodeSetWriter.finished(output)
+    mapper = SerialMapper(5)
+    assert both_digests(recordings, tmp_path, mapper) == undisturbed
+    rows = read_merged_manifest(output)
+    assert len(rows) == COUNT + 1
+    assert len({row.episode_id for row in rows}) == COUNT + 1
+
+
+def test_an_unforeseen_error_is_a_quarantined_episode(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from worldline_core.data import curate_shard
+
+    whole = curate_shard.check_episode
+
+    def fails_on_one(configured: CurateConfig, loaded: Any) -> None:
+        if loaded.episode.episode_id == "episode-004":
+            raise ZeroDivisionError(f"at {tmp_path}/somewhere/x.py, object at 0x7f00deadbeef")
+        whole(configured, loaded)
+
+    monkeypatch.setattr(curate_shard, "check_episode", fails_on_one)
+    counts = curate(config(recordings), {}, tmp_path / "set")
+    assert counts["reasons"]["crashed"] == 1
+    assert counts["kept"] + counts["quarantined"] == counts["found"] == COUNT + 1
+    (row,) = (row for row in read_quarantine(tmp_path / "set") if row.reason == "crashed")
+    evidence = json.loads(row.evidence)
+    assert evidence["type"] == "ZeroDivisionError"
+    assert evidence["trace"][-1].endswith("fails_on_one")
+    assert any(line.startswith("worldline_core/data/curate_shard.py:") for line in evidence["trace"])
+    assert str(tmp_path) not in row.evidence + row.detail
+    assert "deadbeef" not in row.evidence + row.detail
+
+
+def test_a_full_disk_ends_the_run(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import errno
+
+    def full(*_arguments: object, **_named: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(EpisodeSetWriter, "add", full)
+    with pytest.raises(OSError, match="No space left"):
+        curate(config(recordings), {}, tmp_path / "set")
+    assert EpisodeSetWriter(tmp_path / "set").rejected() == []

@@ -1,0 +1,208 @@
+"""Files of object stores: listed, and copied to this machine when they are read, within a bound.
+
+Locations are `universal_pathlib` paths; credentials and endpoints come from the environment of the store's own library
+(`AWS_*`, or fsspec's `FSSPEC_<PROTOCOL>_<OPTION>`), never from a configuration that ends up in a manifest.
+"""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import os
+import shutil
+import tempfile
+import threading
+from collections import OrderedDict
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, cast
+
+from upath import UPath
+from upath.implementations.local import FilePath
+
+from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
+from worldline_core.scale.transient import with_retries
+from worldline_core.store.digest import digest_value
+
+if TYPE_CHECKING:
+    # UPath has pathlib's interface but is not its subclass; readers of folders need not tell them apart.
+    type AnyPath = Path
+else:
+    AnyPath = Path | UPath
+DEFAULT_CACHE_BYTES = 8 << 30
+_FOLDER_PREFIX = "worldline-remote-"
+
+
+def parse_location(text: str | Path | UPath) -> AnyPath:
+    """A folder of this machine, or a location in an object store when the text is a URL (`s3://bucket/folder`).
+
+    Raises: ConfigError for an unknown protocol.
+    """
+    if isinstance(text, Path):
+        return text
+    try:
+        location = UPath(text) if isinstance(text, str) else text
+    except ValueError as error:
+        raise ConfigError(
+            "Unknown kind of location", expected="a folder, or a URL of a protocol that fsspec knows", got=str(text)
+        ) from error
+    if isinstance(location, Path):
+        return Path(str(location))
+    return Path(location.path) if isinstance(location, FilePath) else cast("AnyPath", location)  # file:// is local
+
+
+def is_remote(path: AnyPath) -> bool:
+    """Whether a path lies in an object store."""
+    return not isinstance(path, Path)
+
+
+def file_system(path: AnyPath) -> Any:
+    """The fsspec file system of a location.
+
+    Raises: UnavailableError where the store's library is not installed.
+    """
+    try:
+        return cast("UPath", path).fs
+    except ImportError as error:
+        raise UnavailableError(
+            f"Locations of the form {cast('UPath', path).protocol}:// need a library that is not installed",
+            where=str(path),
+            got=str(error),
+            next_step="uv sync --extra s3 (for s3://), or install the fsspec library of that store",
+        ) from error
+
+
+def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
+    """Every file below `root`: relative name -> what the store says about it, sorted by name.
+
+    Raises: UnreachableInputError when the store does not answer.
+    """
+    fs = file_system(root)
+    base = fs._strip_protocol(str(root)).rstrip("/")
+    found = with_retries(lambda: fs.find(base, detail=True), str(root))
+    relative = {name.removeprefix(base).lstrip("/"): about for name, about in found.items()}
+    return {name: relative[name] for name in sorted(relative) if name}
+
+
+_CHANGE_MARKS = (
+    "ETag",
+    "etag",
+    "checksum",
+    "md5Hash",
+    "content_md5",
+    "LastModified",
+    "last_modified",
+    "mtime",
+    "created",
+)
+"""What stores say of a file that differs when its content does; the first that one has is taken."""
+
+
+def remote_digest(root: AnyPath) -> str:
+    """Digest of what a store lists below `root`: names, sizes and the mark of each file's content.
+
+    Raises: ArtifactError when nothing is there; UnreachableInputError when the store does not answer.
+    """
+    entries = []
+    for name, about in list_files(root).items():
+        mark = next((str(about[key]) for key in _CHANGE_MARKS if about.get(key) is not None), "")
+        entries.append([name, about.get("size"), mark])
+    if not entries:
+        raise ArtifactError("There is nothing at an input's location", where=str(root), next_step="check the URL")
+    return digest_value(entries)
+
+
+def matching(names: list[str], pattern: str) -> list[str]:
+    """The relative names that `Path.rglob(pattern)` would find."""
+    return [name for name in names if PurePosixPath(name).match(pattern)]
+
+
+class RemoteCache:
+    """Copies of remote files below one folder, the least recently read removed first.
+
+    A copy may be removed as soon as the next file is fetched: open what `fetch` returns at once, and ask again later.
+    A single file larger than the bound is kept alone.
+    """
+
+    def __init__(self, folder: Path, max_bytes: int = DEFAULT_CACHE_BYTES) -> None:
+        self.folder = folder
+        self.max_bytes = max_bytes
+        self.fetched_bytes = 0
+        self._sizes: OrderedDict[Path, int] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def place(self, path: AnyPath) -> Path:
+        """Where the copy of a remote file lies: the store's own names, so that messages can be made portable."""
+        fs = file_system(path)
+        parts = PurePosixPath(fs._strip_protocol(str(path))).parts
+        return self.folder.joinpath(
+            cast("UPath", path).protocol, *(part for part in parts if part not in ("/", "..", "."))
+        )
+
+    def has(self, path: AnyPath) -> bool:
+        """Whether there is a copy."""
+        return self.place(path) in self._sizes
+
+    def fetch(self, path: AnyPath) -> Path:
+        """A copy of the file on this machine.
+
+        Raises: FileNotFoundError; UnreachableInputError when the store does not answer.
+        """
+        with self._lock:
+            copy = self.place(path)
+            if copy in self._sizes:
+                self._sizes.move_to_end(copy)
+                return copy
+            fs = file_system(path)
+            size = with_retries(lambda: self._download(fs, path, copy), str(path))
+            self.fetched_bytes += size
+            self._sizes[copy] = size
+            while sum(self._sizes.values()) > self.max_bytes and len(self._sizes) > 1:
+                oldest, _ = self._sizes.popitem(last=False)
+                oldest.unlink(missing_ok=True)
+            return copy
+
+    def _download(self, fs: Any, path: AnyPath, copy: Path) -> int:
+        about = fs.info(str(path))
+        if about.get("type") != "file":
+            raise FileNotFoundError(errno.ENOENT, "Not a file", str(path))
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        temporary = copy.with_name(f".{copy.name}.tmp")
+        try:
+            fs.get_file(str(path), str(temporary))
+            size = temporary.stat().st_size
+            if about.get("size") is not None and size != about["size"]:
+                fs.invalidate_cache()
+                raise OSError(errno.EIO, f"download ended after {size} of {about['size']} bytes", str(path))
+            temporary.replace(copy)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return size
+
+    def clear(self) -> None:
+        """Remove all copies."""
+        with self._lock:
+            self._sizes.clear()
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+_process_cache: RemoteCache | None = None
+
+
+def process_cache() -> RemoteCache:
+    """The cache of this process, below the machine's folder for temporary files; removed when the process ends."""
+    global _process_cache
+    if _process_cache is None or _process_cache.folder.name != f"{_FOLDER_PREFIX}{os.getpid()}":
+        temporary = Path(tempfile.gettempdir())
+        _remove_leftovers(temporary)
+        _process_cache = RemoteCache(temporary / f"{_FOLDER_PREFIX}{os.getpid()}")
+        _process_cache.clear()  # of an earlier process with this number
+        atexit.register(_process_cache.clear)
+    return _process_cache
+
+
+def _remove_leftovers(temporary: Path) -> None:
+    """Caches of this user's processes that were killed."""
+    for folder in temporary.glob(f"{_FOLDER_PREFIX}*"):
+        number = folder.name.removeprefix(_FOLDER_PREFIX)
+        if number.isdigit() and not Path(f"/proc/{number}").exists() and Path("/proc/self").exists():
+            shutil.rmtree(folder, ignore_errors=True)
