@@ -75,8 +75,8 @@ def test_messages_follow_foxglove_schemas(tmp_path: Path, sample: Make) -> None:
         "/left_wrist/calibration": "foxglove.CameraCalibration",
         "/right_wrist/calibration": "foxglove.CameraCalibration",
         "/tf": "foxglove.FrameTransform",
-        "/joint_states": "worldline.JointStates",
-        "/joint_commands": "worldline.JointStates",
+        "/joint_states": "foxglove.JointStates",
+        "/joint_commands": "foxglove.JointStates",
     }
 
 

@@ -2,7 +2,7 @@
 
 Messages are JSON in Foxglove's schemas, one instant a frame, stamped with the frame's time in nanoseconds:
 `/<view>/image` CompressedImage (png is exact, jpeg is not), `/<view>/calibration` CameraCalibration, `/tf` FrameTransform
-(cameras, tools), `/joint_states` and `/joint_commands` (names and positions). Everything else about an episode is one
+(cameras, tools), `/joint_states` and `/joint_commands` JointStates. Everything else about an episode is one
 metadata record. The same input gives the same bytes.
 """
 
@@ -27,7 +27,9 @@ from worldline_core.store.atomic import atomic_path
 
 ImageFormat = Literal["png", "jpeg"]
 EPISODE_METADATA = "worldline.episode"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
+"""1 wrote joints as names and positions, in a schema of its own."""
 _JPEG_QUALITY = 95
 
 
@@ -173,8 +175,8 @@ def write_episode_mcap(
         for index, time in enumerate(episode.timestamps):
             time_ns = nanoseconds(time)
             for topic, values in (("/joint_states", episode.state), ("/joint_commands", episode.action)):
-                message = {"timestamp": _stamp(time_ns), "name": joint_names, "position": values[index].tolist()}
-                recorder.add(topic, "worldline.JointStates", time_ns, message)
+                joints = [{"name": n, "position": v} for n, v in zip(joint_names, values[index].tolist(), strict=True)]
+                recorder.add(topic, "foxglove.JointStates", time_ns, {"timestamp": _stamp(time_ns), "joints": joints})
             for view, camera in episode.cameras.items():
                 if index == 0:
                     message = _calibration(camera, time_ns, (distortions or {}).get(view))

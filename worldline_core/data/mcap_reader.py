@@ -4,22 +4,54 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.mcap_io import EPISODE_METADATA, FORMAT_VERSION
+from worldline_core.data.images import decode_image
+from worldline_core.data.json_file import parse_json, well_formed
+from worldline_core.data.limits import regular_file
+from worldline_core.data.mcap_chunks import check_chunks
+from worldline_core.data.mcap_io import EPISODE_METADATA, READABLE_VERSIONS
 from worldline_core.data.recorded_poses import camera_pose, rejected_as
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import local_file
 from worldline_core.geometry.distortion import Distortion, distortion_from_ros
 from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
+
+# What the reader raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    EOFError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    IndexError,
+    OSError,
+    struct.error,
+    OverflowError,
+    MemoryError,
+)
+_TEXTS = (
+    "episode_id",
+    "source",
+    "embodiment",
+    "scene",
+    "task_family",
+    "instruction",
+    "outcome",
+    "split",
+    "primary_view",
+    "state_kind",
+)
 
 
 @dataclass(frozen=True)
@@ -37,16 +69,17 @@ def read_episode_id(path: Path) -> str:
 
     Raises: DataError when the file is damaged or holds no episode of this project.
     """
-    return str(_metadata(path)["episode_id"])
+    with well_formed(path, f"metadata {EPISODE_METADATA}"):
+        return str(_metadata(path)["episode_id"])
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "File is missing", where=path)
+    file = regular_file(path, "MCAP file")
+    check_chunks(file, path)
     try:
-        with path.open("rb") as stream:
+        with file.open("rb") as stream:
             found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-    except (McapError, EOFError, ValueError) as error:
+    except _DAMAGE as error:
         raise RejectedInputError("unreadable", "MCAP file is damaged", where=path, got=repr(error)) from error
     if EPISODE_METADATA not in found:
         raise RejectedInputError(
@@ -56,13 +89,13 @@ def _metadata(path: Path) -> dict[str, Any]:
             expected=f"a metadata record {EPISODE_METADATA}",
             got=", ".join(found) or "none",
         )
-    values = {key: json.loads(value) for key, value in found[EPISODE_METADATA].items()}
-    if values.get("format_version") != FORMAT_VERSION:
+    values = {key: parse_json(value, f"{path}, {EPISODE_METADATA}") for key, value in found[EPISODE_METADATA].items()}
+    if values.get("format_version") not in READABLE_VERSIONS:
         raise RejectedInputError(
             "unreadable",
             "MCAP episode has another version",
             where=path,
-            expected=FORMAT_VERSION,
+            expected=" or ".join(map(str, READABLE_VERSIONS)),
             got=values.get("format_version"),
         )
     return values
@@ -76,12 +109,20 @@ def read_episode_mcap(path: Path) -> McapEpisode:
     about = _metadata(path)
     messages: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     try:
-        with path.open("rb") as stream:
+        with local_file(path).open("rb") as stream:
             for _, channel, message in make_reader(stream).iter_messages():
-                messages.setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
-    except (McapError, EOFError, ValueError) as error:
+                content = parse_json(message.data, f"{path}, topic {channel.topic}")
+                messages.setdefault(channel.topic, []).append((message.log_time, content))
+    except _DAMAGE as error:
         raise RejectedInputError("unreadable", "MCAP file is damaged", where=path, got=repr(error)) from error
+    with well_formed(path, "an episode as mcap_io writes it"):
+        return _assembled(about, messages, path)
 
+
+def _assembled(about: dict[str, Any], messages: dict[str, list[tuple[int, dict[str, Any]]]], path: Path) -> McapEpisode:
+    for name in _TEXTS:
+        if not isinstance(about[name], str):
+            raise TypeError(f"{name} is no text")
     num_frames = int(about["num_frames"])
     states = _take(messages, "/joint_states", num_frames, path)
     commands = _take(messages, "/joint_commands", num_frames, path)
@@ -116,8 +157,8 @@ def read_episode_mcap(path: Path) -> McapEpisode:
         outcome=about["outcome"],
         split=about["split"],
         fps=float(about["fps"]),
-        state=np.array([m["position"] for _, m in states], dtype=np.float32),
-        action=np.array([m["position"] for _, m in commands], dtype=np.float32),
+        state=np.array([_positions(m) for _, m in states], dtype=np.float32),
+        action=np.array([_positions(m) for _, m in commands], dtype=np.float32),
         timestamps=times,
         cameras=cameras,
         bank=about["bank"],
@@ -131,6 +172,11 @@ def read_episode_mcap(path: Path) -> McapEpisode:
         conventions=about["conventions"],
     )
     return McapEpisode(episode, frames, masks, distortions)
+
+
+def _positions(message: dict[str, Any]) -> list[float]:
+    """Of foxglove.JointStates, or of version 1's list of positions."""
+    return [joint["position"] for joint in message["joints"]] if "joints" in message else message["position"]
 
 
 def _take(
@@ -151,13 +197,10 @@ def _take(
 
 def _decode(message: dict[str, Any], path: Path) -> np.ndarray:
     try:
-        raw = np.frombuffer(base64.b64decode(message["data"], validate=True), np.uint8)
-    except (binascii.Error, KeyError) as error:
+        raw = base64.b64decode(message["data"], validate=True)
+    except (binascii.Error, KeyError, TypeError, ValueError) as error:
         raise RejectedInputError("unreadable", "Image message is damaged", where=path, got=repr(error)) from error
-    image = cv2.imdecode(raw, cv2.IMREAD_COLOR)
-    if image is None:
-        raise RejectedInputError("unreadable", "Image cannot be decoded", where=path)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return decode_image(raw, path)
 
 
 def _poses(transforms: dict[str, list[dict[str, Any]]], child: str, count: int, path: Path) -> np.ndarray:

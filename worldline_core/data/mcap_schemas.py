@@ -1,4 +1,4 @@
-"""JSON schemas of the MCAP messages: Foxglove's own where it has one, cut to the fields that are written."""
+"""JSON schemas of the MCAP messages: Foxglove's published ones, cut to the fields that are written."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import Any
 _TIME: dict[str, Any] = {
     "type": "object",
     "title": "time",
-    "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0}},
+    "properties": {
+        "sec": {"type": "integer", "minimum": 0},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
 }
 _NUMBER: dict[str, Any] = {"type": "number"}
 _NUMBERS: dict[str, Any] = {"type": "array", "items": _NUMBER}
@@ -15,11 +18,15 @@ _STRING: dict[str, Any] = {"type": "string"}
 
 
 def _object(title: str, **properties: dict[str, Any]) -> dict[str, Any]:
-    return {"title": title, "type": "object", "properties": properties}
+    return {"title": title, "type": "object", "properties": properties, "required": list(properties)}
 
 
-def _record(*names: str) -> dict[str, Any]:
-    return {"type": "object", "properties": dict.fromkeys(names, _NUMBER)}
+def _record(title: str, *names: str) -> dict[str, Any]:
+    return _object(title, **dict.fromkeys(names, _NUMBER))
+
+
+def _matrix(count: int) -> dict[str, Any]:
+    return {**_NUMBERS, "minItems": count, "maxItems": count}
 
 
 SCHEMAS: dict[str, dict[str, Any]] = {
@@ -38,22 +45,21 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         height={"type": "integer", "minimum": 0},
         distortion_model=_STRING,
         D=_NUMBERS,
-        K=_NUMBERS,
-        R=_NUMBERS,
-        P=_NUMBERS,
+        K=_matrix(9),
+        R=_matrix(9),
+        P=_matrix(12),
     ),
     "foxglove.FrameTransform": _object(
         "foxglove.FrameTransform",
         timestamp=_TIME,
         parent_frame_id=_STRING,
         child_frame_id=_STRING,
-        translation=_record("x", "y", "z"),
-        rotation=_record("x", "y", "z", "w"),
+        translation=_record("foxglove.Vector3", "x", "y", "z"),
+        rotation=_record("foxglove.Quaternion", "x", "y", "z", "w"),
     ),
-    "worldline.JointStates": _object(
-        "worldline.JointStates",
+    "foxglove.JointStates": _object(
+        "foxglove.JointStates",
         timestamp=_TIME,
-        name={"type": "array", "items": _STRING},
-        position=_NUMBERS,
+        joints={"type": "array", "items": _object("foxglove.JointState", name=_STRING, position=_NUMBER)},
     ),
 }

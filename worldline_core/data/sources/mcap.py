@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 from worldline_core.data.mcap_reader import read_episode_id, read_episode_mcap
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
 from worldline_core.errors import DataError
 
@@ -21,14 +21,17 @@ class McapSourceConfig(SourceConfigBase):
 class McapSource:
     """Reads a folder of MCAP files; a damaged file is known by its name."""
 
-    def __init__(self, config: McapSourceConfig, root: Path) -> None:
+    def __init__(self, config: McapSourceConfig, root: AnyPath) -> None:
         self._name = config.name
-        self._files: dict[str, Path] = {}
-        for path in [root] if root.is_file() else sorted(root.rglob("*.mcap")):
+        self._root = root
+        self._files: dict[str, AnyPath] = {}
+        for path in [root] if is_file(root) else find_files(root, "*.mcap"):
             try:
+                if path != root:
+                    inside(root, str(relative_name(path, root)))
                 identity = read_episode_id(path)
             except DataError:
-                identity = str(path.relative_to(root)) if path != root else path.name  # `load` says what is wrong
+                identity = str(relative_name(path, root)) if path != root else path.name  # `load` says what is wrong
             if identity in self._files:
                 identity = f"{identity}@{path.name}"
             self._files[identity] = path
@@ -37,7 +40,10 @@ class McapSource:
         return list(self._files)
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        read = read_episode_mcap(self._files[episode_id])
+        path = self._files[episode_id]
+        if path != self._root:
+            inside(self._root, str(relative_name(path, self._root)))
+        read = read_episode_mcap(path)
         if read.episode.episode_id != episode_id:
             raise RejectedInputError(
                 "duplicate_id",

@@ -1,0 +1,276 @@
+"""A small ROS 2 robot whose every signal is a known function of time, recorded as MCAP by the public ROS 2 writer.
+
+Image number n is a PNG whose pixels hold n, so a test can tell which image became which frame. Joints are sines, the
+head camera hangs on a static transform, the wrist camera on a moving one, 0.1 m further along a static one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap_ros2.writer import Writer
+
+HEIGHT, WIDTH = 12, 16
+START_NS = 1_700_000_000_000_000_000
+
+STAMP = "builtin_interfaces/Time stamp\nstring frame_id\n"
+HEADER = "================\nMSG: std_msgs/Header\n" + STAMP
+TIME = "================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+POINT = "================\nMSG: geometry_msgs/{}\nfloat64 x\nfloat64 y\nfloat64 z\n"
+QUATERNION = "================\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
+STAMPED_TRANSFORM = "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
+TRANSFORM = "================\nMSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+DIMENSIONS = (
+    "std_msgs/MultiArrayLayout layout\n{}[] data\n"
+    "================\nMSG: std_msgs/MultiArrayLayout\nstd_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n"
+    "================\nMSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n"
+)
+DEFINITIONS = {
+    "sensor_msgs/msg/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data\n" + HEADER + TIME,
+    "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+    "uint32 step\nuint8[] data\n" + HEADER + TIME,
+    "sensor_msgs/msg/CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n"
+    "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n"
+    + HEADER
+    + "================\nMSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\n"
+    "bool do_rectify\n" + TIME,
+    "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n"
+    "float64[] effort\n" + HEADER + TIME,
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
+    "================\nMSG: geometry_msgs/TransformStamped\n"
+    + STAMPED_TRANSFORM
+    + HEADER
+    + TRANSFORM
+    + POINT.format("Vector3")
+    + QUATERNION
+    + TIME,
+    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
+    + HEADER
+    + "================\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+    + POINT.format("Point")
+    + QUATERNION
+    + TIME,
+    "std_msgs/msg/Float64MultiArray": DIMENSIONS.format("float64"),
+    "std_msgs/msg/Float32": "float32 data\n",
+    "std_msgs/msg/String": "string data\n",
+    "sensor_msgs/msg/Imu": "std_msgs/Header header\n" + HEADER + TIME,
+}
+
+
+def joints(time: np.ndarray | float) -> np.ndarray:
+    """(..., 2) rad."""
+    return np.stack([0.5 * np.sin(np.asarray(time)), 0.3 * np.cos(0.7 * np.asarray(time))], axis=-1)
+
+
+def finger(time: np.ndarray | float) -> np.ndarray:
+    """0.0 closed .. 0.04 m open."""
+    return 0.02 + 0.02 * np.sin(0.5 * np.asarray(time))
+
+
+def wrist(time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position and quaternion xyzw of the wrist in base_link: turns about z, moves along x."""
+    angle = 0.8 * time
+    return np.array([0.3 + 0.05 * time, 0.1, 0.4]), np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])
+
+
+def picture(number: int) -> np.ndarray:
+    """uint8 (HEIGHT, WIDTH, 3) RGB that holds a number."""
+    image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
+    image[:] = (number % 256, number // 256, 77)
+    return image
+
+
+def number_of(frames: np.ndarray) -> np.ndarray:
+    """Which pictures these are."""
+    return frames[:, 0, 0, 0].astype(int) + 256 * frames[:, 0, 0, 1].astype(int)
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One message: what it says, the time it states (None: none), and when the recorder wrote it."""
+
+    topic: str
+    schema: str
+    message: dict[str, Any]
+    time_ns: int | None
+    log_ns: int
+
+
+@dataclass
+class Recording:
+    """Messages in the order in which the file will hold them."""
+
+    sent: list[Sent] = field(default_factory=list)
+
+    def add(
+        self,
+        topic: str,
+        schema: str,
+        seconds: float,
+        message: dict[str, Any],
+        *,
+        headed: bool = True,
+        frame: str = "",
+        delay_s: float = 0.002,
+    ) -> None:
+        time_ns = START_NS + round(seconds * 1e9)
+        if headed:
+            stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+            message = {"header": {"stamp": stamp, "frame_id": frame}, **message}
+        self.sent.append(Sent(topic, schema, message, time_ns if headed else None, time_ns + round(delay_s * 1e9)))
+
+    def change(self, topic: str, change: Callable[[list[Sent]], Iterable[Sent]]) -> None:
+        """Replace the messages of a topic, in place of the first of them."""
+        mine = [sent for sent in self.sent if sent.topic == topic]
+        first = self.sent.index(mine[0])
+        self.sent = [sent for sent in self.sent if sent.topic != topic]
+        self.sent[first:first] = list(change(mine))
+
+    def in_log_order(self) -> Recording:
+        return Recording(sorted(self.sent, key=lambda sent: sent.log_ns))
+
+    def write(self, path: Path, **options: Any) -> Path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as stream:
+            writer = Writer(stream, **{"chunk_size": 4096, **options})
+            schemas = {}
+            for number, sent in enumerate(self.sent):
+                if sent.schema not in schemas:
+                    schemas[sent.schema] = writer.register_msgdef(sent.schema, DEFINITIONS[sent.schema])
+                writer.write_message(sent.topic, schemas[sent.schema], sent.message, sent.log_ns, sent.log_ns, number)
+            writer.finish()
+        return path
+
+
+def shifted(sent: Sent, seconds: float, at_ns: int | None = None) -> Sent:
+    """The message with another header time; the log time stays."""
+    assert sent.time_ns is not None
+    time_ns = (sent.time_ns if at_ns is None else at_ns) + round(seconds * 1e9)
+    stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+    header = {**sent.message["header"], "stamp": stamp}
+    return replace(sent, message={**sent.message, "header": header}, time_ns=time_ns)
+
+
+def transform(parent: str, child: str, seconds: float, place: Any, quaternion: Any) -> dict[str, Any]:
+    time_ns = START_NS + round(seconds * 1e9)
+    return {
+        "header": {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": parent},
+        "child_frame_id": child,
+        "transform": {
+            "translation": dict(zip("xyz", map(float, place), strict=True)),
+            "rotation": dict(zip("xyzw", map(float, quaternion), strict=True)),
+        },
+    }
+
+
+def camera_info(**changes: Any) -> dict[str, Any]:
+    K = [20.0, 0.0, 7.5, 0.0, 21.0, 5.5, 0.0, 0.0, 1.0]
+    roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    return {
+        "height": HEIGHT, "width": WIDTH, "distortion_model": "plumb_bob", "d": [0.0] * 5, "k": K, "r": np.eye(3).reshape(-1).tolist(),
+        "p": [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0], "binning_x": 0, "binning_y": 0, "roi": roi, **changes,
+    }  # fmt: skip
+
+
+def robot(seconds: float = 3.0, *, camera_fps: float = 30.0, jitter_s: float = 0.0, seed: int = 0) -> Recording:
+    """A recording of the robot: two cameras, joints at 100 Hz, commands at 50 Hz, transforms at 50 Hz."""
+    rng = np.random.default_rng(seed)
+    recording = Recording()
+    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, {"transforms": [
+        transform("base_link", "head_optical_frame", 0.0, [1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]),
+        transform("wrist", "wrist_optical_frame", 0.0, [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]),
+    ]}, headed=False)  # fmt: skip
+    for view in ("head", "wrist"):
+        recording.add(
+            f"/{view}/camera_info", "sensor_msgs/msg/CameraInfo", 0.0, camera_info(), frame=f"{view}_optical_frame"
+        )
+        for number in range(int(seconds * camera_fps)):
+            time = number / camera_fps + rng.uniform(-jitter_s, jitter_s)
+            message = {"format": "png", "data": png(picture(number))}
+            topic = f"/{view}/image/compressed"
+            recording.add(
+                topic, "sensor_msgs/msg/CompressedImage", time, message, frame=f"{view}_optical_frame", delay_s=0.02
+            )
+    for number in range(int(seconds * 100)):
+        time = number / 100 + rng.uniform(-jitter_s, jitter_s)
+        message = {
+            "name": ["finger", "b", "a"],
+            "position": [float(finger(time)), *joints(time)[::-1].tolist()],
+            "velocity": [],
+            "effort": [],
+        }
+        recording.add("/joint_states", "sensor_msgs/msg/JointState", time, message)
+    for number in range(int(seconds * 50)):
+        time = number / 50
+        layout = {"dim": [], "data_offset": 0}
+        values = [*(joints(time) + 0.01).tolist(), float(finger(time))]
+        recording.add(
+            "/command", "std_msgs/msg/Float64MultiArray", time, {"layout": layout, "data": values}, headed=False
+        )
+        moving = time + rng.uniform(-jitter_s, jitter_s)
+        message = {"transforms": [transform("base_link", "wrist", moving, *wrist(moving))]}
+        recording.add("/tf", "tf2_msgs/msg/TFMessage", moving, message, headed=False)
+    return recording.in_log_order()
+
+
+def declared(path: Path, **changes: Any) -> dict[str, Any]:
+    """The source's configuration for `robot`."""
+    opening = {"closed": 0.0, "open": 0.04}
+    return {
+        "kind": "mcap_topics",
+        "path": str(path),
+        "name": "toy",
+        "embodiment": "toy",
+        "fps": 30,
+        "views": {
+            "head": {"image": "/head/image/compressed", "calibration": "/head/camera_info"},
+            "right_wrist": {"image": "/wrist/image/compressed", "calibration": "/wrist/camera_info"},
+        },
+        "arms": [
+            {
+                "name": "right",
+                "state": {
+                    "joints": {"topic": "/joint_states", "names": ["a", "b"]},
+                    "gripper": {"topic": "/joint_states", "names": ["finger"], "range": opening},
+                },
+                "command": {
+                    "joints": {"topic": "/command", "columns": [0, 1]},
+                    "gripper": {"topic": "/command", "columns": [2], "range": opening},
+                },
+            }
+        ],
+        **changes,
+    }
+
+
+@dataclass(frozen=True)
+class Toy:
+    """What the tests use of this file (test modules cannot import one another)."""
+
+    robot: Callable[..., Recording] = robot
+    declared: Callable[..., dict[str, Any]] = declared
+    recording: type[Recording] = Recording
+    shifted: Callable[[Sent, float], Sent] = shifted
+    transform: Callable[..., dict[str, Any]] = transform
+    camera_info: Callable[..., dict[str, Any]] = camera_info
+    picture: Callable[[int], np.ndarray] = picture
+    number_of: Callable[[np.ndarray], np.ndarray] = number_of
+    joints: Callable[..., np.ndarray] = joints
+    finger: Callable[..., np.ndarray] = finger
+    wrist: Callable[[float], tuple[np.ndarray, np.ndarray]] = wrist
+    start_ns: int = START_NS
+
+
+@pytest.fixture(scope="session")
+def toy() -> Toy:
+    return Toy()

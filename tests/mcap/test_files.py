@@ -1,0 +1,260 @@
+"""Damaged, foreign and misdeclared files; several episodes in a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as RawWriter
+
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_index import read_quarantine
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
+from worldline_core.data.sources.open import open_source
+
+
+def source(declared: dict[str, Any]) -> EpisodeSource:
+    config = CurateConfig.model_validate({"sources": [declared]}).sources[0]
+    return open_source(config, config.path)
+
+
+def load(declared: dict[str, Any], episode: str = "toy-a") -> LoadedEpisode:
+    return source(declared).load(episode)
+
+
+def rejection(declared: dict[str, Any], episode: str = "toy-a") -> RejectedInputError:
+    with pytest.raises(RejectedInputError, match=r"\S") as caught:
+        load(declared, episode)
+    return caught.value
+
+
+def test_damaged_files_are_quarantined_and_the_others_are_not(tmp_path: Path, toy: Any) -> None:
+    raw = tmp_path / "raw"
+    content = toy.robot().write(raw / "good.mcap").read_bytes()
+    (raw / "cut.mcap").write_bytes(content[: len(content) // 2])
+    (raw / "empty.mcap").write_bytes(b"")
+    (raw / "text.mcap").write_bytes(b"no mcap at all" * 50)
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 0xFF  # inside of a compressed chunk
+    (raw / "flipped.mcap").write_bytes(flipped)
+    with (raw / "silent.mcap").open("wb") as stream:
+        writer = RawWriter(stream)
+        writer.start()
+        writer.finish()
+    declared = toy.declared(raw)
+    counts = curate(CurateConfig.model_validate({"sources": [declared]}), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (6, 1)
+    reasons = {row.episode_id: row.reason for row in read_quarantine(tmp_path / "out")}
+    assert reasons == {
+        "toy-cut": "unreadable",
+        "toy-empty": "unreadable",
+        "toy-text": "unreadable",
+        "toy-flipped": "unreadable",
+        "toy-silent": "missing_topic",
+    }
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+def test_wrong_checksums_are_found(tmp_path: Path, toy: Any, compression: CompressionType) -> None:
+    path = toy.robot().write(tmp_path / "a.mcap", compression=compression)
+    assert load(toy.declared(tmp_path)).episode.num_frames == 90
+    with path.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[3]  # type: ignore[union-attr]
+    content = bytearray(path.read_bytes())
+    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    path.write_bytes(content)
+    assert rejection(toy.declared(tmp_path)).reason == "unreadable"
+
+
+def test_files_without_chunks_or_summary_are_read(tmp_path: Path, toy: Any) -> None:
+    expected = None
+    for options in (
+        {},
+        {"use_chunking": False},
+        {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False},
+    ):
+        path = toy.robot().write(tmp_path / "source.mcap")
+        with path.open("rb") as stream, (tmp_path / "a.mcap").open("wb") as target:
+            writer = RawWriter(target, chunk_size=4096, **options)
+            writer.start()
+            schemas, channels = {}, {}
+            for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+                assert schema is not None
+                if schema.id not in schemas:
+                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                if channel.id not in channels:
+                    channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
+                writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+            writer.finish()
+        path.unlink()
+        loaded = load(toy.declared(tmp_path))
+        expected = loaded if expected is None else expected
+        assert np.array_equal(loaded.episode.state, expected.episode.state)
+        assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
+
+
+def test_missing_topics_are_named_beside_those_there_are(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    declared = toy.declared(tmp_path)
+    declared["views"]["head"]["image"] = "/top/image"
+    error = rejection(declared)
+    assert error.reason == "missing_topic"
+    assert error.expected == "/top/image"
+    assert "/head/image/compressed (sensor_msgs/msg/CompressedImage)" in str(error.got)
+
+
+def test_schemas_that_are_not_understood_or_do_not_fit(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    recording.add("/imu", "sensor_msgs/msg/Imu", 0.1, {})
+    recording.write(tmp_path / "a.mcap")
+    for topic, what in (("/imu", "not understood"), ("/head/camera_info", "another kind")):
+        declared = toy.declared(tmp_path)
+        declared["views"]["head"] = {"image": topic}
+        error = rejection(declared)
+        assert error.reason == "unknown_schema"
+        assert what in error.what
+        assert topic in str(error.where)
+
+
+def test_joints_that_no_message_has(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    declared = toy.declared(tmp_path)
+    joints = declared["arms"][0]["state"]["joints"]
+    joints["names"] = ["a", "elbow"]
+    error = rejection(declared)
+    assert (error.reason, error.expected) == ("missing_column", "position of a, elbow")
+    assert "joints a, b, finger" in str(error.got)
+    joints |= {"names": ["a", "b"], "field": "velocity"}
+    assert "0 velocity values" in str(rejection(declared).got)
+
+
+def test_drivers_that_share_a_topic(tmp_path: Path, toy: Any) -> None:
+    """Arm and gripper publish their own joints on one topic, at their own rates."""
+    recording = toy.robot()
+
+    def split(sent: list[Any]) -> list[Any]:
+        result = []
+        for number, each in enumerate(sent):
+            for first, last in ((0, 1), (1, 3)):
+                if first == 1 or number % 2 == 0:
+                    part = {
+                        **each.message,
+                        "name": each.message["name"][first:last],
+                        "position": each.message["position"][first:last],
+                    }
+                    result.append(type(each)(each.topic, each.schema, part, each.time_ns, each.log_ns))
+        return result
+
+    recording.change("/joint_states", split)
+    recording.write(tmp_path / "a.mcap")
+    episode = load(toy.declared(tmp_path)).episode
+    time = episode.timestamps
+    assert np.abs(episode.state[:, :2] - toy.joints(time)).max() < 1e-5
+    assert np.abs(episode.state[:, 2] - toy.finger(time) / 0.04).max() < 1e-4
+
+
+def test_frames_that_do_not_hang_together(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path, base_frame="torso"))
+    assert error.reason == "missing_calibration"
+    assert "base_link -> wrist" in str(error.got)
+    recording = toy.robot()
+    twice = toy.transform("wrist", "head_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 1])
+    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.1, {"transforms": [twice]}, headed=False)
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, error.what) == ("invalid_extrinsics", "A frame has two parents")
+    recording = toy.robot()
+    nothing = toy.transform("wrist", "odd", 0.0, [0, 0, 0], [0, 0, 0, 0])
+    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.1, {"transforms": [nothing]}, headed=False)
+    recording.write(tmp_path / "a.mcap")
+    assert "without direction" in rejection(toy.declared(tmp_path)).what
+
+
+def test_a_calibration_that_changes(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    other = toy.camera_info(k=[25.0, 0, 7.5, 0, 25.0, 5.5, 0, 0, 1.0])
+    recording.add("/head/camera_info", "sensor_msgs/msg/CameraInfo", 1.0, other, frame="head_optical_frame")
+    recording.write(tmp_path / "a.mcap")
+    assert rejection(toy.declared(tmp_path)).reason == "changing_calibration"
+
+
+def test_time_ranges_cut_a_long_file(tmp_path: Path, toy: Any) -> None:
+    """The calibration and the static transforms were sent before; images are read around the range only."""
+    toy.robot(6.0).write(tmp_path / "long" / "a.mcap")
+    ranges = [
+        {"name": "first", "start_s": 1.0, "stop_s": 2.0},
+        {"name": "second", "start_s": 4.0, "stop_s": 5.5, "instruction": "wave twice"},
+    ]
+    declared = toy.declared(tmp_path, episodes={"by": "ranges", "ranges": ranges}, instruction="wave")
+    opened = source(declared)
+    assert opened.episode_ids() == ["toy-long/a-first", "toy-long/a-second"]
+    for name, begin, count, text in (("first", 1.0, 30, "wave"), ("second", 4.0, 45, "wave twice")):
+        loaded = opened.load(f"toy-long/a-{name}")
+        episode = loaded.episode
+        numbers = toy.number_of(loaded.frames("head"))
+        assert abs(episode.num_frames - count) <= 1
+        assert np.array_equal(numbers, numbers[0] + np.arange(episode.num_frames))
+        assert abs(numbers[0] / 30 - begin) < 0.04
+        assert np.abs(episode.state[:, :2] - toy.joints(numbers[0] / 30 + episode.timestamps)).max() < 1e-5
+        assert (episode.instruction, episode.scene) == (text, "toy-long/a")
+    with pytest.raises(ValueError, match="ends before it starts"):
+        source(toy.declared(tmp_path, episodes={"by": "ranges", "ranges": [{"name": "x", "start_s": 2, "stop_s": 1}]}))
+
+
+def test_markers_bound_episodes(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot(8.0)
+    texts = {
+        0.5: "start: pick the cup", 1.5: "operator coughs", 2.5: "stop: success",
+        3.0: "start", 4.0: "start: put it down", 5.5: "stop: failure", 6.0: "stop", 7.0: "start",
+    }  # fmt: skip
+    for time, text in texts.items():
+        recording.add("/episode", "std_msgs/msg/String", time, {"data": text}, headed=False, delay_s=0.002)
+    recording.in_log_order().write(tmp_path / "raw" / "a.mcap")
+    declared = toy.declared(tmp_path / "raw", episodes={"by": "markers", "topic": "/episode"})
+    counts = curate(CurateConfig.model_validate({"sources": [declared]}), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (5, 2, {"missing_marker": 3})
+    opened = source(declared)
+    first, second = (opened.load(f"toy-a-000{number}").episode for number in (0, 2))
+    assert (first.instruction, first.outcome, second.instruction, second.outcome) == (
+        "pick the cup",
+        "success",
+        "put it down",
+        "failure",
+    )
+    assert first.num_frames == pytest.approx(60, abs=1)
+    assert second.num_frames == pytest.approx(45, abs=1)
+    for episode in ("toy-a-0001", "toy-a-0003", "toy-a-0004"):
+        assert rejection(declared, episode).reason == "missing_marker"
+    elsewhere = toy.declared(tmp_path / "raw", episodes={"by": "markers", "topic": "/marks"})
+    assert source(elsewhere).episode_ids() == ["toy-a"]
+    assert rejection(elsewhere).reason == "missing_topic"
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path: Path, toy: Any) -> None:
+    toy.robot(1.0).write(tmp_path / "elsewhere" / "a.mcap")
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "a.mcap").symlink_to(tmp_path / "elsewhere" / "a.mcap")
+    assert rejection(toy.declared(tmp_path / "raw")).reason == "path_traversal"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fps": 0}, "greater than 0"),
+        ({"arms": []}, "at least 1 item"),
+        ({"primary_view": "top"}, "primary_view top is none of head, right_wrist"),
+        ({"rate": 30}, "Extra inputs are not permitted"),
+        ({"transforms": ["/joint_states"]}, "declared both as readings and as transforms"),
+        ({"episodes": {"by": "markers", "topic": "/x", "start": "("}}, "is no regular expression"),
+    ],
+)
+def test_the_configuration_is_strict(tmp_path: Path, toy: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        source(toy.declared(tmp_path, **changes))

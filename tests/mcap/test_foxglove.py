@@ -1,0 +1,295 @@
+"""Foxglove's schemas: protobuf with descriptors built here by hand after the published .proto files, video, and JSON."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, timestamp_pb2
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap_protobuf.writer import Writer
+
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.mcap_io import write_episode_mcap
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import LoadedEpisode
+from worldline_core.data.sources.open import open_source
+
+Field = descriptor_pb2.FieldDescriptorProto
+TIMESTAMP = ".google.protobuf.Timestamp"
+# Field numbers and types as in Foxglove's published .proto files.
+MESSAGES: dict[str, list[tuple[str, int, int, str | None, bool]]] = {
+    "Vector3": [("x", 1, Field.TYPE_DOUBLE, None, False), ("y", 2, Field.TYPE_DOUBLE, None, False), ("z", 3, Field.TYPE_DOUBLE, None, False)],
+    "Quaternion": [(axis, number, Field.TYPE_DOUBLE, None, False) for number, axis in enumerate("xyzw", 1)],
+    "Pose": [("position", 1, Field.TYPE_MESSAGE, ".foxglove.Vector3", False), ("orientation", 2, Field.TYPE_MESSAGE, ".foxglove.Quaternion", False)],
+    "PoseInFrame": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 2, Field.TYPE_STRING, None, False), ("pose", 3, Field.TYPE_MESSAGE, ".foxglove.Pose", False)],
+    "FrameTransform": [
+        ("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("parent_frame_id", 2, Field.TYPE_STRING, None, False),
+        ("child_frame_id", 3, Field.TYPE_STRING, None, False), ("translation", 4, Field.TYPE_MESSAGE, ".foxglove.Vector3", False),
+        ("rotation", 5, Field.TYPE_MESSAGE, ".foxglove.Quaternion", False),
+    ],
+    "FrameTransforms": [("transforms", 1, Field.TYPE_MESSAGE, ".foxglove.FrameTransform", True)],
+    "CompressedImage": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 4, Field.TYPE_STRING, None, False), ("data", 2, Field.TYPE_BYTES, None, False), ("format", 3, Field.TYPE_STRING, None, False)],
+    "CompressedVideo": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 2, Field.TYPE_STRING, None, False), ("data", 3, Field.TYPE_BYTES, None, False), ("format", 4, Field.TYPE_STRING, None, False)],
+    "CameraCalibration": [
+        ("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 9, Field.TYPE_STRING, None, False), ("width", 2, Field.TYPE_FIXED32, None, False),
+        ("height", 3, Field.TYPE_FIXED32, None, False), ("distortion_model", 4, Field.TYPE_STRING, None, False),
+        *((name, number, Field.TYPE_DOUBLE, None, True) for number, name in enumerate("DKRP", 5)),
+    ],
+    "JointState": [("name", 1, Field.TYPE_STRING, None, False), *((name, number, Field.TYPE_DOUBLE, "optional", False) for number, name in enumerate(("position", "velocity", "acceleration", "effort"), 2))],
+    "JointStates": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("joints", 2, Field.TYPE_MESSAGE, ".foxglove.JointState", True)],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def foxglove() -> dict[str, Any]:
+    """Message classes by name."""
+    pool = DescriptorPool()
+    pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
+    file = descriptor_pb2.FileDescriptorProto(
+        name="foxglove/all.proto", package="foxglove", syntax="proto3", dependency=["google/protobuf/timestamp.proto"]
+    )
+    for name, fields in MESSAGES.items():
+        message = file.message_type.add(name=name)
+        for field, number, kind, of, repeated in fields:
+            added = message.field.add(
+                name=field, number=number, type=kind, label=Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
+            )
+            if of == "optional":
+                added.proto3_optional, added.oneof_index = True, len(message.oneof_decl)
+                message.oneof_decl.add(name=f"_{field}")
+            elif of is not None:
+                added.type_name = of
+    pool.AddSerializedFile(file.SerializeToString())
+    return {name: GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}")) for name in MESSAGES}
+
+
+def coloured(number: int) -> np.ndarray:
+    """(48, 64, 3): grey steps that survive lossy coding."""
+    return np.full((48, 64, 3), 20 + 3 * number, np.uint8)
+
+
+def annex_b(
+    count: int, *, codec: str = "libx264", keys_every: int = 15, options: dict[str, str] | None = None
+) -> list[bytes]:
+    """One message a frame, without B-frames, as Foxglove wants it."""
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt = 64, 48, "yuv420p"
+    encoder.framerate, encoder.time_base = 30, Fraction(1, 30)
+    encoder.options = {"bf": "0", "g": str(keys_every), "crf": "10", "tune": "zerolatency", **(options or {})}
+    packets: list[bytes] = []
+    for number in range(count):
+        frame = av.VideoFrame.from_ndarray(coloured(number), format="rgb24").reformat(format="yuv420p")
+        frame.pts = number
+        packets += [bytes(packet) for packet in encoder.encode(frame)]
+    return packets + [bytes(packet) for packet in encoder.encode(None)]
+
+
+def write(
+    path: Path,
+    toy: Any,
+    foxglove: dict[str, Any],
+    packets: list[bytes] | None,
+    *,
+    leave_out: tuple[int, ...] = (),
+    format_name: str = "h264",
+) -> None:
+    """Two seconds: a head camera (PNG or video), joints with an unset velocity, a moving head, a tool pose."""
+
+    def at(seconds: float) -> tuple[int, Any]:
+        time_ns = toy.start_ns + round(seconds * 1e9)
+        return time_ns, timestamp_pb2.Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString()
+
+    def stamped(name: str, seconds: float, **values: Any) -> Any:
+        message = foxglove[name](**values)
+        message.timestamp.ParseFromString(at(seconds)[1])
+        return message
+
+    def pose_of(seconds: float) -> dict[str, Any]:
+        place, quaternion = toy.wrist(seconds)
+        return dict(zip("xyz", place, strict=True)), dict(zip("xyzw", quaternion, strict=True))
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sent: list[tuple[float, str, Any]] = []
+    K = [80.0, 0, 31.5, 0, 80.0, 23.5, 0, 0, 1]
+    sent.append(
+        (
+            0.0,
+            "/calibration",
+            stamped("CameraCalibration", 0.0, frame_id="camera", width=64, height=48, K=K, distortion_model="", D=[]),
+        )
+    )
+    for number in range(60):
+        if number in leave_out:
+            continue
+        if packets is None:
+            data = {"data": png(coloured(number)), "format": "png"}
+            message = stamped("CompressedImage", number / 30, frame_id="camera", **data)
+        else:
+            message = stamped(
+                "CompressedVideo", number / 30, frame_id="camera", data=packets[number], format=format_name
+            )
+        sent.append((number / 30, "/image", message))
+    for number in range(200):
+        time = number / 100
+        joints = [{"name": name, "position": value} for name, value in zip("ab", toy.joints(time), strict=True)]
+        joints.append({"name": "finger", "position": float(toy.finger(time))})
+        sent.append((time, "/joints", stamped("JointStates", time, joints=joints)))
+    for number in range(100):
+        time = number / 50
+        translation, rotation = pose_of(time)
+        moving = stamped(
+            "FrameTransform",
+            time,
+            parent_frame_id="base_link",
+            child_frame_id="camera",
+            translation=translation,
+            rotation=rotation,
+        )
+        sent.append((time, "/tf", foxglove["FrameTransforms"](transforms=[moving])))
+        tool = {"position": translation, "orientation": rotation}
+        sent.append((time, "/tool", stamped("PoseInFrame", time, frame_id="base_link", pose=tool)))
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        for seconds, topic, message in sorted(sent, key=lambda each: each[0]):
+            writer.write_message(topic, message, at(seconds)[0] + 10**6, at(seconds)[0])
+        writer.finish()
+
+
+def png(image: np.ndarray) -> bytes:
+    import cv2
+
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def declared(path: Path, **changes: Any) -> dict[str, Any]:
+    opening = {"closed": 0.0, "open": 0.04}
+    state = {
+        "joints": {"topic": "/joints", "names": ["a", "b"]},
+        "gripper": {"topic": "/joints", "names": ["finger"], "range": opening},
+    }
+    return {
+        "kind": "mcap_topics", "path": str(path), "name": "toy", "embodiment": "toy", "fps": 30,
+        "views": {"head": {"image": "/image", "calibration": "/calibration"}},
+        "arms": [{"name": "right", "state": state, "tool_pose": "/tool"}], "without_commands": "repeat_state", **changes,
+    }  # fmt: skip
+
+
+def load(source: dict[str, Any], episode: str = "toy-a") -> LoadedEpisode:
+    config = CurateConfig.model_validate({"sources": [source]}).sources[0]
+    return open_source(config, config.path).load(episode)
+
+
+def test_protobuf_messages_come_back(tmp_path: Path, toy: Any, foxglove: dict[str, Any]) -> None:
+    write(tmp_path / "a.mcap", toy, foxglove, None)
+    loaded = load(declared(tmp_path))
+    episode = loaded.episode
+    assert np.array_equal(
+        loaded.frames("head"), np.stack([coloured(number) for number in range(60)])[: episode.num_frames]
+    )
+    assert np.abs(episode.state[:, :2] - toy.joints(episode.timestamps)).max() < 1e-5
+    assert np.array_equal(episode.cameras["head"].K, [[80, 0, 31.5], [0, 80, 23.5], [0, 0, 1]])
+    assert episode.cameras["head"].moving
+    assert episode.T_base_ee is not None
+    assert np.abs(episode.T_base_ee[:, 0] - episode.cameras["head"].T_base_camera).max() < 1e-9
+    velocity = declared(tmp_path)
+    velocity["arms"][0]["state"]["joints"]["field"] = "velocity"  # not set in any message
+    assert np.isnan(load(velocity).episode.state[:, :2]).all()
+
+
+@pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
+def test_video_is_decoded_frame_by_frame(
+    tmp_path: Path, toy: Any, foxglove: dict[str, Any], codec: str, name: str
+) -> None:
+    packets = annex_b(
+        60, codec=codec, options={"x265-params": "log-level=none:bframes=0:keyint=15"} if name == "h265" else {}
+    )
+    assert len(packets) == 60
+    write(tmp_path / "a.mcap", toy, foxglove, packets, format_name=name)
+    loaded = load(declared(tmp_path))
+    frames = loaded.frames("head").astype(int)
+    assert np.abs(frames.mean(axis=(1, 2, 3)) - (20 + 3 * np.arange(len(frames)))).max() < 1.5
+    ranges = {"by": "ranges", "ranges": [{"name": "late", "start_s": 1.3, "stop_s": 1.8}]}
+    late = load(declared(tmp_path, episodes=ranges), "toy-a-late")
+    begin = round(float((late.frames("head")[0].mean() - 20) / 3))
+    assert begin in (39, 40)  # not a key frame: decoding began at an earlier one
+    assert (
+        np.abs(late.frames("head").mean(axis=(1, 2, 3)) - (20 + 3 * (begin + np.arange(late.episode.num_frames)))).max()
+        < 1.5
+    )
+
+
+def test_a_lost_video_message_is_not_concealed(tmp_path: Path, toy: Any, foxglove: dict[str, Any]) -> None:
+    packets = annex_b(60)
+    write(tmp_path / "a.mcap", toy, foxglove, packets, leave_out=(20,))
+    with pytest.raises(RejectedInputError, match="depend on a message that is missing") as caught:
+        load(declared(tmp_path))
+    assert caught.value.reason == "truncated_video"
+    assert caught.value.evidence["frames"] in (9, 10)  # key frames are 0, 15, 30, 45; frame 20 shows image 19 or 21
+    write(tmp_path / "a.mcap", toy, foxglove, packets, leave_out=(30,))  # a key frame: spoiled up to the next one
+    with pytest.raises(RejectedInputError, match="depend on a message that is missing") as caught:
+        load(declared(tmp_path))
+    assert caught.value.evidence["frames"] in (14, 15)
+    write(
+        tmp_path / "a.mcap", toy, foxglove, packets, leave_out=(29,)
+    )  # the last one before a key frame: nothing depends on it
+    assert load(declared(tmp_path)).frames("head").mean(axis=(1, 2, 3))[30] == pytest.approx(20 + 90, abs=1.5)
+
+
+def test_video_that_does_not_decode_is_refused(tmp_path: Path, toy: Any, foxglove: dict[str, Any]) -> None:
+    packets = annex_b(60)
+    write(
+        tmp_path / "a.mcap",
+        toy,
+        foxglove,
+        [packet if i != 20 else b"\x00\x00\x01\x09" for i, packet in enumerate(packets)],
+    )
+    with pytest.raises(RejectedInputError, match=r"Video (frames are missing or damaged|cannot be decoded)") as caught:
+        load(declared(tmp_path)).frames("head")
+    assert caught.value.reason == "truncated_video"
+    write(tmp_path / "b.mcap", toy, foxglove, packets, format_name="vp9")
+    with pytest.raises(RejectedInputError, match=r"(?s)codec is not supported.*h264 or h265.*vp9"):
+        load(declared(tmp_path), "toy-b").frames("head")
+    no_keys = [packet for packet in packets[1:15] for _ in range(5)]
+    write(tmp_path / "c.mcap", toy, foxglove, no_keys[:60])
+    with pytest.raises(RejectedInputError, match="No key frame comes before"):
+        load(declared(tmp_path), "toy-c").frames("head")
+
+
+def test_the_projects_own_export_is_read_through_its_topics(tmp_path: Path, toy: Any) -> None:
+    """JSON in Foxglove's schemas: the same recording as any other tool would see it."""
+    from worldline_core.data.episode import CameraTrack, Episode
+
+    count = 20
+    time = np.arange(count) / 10
+    state = np.concatenate([toy.joints(time), toy.finger(time)[:, None] / 0.04], axis=1).astype(np.float32)
+    K = np.array([[20.0, 0, 7.5], [0, 21.0, 5.5], [0, 0, 1]])
+    cameras = {"head": CameraTrack("head", K, np.eye(4)[None], 16, 12)}
+    episode = Episode(
+        episode_id="e", source="s", embodiment="toy", scene="x", task_family="lift", instruction="lift", outcome="success",
+        split="test", fps=10.0, state=state, action=state + np.float32(0.5), timestamps=time, cameras=cameras,
+        state_names=("right/a", "right/b", "right/gripper"),
+    )  # fmt: skip
+    frames = {"head": np.stack([toy.picture(number) for number in range(count)])}
+    write_episode_mcap(tmp_path / "a.mcap", episode, frames)
+    unit = {"closed": 0.0, "open": 1.0}
+
+    def readings(topic: str) -> dict[str, Any]:
+        return {
+            "joints": {"topic": topic, "names": ["right/a", "right/b"]},
+            "gripper": {"topic": topic, "names": ["right/gripper"], "range": unit},
+        }
+
+    source = declared(
+        tmp_path, fps=10, base_frame="base", views={"head": {"image": "/head/image", "calibration": "/head/calibration"}},
+        arms=[{"name": "right", "state": readings("/joint_states"), "command": readings("/joint_commands")}],
+    )  # fmt: skip
+    loaded = load(source)
+    assert np.array_equal(loaded.episode.state, state)
+    assert np.array_equal(loaded.frames("head"), frames["head"])
+    assert np.array_equal(loaded.episode.cameras["head"].K, K)

@@ -1,0 +1,352 @@
+"""ROS 2 recordings: known functions of time come back at the instants, with the errors that resampling really makes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.sources.base import LoadedEpisode
+from worldline_core.data.sources.open import open_source
+from worldline_core.errors import DataError
+
+
+def load(declared: dict[str, Any], episode: str = "toy-a") -> LoadedEpisode:
+    config = CurateConfig.model_validate({"sources": [declared]}).sources[0]
+    return open_source(config, config.path).load(episode)
+
+
+def rejection(declared: dict[str, Any], episode: str = "toy-a") -> RejectedInputError:
+    with pytest.raises(RejectedInputError, match=r"\S") as caught:
+        loaded = load(declared, episode)
+        for view in loaded.views:
+            loaded.frames(view)
+    return caught.value
+
+
+def test_known_functions_of_time_come_back(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    episode = loaded.episode
+    time = episode.timestamps
+    assert np.allclose(time, np.arange(90) / 30, atol=1e-8)
+    # Linear between readings 10 ms (state) and 20 ms (command) apart: h^2 / 8 times the second derivative.
+    assert np.abs(episode.state[:, :2] - toy.joints(time)).max() < 0.01**2 / 8 * 0.5 + 1e-7
+    assert np.abs(episode.action[:, :2] - toy.joints(time) - 0.01).max() < 0.02**2 / 8 * 0.5 + 1e-5
+    assert np.abs(episode.state[:, 2] - toy.finger(time) / 0.04).max() < 1e-5
+    assert episode.state_names == ("right/a", "right/b", "right/gripper")
+    for view in ("head", "right_wrist"):
+        assert np.array_equal(toy.number_of(loaded.frames(view)), np.arange(90))
+    head, wrist = episode.cameras["head"], episode.cameras["right_wrist"]
+    assert not head.moving
+    assert np.allclose(head.T_base_camera[0], [[1, 0, 0, 1], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+    for i in (0, 17, 89):
+        place, (_, _, sine, cosine) = toy.wrist(time[i])
+        angle = 2 * np.arctan2(sine, cosine)
+        expected = np.eye(4)
+        expected[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        expected[:3, 3] = place + np.array([0, 0, 0.1])
+        assert np.abs(wrist.T_base_camera[i] - expected).max() < 1e-6  # place and angle are linear: nothing is lost
+    assert np.array_equal(head.K, [[20, 0, 7.5], [0, 21, 5.5], [0, 0, 1]])
+
+
+def test_the_error_of_resampling_is_measured(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot(jitter_s=0.004, seed=3)
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    notes = loaded.episode.conventions
+    stated = json.loads(str(notes["resampling"]))
+    # Counted again here, from the times that were sent.
+    times = {
+        topic: np.sort([sent.time_ns for sent in recording.sent if sent.topic == topic and sent.time_ns is not None])
+        for topic in ("/head/image/compressed", "/wrist/image/compressed", "/joint_states")
+    }
+    numbers = {view: toy.number_of(loaded.frames(view)) for view in loaded.views}
+    begin = times["/head/image/compressed"][numbers["head"][0]]
+    grid = begin + np.round(np.arange(loaded.episode.num_frames) * 1e9 / 30).astype(np.int64)
+    for view, topic in (("head", "/head/image/compressed"), ("right_wrist", "/wrist/image/compressed")):
+        sent = np.array([s.time_ns for s in recording.sent if s.topic == topic])
+        by_number = np.sort(sent)  # pictures were numbered in order of time; the jitter is less than half a step
+        distance = np.abs(by_number[None] - grid[:, None])
+        assert np.array_equal(numbers[view], distance.argmin(axis=1))
+        assert stated[f"image {view}"]["max_ms"] == pytest.approx(distance.min(axis=1).max() / 1e6, abs=1e-5)
+        assert stated[f"image {view}"]["mean_ms"] == pytest.approx(distance.min(axis=1).mean() / 1e6, abs=1e-5)
+    joint_distance = np.abs(times["/joint_states"][None] - grid[:, None]).min(axis=1) / 1e6
+    assert stated["topic /joint_states"]["max_ms"] == pytest.approx(joint_distance.max(), abs=1e-5)
+    seconds = (grid - toy.start_ns) / 1e9
+    error = np.abs(loaded.episode.state[:, :2] - toy.joints(seconds)).max()
+    assert error < float(notes["interpolation_error_rad"]) + 1e-6
+    assert notes["resampling_max_ms"] == max(each["max_ms"] for each in stated.values())
+
+
+def test_a_set_is_made_of_them(tmp_path: Path, toy: Any) -> None:
+    toy.robot(jitter_s=0.003).write(tmp_path / "raw" / "a.mcap")
+    source = toy.declared(tmp_path / "raw", instruction="wave")
+    counts = curate(CurateConfig.model_validate({"sources": [source], "fps": 15}), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (1, 1)
+    curated = EpisodeSet.open(tmp_path / "out")
+    row = curated.rows[0]
+    assert (row.instruction, row.fps, row.views, row.stage2_ok) == ("wave", 15, ("head", "right_wrist"), True)
+    # The stored video is lossy; the numbers differ by less than a step.
+    frames = curated.frames(0, "head")
+    assert np.all(np.diff(frames[:, 0, 0, 0].astype(int)) >= 1)
+
+
+def test_messages_out_of_order_are_sorted_and_counted(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    for topic in ("/head/image/compressed", "/joint_states"):
+        recording.change(topic, lambda sent: [sent[i ^ 1] if i ^ 1 < len(sent) else sent[i] for i in range(len(sent))])
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
+    assert np.abs(loaded.episode.state[:, :2] - toy.joints(loaded.episode.timestamps)).max() < 1e-5
+    assert loaded.episode.conventions["messages_out_of_order"] == 45 + 150
+    toy.robot().write(tmp_path / "a.mcap")
+    assert load(toy.declared(tmp_path)).episode.conventions["messages_out_of_order"] == 0
+
+
+def test_messages_sent_twice_count_once(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    recording.change("/head/image/compressed", lambda sent: [each for s in sent for each in (s, s)])
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    assert loaded.episode.conventions["messages_repeated"] == 90
+    assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
+
+
+@pytest.mark.parametrize(("topic", "lost"), [("/head/image/compressed", 2), ("/joint_states", 15)])
+def test_a_few_lost_messages_are_counted_and_bridged(tmp_path: Path, toy: Any, topic: str, lost: int) -> None:
+    recording = toy.robot()
+    recording.change(topic, lambda sent: sent[:40] + sent[40 + lost :])
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    assert loaded.episode.conventions["messages_lost"] == lost
+    if topic.endswith("compressed"):
+        assert toy.number_of(loaded.frames("head"))[38:44].tolist() == [38, 39, 39, 42, 42, 43]
+        assert loaded.episode.conventions["repeated_images"] == 2
+
+
+@pytest.mark.parametrize(
+    ("topic", "keep", "what"),
+    [
+        ("/head/image/compressed", lambda sent: sent[:40] + sent[45:], "Images are missing"),
+        ("/joint_states", lambda sent: sent[:100] + sent[125:], "Messages are missing"),
+        ("/command", lambda sent: sent[:50] + sent[70:], "Messages are missing"),
+        ("/tf", lambda sent: sent[:50] + sent[70:], "Messages are missing"),
+        ("/wrist/image/compressed", lambda sent: sent[:40], "Topic ends too early"),
+        ("/joint_states", lambda sent: sent[150:], "Topic begins too late"),
+    ],
+)
+def test_gaps_are_refused(tmp_path: Path, toy: Any, topic: str, keep: Any, what: str) -> None:
+    recording = toy.robot()
+    recording.change(topic, keep)
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, error.what) == ("time_gap", what)
+    assert topic in str(error) or topic == "/tf"
+    gap = float(error.evidence["gap_s"])
+    # 5 images of 33 ms, 25 readings of 10 ms, 20 commands or transforms of 20 ms are missing; 40 of 90 images; 1.5 of 3 s.
+    expected = {"Images are missing": 0.2, "Topic ends too early": 1.66, "Topic begins too late": 1.5}
+    assert gap == pytest.approx(expected.get(what, 0.26 if topic == "/joint_states" else 0.42), abs=0.04)
+
+
+def test_clocks_that_disagree_are_measured_corrected_or_refused(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    topic = "/wrist/image/compressed"
+    recording.change(topic, lambda sent: [toy.shifted(each, 0.5) for each in sent])
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert error.reason == "clock_skew"
+    assert error.evidence["skew_ms"] == pytest.approx(500)  # the head camera's images take 20 ms too
+    repaired = load(toy.declared(tmp_path, time_offsets_ms={topic: -500.0}))
+    assert np.array_equal(toy.number_of(repaired.frames("right_wrist")), np.arange(90))
+    assert repaired.episode.conventions["clock_skew_ms"] == pytest.approx(18)
+    wrong = load(toy.declared(tmp_path, max_clock_skew_ms=600))  # believed: the images are half a second off
+    assert toy.number_of(wrong.frames("right_wrist"))[0] - toy.number_of(wrong.frames("head"))[0] == -15
+    by_log = load(toy.declared(tmp_path, time="log"))
+    assert np.array_equal(toy.number_of(by_log.frames("right_wrist")), toy.number_of(by_log.frames("head")))
+
+
+def test_header_and_log_time_differ_by_what_is_reported(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    by_header, by_log = (load(toy.declared(tmp_path, time=time)).episode for time in ("header", "log"))
+    assert "/head/image/compressed: least 20.000, median 20.000" in str(by_header.conventions["header_to_log_ms"])
+    assert by_header.conventions["timed_by_log"] == "/command"
+    # Images are logged 20 ms late, joints 2 ms: by log time a frame meets joints that are 18 ms younger.
+    younger = toy.joints(by_header.timestamps + 0.018)
+    overlap = min(len(by_log.state), len(younger))
+    assert np.abs(by_log.state[:overlap, :2] - younger[:overlap]).max() < 1e-4
+
+
+def test_a_simulated_clock_is_met_by_topics_without_one(tmp_path: Path, toy: Any) -> None:
+    """Header times count from zero, log times are of the wall: commands have only the latter."""
+    recording = toy.robot()
+    for topic in ("/head/image/compressed", "/wrist/image/compressed", "/joint_states"):
+        recording.change(topic, lambda sent: [toy.shifted(each, -toy.start_ns / 1e9 + 100) for each in sent])
+    no_wrist = toy.declared(tmp_path)
+    del no_wrist["views"]["right_wrist"]["calibration"]
+    recording.write(tmp_path / "a.mcap")
+    loaded = load(no_wrist)
+    time = loaded.episode.timestamps
+    assert np.abs(loaded.episode.action[:, :2] - toy.joints(time) - 0.01).max() < 1e-4
+
+
+def test_a_clock_set_back_is_refused(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot(4.0)
+    recording.change("/joint_states", lambda sent: sent[:300] + [toy.shifted(each, -2.5) for each in sent[300:]])
+    recording.write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path, max_clock_skew_ms=5000))
+    assert (error.reason, error.evidence["message"]) == ("clock_jump", 300)
+    assert error.evidence["jump_s"] == pytest.approx(2.49)
+
+
+def test_missing_header_times_are_not_taken_for_times(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    recording.change("/joint_states", lambda sent: [toy.shifted(each, 0, at_ns=0) for each in sent])
+    recording.write(tmp_path / "a.mcap")
+    with pytest.raises(DataError, match=r"(?s)no header time.*0 in 300 of 300.*time: log"):
+        load(toy.declared(tmp_path))
+
+
+def test_a_slow_camera_is_refused(tmp_path: Path, toy: Any) -> None:
+    toy.robot(camera_fps=15).write(tmp_path / "a.mcap")
+    error = rejection(toy.declared(tmp_path))
+    assert (error.reason, error.evidence["measured_fps"]) == ("wrong_fps", pytest.approx(15))
+    loaded = load(toy.declared(tmp_path, fps=7.5))
+    assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(0, 45, 2))
+
+
+def test_commands_hold_or_are_declared_missing(tmp_path: Path, toy: Any) -> None:
+    toy.robot().write(tmp_path / "a.mcap")
+    declared = toy.declared(tmp_path)
+    arm = declared["arms"][0]
+    for readings in arm["command"].values():
+        readings["resample"] = "hold"
+    held = load(declared).episode
+    last = np.floor(held.timestamps * 50 + 1e-6) / 50
+    assert np.abs(held.action[:, :2] - toy.joints(last) - 0.01).max() < 1e-6
+    del arm["command"]
+    with pytest.raises(ValueError, match="give their topics, or say without_commands"):
+        load(declared)
+    repeated = load({**declared, "without_commands": "repeat_state"}).episode
+    assert np.array_equal(repeated.action, repeated.state)
+    assert str(repeated.conventions["action"]).startswith("repeats the state")
+
+
+def test_degrees_and_tool_poses(tmp_path: Path, toy: Any) -> None:
+    recording = toy.robot()
+    for number in range(150):
+        time = number / 50
+        place, quaternion = toy.wrist(time)
+        pose = {
+            "position": dict(zip("xyz", (place + np.array([0, 0, 0.2])).tolist(), strict=True)),
+            "orientation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+        }
+        recording.add("/tool", "geometry_msgs/msg/PoseStamped", time, {"pose": pose}, frame="base_link")
+    static = toy.transform("wrist", "tool", 0.0, [0.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0])
+    recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, {"transforms": [static]}, headed=False)
+    recording.in_log_order().write(tmp_path / "a.mcap")
+    declared = toy.declared(tmp_path)
+    declared["arms"][0]["state"]["joints"]["unit"] = "deg"
+    by_topic, by_frame = (
+        load({**declared, "arms": [{**declared["arms"][0], **choice}]}).episode
+        for choice in ({"tool_pose": "/tool"}, {"tool_frame": "tool"})
+    )
+    assert by_topic.T_base_ee is not None and by_frame.T_base_ee is not None
+    assert by_topic.T_base_ee.shape == (90, 1, 4, 4)
+    assert np.abs(by_topic.T_base_ee - by_frame.T_base_ee).max() < 1e-9
+    assert by_topic.T_base_ee[30, 0, :3, 3] == pytest.approx([0.3 + 0.05 * 1.0, 0.1, 0.6])
+    assert by_topic.gripper is not None
+    assert np.array_equal(by_topic.gripper[:, 0].astype(np.float32), by_topic.state[:, 2])
+    assert np.abs(np.rad2deg(by_topic.state[:, :2]) - toy.joints(by_topic.timestamps)).max() < 1e-4
+
+
+def test_binning_region_rectification_and_lens(tmp_path: Path, toy: Any) -> None:
+    def with_info(**changes: Any) -> Any:
+        recording = toy.robot()
+        for view in ("head", "wrist"):
+            recording.change(
+                f"/{view}/camera_info",
+                lambda sent: [type(s)(s.topic, s.schema, {**s.message, **changes}, s.time_ns, s.log_ns) for s in sent],
+            )
+        recording.write(tmp_path / "a.mcap")
+        return load(toy.declared(tmp_path))
+
+    region = {"x_offset": 4, "y_offset": 6, "height": 24, "width": 32, "do_rectify": False}
+    binned = with_info(height=48, width=64, binning_x=2, binning_y=2, roi=region).episode.cameras["head"]
+    assert (binned.height, binned.width) == (12, 16)
+    # A point at full-resolution pixel (u, v) lands at ((u - 4 + 0.5) / 2 - 0.5, (v - 6 + 0.5) / 2 - 0.5).
+    assert np.allclose(binned.K, [[10, 0, (7.5 - 4 + 0.5) / 2 - 0.5], [0, 10.5, (5.5 - 6 + 0.5) / 2 - 0.5], [0, 0, 1]])
+    P = [18.0, 0, 7.0, 0, 0, 18.0, 5.0, 0, 0, 0, 1, 0]
+    lens = {"d": [-0.1, 0.01, 0.0, 0.0, 0.0], "p": P}
+    bent = with_info(**lens)
+    assert str(bent.episode.conventions["undistorted"]).startswith("head: radtan [-0.1")
+    toy_declared = toy.declared(tmp_path)
+    for view in toy_declared["views"].values():
+        view["rectified"] = True
+    straight = load(toy_declared).episode
+    assert np.array_equal(straight.cameras["head"].K, [[18, 0, 7], [0, 18, 5], [0, 0, 1]])
+    assert "undistorted" not in straight.conventions
+    with pytest.raises(RejectedInputError, match="Calibration is of another image size"):
+        with_info(height=24, width=32).frames("head")
+
+
+def test_raw_images_of_every_encoding(tmp_path: Path, toy: Any) -> None:
+    expected = toy.picture(7)
+    encodings = {
+        "rgb8": expected,
+        "bgr8": expected[..., ::-1],
+        "rgba8": np.concatenate([expected, expected[..., :1]], axis=-1),
+        "mono8": expected[..., :1],
+    }
+    for name, pixels in encodings.items():
+        recording = toy.robot(0.5)
+        padded = np.pad(pixels.reshape(12, -1), ((0, 0), (0, 5)))  # rows may be longer than the image
+        raw = {
+            "height": 12,
+            "width": 16,
+            "encoding": name,
+            "is_bigendian": 0,
+            "step": padded.shape[1],
+            "data": padded.tobytes(),
+        }
+        topic = "/head/image/compressed"
+
+        def as_raw(sent: list[Any], raw: dict[str, Any] = raw) -> list[Any]:
+            return [
+                type(s)(s.topic, "sensor_msgs/msg/Image", {"header": s.message["header"], **raw}, s.time_ns, s.log_ns)
+                for s in sent
+            ]
+
+        recording.change(topic, as_raw)
+        recording.write(tmp_path / "a.mcap")
+        frames = load(toy.declared(tmp_path)).frames("head")
+        assert np.array_equal(frames[3], np.repeat(expected[..., :1], 3, -1) if name == "mono8" else expected), name
+    raw["encoding"] = "16UC1"
+    recording.change(topic, lambda sent: as_raw(list(sent), raw))
+    recording.write(tmp_path / "a.mcap")
+    with pytest.raises(RejectedInputError, match=r"(?s)encoding is not supported.*rgb8.*16UC1"):
+        load(toy.declared(tmp_path)).frames("head")
+
+
+def test_images_are_read_one_by_one(tmp_path: Path, toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoded lazily and in order: asking for five frames decodes five."""
+    import worldline_core.data.mcap_topics.images as images
+
+    toy.robot().write(tmp_path / "a.mcap")
+    loaded = load(toy.declared(tmp_path))
+    decoded = []
+    original = images.decode_image
+    monkeypatch.setattr(images, "decode_image", lambda *a, **k: decoded.append(1) or original(*a, **k))
+    assert loaded.images is not None
+    frames = loaded.images("head")
+    first = [next(frames) for _ in range(5)]
+    assert len(decoded) == 5
+    assert toy.number_of(np.stack(first)).tolist() == [0, 1, 2, 3, 4]
