@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,7 +16,9 @@ import pytest
 from worldline_core.data.curate import curate
 from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video import encode_video
+from worldline_core.data.video import decode_video, encode_video
+from worldline_core.data.video_clip import VideoClip
+from worldline_core.data.view_recording import RecordedView
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]
@@ -44,6 +48,31 @@ def test_lerobots_own_class_reads_the_same_frames_and_values(
         for view in stored.rows[episode].views:
             pixels = (item[f"observation.images.{view}"].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
             assert np.array_equal(pixels, stored.frames(episode, view, [frame])[0])
+    # Videos copied as they were recorded, with frames stored out of order, one file an episode.
+    shown = {}
+    with EpisodeSetWriter(tmp_path / "copied", fps=8) as writer:
+        for number in range(2):
+            episode, frames, _ = sample(number, num_frames=15)
+            path = tmp_path / f"{number}.mp4"
+            _foreign_video(path, frames["head"])
+            shown[number] = decode_video(path)
+            clip = VideoClip.whole_file(path, 15, 8.0)
+            only_head = replace(episode, cameras={"head": episode.cameras["head"]})
+            writer.add(only_head, {"head": RecordedView(lambda: iter(()), 15, clip)})
+    copied = LeRobotDataset("local/copied", root=tmp_path / "copied/datasets/ur5e_pair", video_backend="pyav")
+    for position in (0, 1, 7, 14, 15, 22, 29):
+        pixels = (copied[position]["observation.images.head"].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+        assert np.array_equal(pixels, shown[position // 15][position % 15])
+
+
+def _foreign_video(path: Path, frames: np.ndarray) -> None:
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=8)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+        stream.options = {"bf": "3", "threads": "1"}
+        for image in frames:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode(None))
 
 
 def v21_dataset(root: Path, lengths: dict[int, int], *, degrees: bool = False) -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
+import pytest
 
 from worldline_core.data.curate import curate
 from worldline_core.data.curate_config import CurateConfig
 from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError
+from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
 
 
 def run(tmp_path: Path, **source: Any) -> tuple[dict[str, Any], EpisodeSet]:
@@ -81,3 +86,98 @@ def test_unitree(tmp_path: Path, shared_data: Path) -> None:
     assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
     assert [row.num_frames for row in curated.rows] == [221, 277]
     assert [row.stage2_reason for row in curated.rows] == ["missing_view", "missing_view"]
+
+
+def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> None:
+    """The other nine episodes all come through, and their joints and poses agree."""
+    from worldline_core.geometry.embodiment import load_embodiment
+    from worldline_core.geometry.kinematics import ArmKinematics
+
+    folder = shared_data / "droid_ctrl_world" / "droid_subset"
+    counts, curated = run(tmp_path, kind="droid_annotation", path=str(folder))
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (9, 9, {})
+    assert {row.fps for row in curated.rows} == {5.0}
+    kinematics = ArmKinematics(load_embodiment("droid_franka"))
+    for i, row in enumerate(curated.rows):
+        episode = curated.episode(i)
+        assert set(row.views) == {"head", "exterior_2", "right_wrist"}
+        assert episode.T_base_ee is not None
+        tools = np.asarray(kinematics.tool_poses(episode.state.astype(np.float64)))
+        assert np.abs(tools[..., :3, 3] - episode.T_base_ee[..., :3, 3]).max() < 2e-3, row.episode_id
+        assert np.abs(tools[..., :3, 2] - episode.T_base_ee[..., :3, 2]).max() < 1e-2, row.episode_id
+
+
+def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
+    root = shared_data / "lerobot_unitree_g1"
+    order = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")
+    arms = [
+        {
+            "name": side,
+            "state": {"joints": {"feature": "observation.state", "columns": [f"k{side.title()}{j}" for j in order]}},
+            "action": {"joints": {"feature": "action", "columns": [f"k{side.title()}{j}" for j in order]}},
+        }
+        for side in ("left", "right")
+    ]
+    counts, curated = run(
+        tmp_path,
+        kind="lerobot_v21",
+        path=str(root),
+        name="unitree",
+        embodiment="unitree_g1_arms",
+        angle_unit="rad",
+        views={"observation.images.cam_high": "head"},
+        arms=arms,
+    )
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (100, 2, {"missing_file": 98})
+    first = curated.episode(0)
+    table = pq.read_table(root / "data/chunk-000/episode_000029.parquet", columns=["observation.state", "action"])
+    raw = np.asarray(table["observation.state"].to_pylist())
+    assert curated.rows[0].episode_id == "unitree-000029"
+    assert np.allclose(first.state, raw[:, :14], atol=1e-6)
+    assert curated.rows[0].instruction == "pick up the yellow bottle on the table"
+    # The commands lead the joints they are given to.
+    assert np.abs(first.action - first.state).mean() < np.abs(first.action - first.state[::-1]).mean()
+
+
+def test_videos_of_droid_as_plain_videos_are_for_evaluation_alone(tmp_path: Path, shared_data: Path) -> None:
+    folder = shared_data / "droid_ctrl_world" / "droid_new_setup" / "videos"
+    counts, curated = run(tmp_path, kind="video_folder", path=str(folder), name="clips", suffixes=[".mp4"])
+    assert counts["found"] == 18
+    assert counts["kept"] + counts["reasons"].get("duplicate", 0) == 18
+    assert {row.stage2_reason for row in curated.rows} == {"missing_actions"}
+    by_scene = {row.scene for row in curated.rows}
+    assert len(by_scene) == 6  # the three cameras of one episode share its scene
+    source = {"kind": "video_folder", "path": str(folder), "name": "droid_videos", "split": "train"}
+    with pytest.raises(ConfigError, match="evaluation only were assigned to training"):
+        curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "second")
+
+
+def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> None:
+    """The sample's own calibration, put into the layout of a calibration file: fingertips land in both pictures."""
+    from worldline_core.data.sources.calibration_file import CameraEntry, calibrated_view
+
+    folder = shared_data / "droid_ctrl_world"
+    recorded = json.loads((folder / "selfcal_droid_new_setup_0003.json").read_text())
+    width, height = recorded["image_size"]
+    record = json.loads((folder / "droid_new_setup/annotation/val/0003.json").read_text())
+    states = np.asarray(record["states"])
+    tips = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6]) @ np.array([0, 0, 0.155, 1.0])
+    for number in (0, 1):
+        camera = recorded[f"camera_{number}"]
+        entry = CameraEntry.model_validate(
+            {"width": width, "height": height, "maps": "camera_to_base", "axes": "opencv", "K": camera["K"], "T": camera["c2w_opencv"]}
+        )  # fmt: skip
+        found = calibrated_view(
+            "head",
+            entry,
+            image_size=(height // 2, width // 2),
+            num_frames=len(states),
+            read_feature=lambda name: np.zeros(0),
+            where="sample",
+        )
+        assert found is not None
+        seen = tips @ np.linalg.inv(found.track.T_base_camera[0]).T
+        pixels = seen[:, :3] @ found.track.K.T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        inside = (seen[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < [width // 2, height // 2]).all(axis=1)
+        assert inside.mean() > 0.9

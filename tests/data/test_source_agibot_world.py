@@ -104,7 +104,7 @@ def test_published_layout_comes_through_curation(tmp_path: Path) -> None:
     row, episode = curated.rows[0], curated.episode(0)
     assert (row.episode_id, row.scene, row.split) == ("agibot-327-648642", "agibot-327", "train")
     assert (row.num_frames, row.fps, row.stage1_ok, row.stage2_ok) == (LENGTH, 30.0, True, True)
-    assert episode.instruction == "Pickup in the supermarket"
+    assert episode.instruction == "pickup in the supermarket"
     assert json.loads(str(episode.conventions["steps"]))[0]["action_text"] == "Grasp the peach"
     assert episode.conventions["waist_lift_m"] == pytest.approx(0.27)
     assert episode.conventions["distortion_not_applied"] == pytest.approx(0.05)
@@ -345,7 +345,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "array linked by a detour": (linked_twice, "path_traversal"),
     "array gathered from another file": (virtual, "path_traversal"),
     "array stored out of the file": (external_storage, "path_traversal"),
-    "array of terabytes": (huge, "unreadable"),
+    "array of terabytes": (huge, "too_large"),
 }
 
 

@@ -79,7 +79,7 @@ def test_published_layout_comes_through_curation(tmp_path: Path) -> None:
     row, episode = curated.rows[0], curated.episode(0)
     assert row.episode_id == "robotwin-beat_block_hammer-demo_clean-data-episode0"
     assert (row.num_frames, row.fps, row.stage2_ok) == (LENGTH, 10.0, True)
-    assert episode.instruction == "Hit the block."
+    assert episode.instruction == "hit the block"
     wave = 0.3 * np.sin(np.arange(LENGTH)[:, None] + np.arange(6)[None])
     assert np.allclose(episode.state[:, [*range(6), *range(7, 13)]], np.hstack([wave, wave + 1]), atol=1e-6)
     assert np.allclose(episode.state[:, [6, 13]], np.linspace(0, 1, LENGTH)[:, None], atol=1e-6)

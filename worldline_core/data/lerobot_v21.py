@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +10,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from worldline_core.data.lerobot_v3 import column_to_numpy, read_json, read_table
+from worldline_core.data.episode_table import EpisodeTable, whole_number
+from worldline_core.data.json_file import read_json_lines
+from worldline_core.data.lerobot_info import read_info
+from worldline_core.data.lerobot_v3 import column_to_numpy
+from worldline_core.data.parquet_file import read_table
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.data.source_paths import fill_template, inside
 from worldline_core.data.video import decode_video, video_size
+from worldline_core.data.video_clip import VideoClip
 from worldline_core.errors import DataError
 
 VERSION = "v2.1"
@@ -28,15 +32,7 @@ class LeRobotV21Dataset:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.info: dict[str, Any] = read_json(root / "meta" / "info.json")
-        version = str(self.info.get("codebase_version"))
-        if version != VERSION:
-            raise DataError("Dataset has another version", where=str(root), expected=VERSION, got=version)
-        missing = [key for key in ("fps", "features", "data_path", "video_path", "chunks_size") if key not in self.info]
-        if missing:
-            raise DataError(
-                "meta/info.json lacks a key", where=str(root), expected=", ".join(missing), got=", ".join(self.info)
-            )
+        self.info = read_info(root, VERSION, ("data_path", "video_path", "chunks_size"))
 
     @property
     def fps(self) -> float:
@@ -51,26 +47,35 @@ class LeRobotV21Dataset:
         return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     @cached_property
-    def episodes(self) -> list[dict[str, Any]]:
-        """Rows of meta/episodes.jsonl by episode_index."""
-        return sorted(_json_lines(self.root / "meta" / "episodes.jsonl"), key=lambda row: row["episode_index"])
+    def episodes(self) -> EpisodeTable:
+        """The rows of meta/episodes.jsonl."""
+        return EpisodeTable.from_json_lines(self.root / "meta" / "episodes.jsonl")
 
     @cached_property
     def tasks(self) -> dict[int, str]:
         """Instruction by task_index."""
-        return {row["task_index"]: row["task"] for row in _json_lines(self.root / "meta" / "tasks.jsonl")}
+        path = self.root / "meta" / "tasks.jsonl"
+        tasks: dict[int, str] = {}
+        for row in read_json_lines(path):
+            if not isinstance(row, dict) or not isinstance(row.get("task_index"), int) or "task" not in row:
+                raise DataError(
+                    "Row of the task list is not understood",
+                    where=str(path),
+                    expected='{"task_index": 0, "task": "..."}',
+                    got=str(row)[:200],
+                )
+            tasks[row["task_index"]] = str(row["task"])
+        return tasks
 
     def row(self, episode_index: int) -> dict[str, Any]:
         """Metadata row of one episode.
 
-        Raises: DataError when the episode is not listed.
+        Raises: DataError when the episode is not listed, or listed twice.
         """
-        for row in self.episodes:
-            if row["episode_index"] == episode_index:
-                return row
-        raise DataError(
-            "No such episode", where=str(self.root), expected="an index in meta/episodes.jsonl", got=episode_index
-        )
+        return self.episodes.row(episode_index)
+
+    def _length(self, episode_index: int) -> int:
+        return whole_number(self.row(episode_index), "length", f"{self.root}, episode {episode_index}")
 
     def _path(self, template: str, episode_index: int, **values: str) -> Path:
         chunk = episode_index // int(self.info["chunks_size"])
@@ -86,7 +91,7 @@ class LeRobotV21Dataset:
         values = read_table(path, [name])[name].combine_chunks()
         if isinstance(values, pa.ChunkedArray):
             values = pa.concat_arrays(values.chunks)
-        length = int(self.row(episode_index)["length"])
+        length = self._length(episode_index)
         if len(values) != length:
             raise RejectedInputError(
                 "length_mismatch",
@@ -103,19 +108,22 @@ class LeRobotV21Dataset:
 
         Raises: DataError when the video is missing, truncated or of another length than listed.
         """
-        path = self._path(str(self.info["video_path"]), episode_index, video_key=key)
-        frames = decode_video(path, int(self.row(episode_index)["length"]))
+        path = self.video_path(episode_index, key)
+        frames = decode_video(path, self._length(episode_index))
         return frames if indices is None else frames[np.asarray(indices, dtype=np.int64)]
+
+    def video_path(self, episode_index: int, key: str) -> Path:
+        """File of one episode's video."""
+        return self._path(str(self.info["video_path"]), episode_index, video_key=key)
+
+    def clip(self, episode_index: int, key: str) -> VideoClip:
+        """One episode's video as it is encoded."""
+        return VideoClip.whole_file(self.video_path(episode_index, key), self._length(episode_index), self.fps)
 
     def video_rate(self, episode_index: int, key: str) -> float:
         """Frames per second that the container states."""
-        return video_size(self._path(str(self.info["video_path"]), episode_index, video_key=key))[2]
+        return video_size(self.video_path(episode_index, key))[2]
 
-
-def _json_lines(path: Path) -> list[dict[str, Any]]:
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "File is missing", where=path)
-    try:
-        return [json.loads(line) for line in path.read_text().splitlines() if line.strip()]
-    except json.JSONDecodeError as error:
-        raise DataError("File is not JSON lines", where=path, got=str(error)) from error
+    def image_size(self, episode_index: int, key: str) -> tuple[int, int]:
+        """(height, width) that the container states."""
+        return video_size(self.video_path(episode_index, key))[:2]

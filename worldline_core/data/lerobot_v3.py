@@ -7,7 +7,7 @@ episode's place is given by from_timestamp and to_timestamp in the episodes tabl
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,11 +16,17 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from worldline_core.data.episode_table import EpisodeTable, whole_number
+from worldline_core.data.file_watch import note_file
+from worldline_core.data.lerobot_info import read_info
+from worldline_core.data.parquet_file import read_table
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import fill_template, inside
+from worldline_core.data.source_paths import fill_template, find_files, inside
 from worldline_core.data.video import decode_segment, video_size
+from worldline_core.data.video_clip import VideoClip
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import atomic_path
 
@@ -30,45 +36,6 @@ VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 IMAGE_PREFIX = "observation.images."
-
-
-def read_json(path: Path) -> Any:
-    """JSON of a file.
-
-    Raises: DataError when it is missing or not JSON.
-    """
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise RejectedInputError("missing_file", "File is missing", where=str(path)) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RejectedInputError("unreadable", "File is not valid JSON", where=str(path), got=str(error)) from error
-
-
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """A Parquet file as a table.
-
-    Raises: DataError when it is missing, damaged, or lacks a wanted column (the message names both).
-    """
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "File is missing", where=str(path))
-    try:
-        file = pq.ParquetFile(path)
-        names = file.schema_arrow.names
-        missing = [column for column in columns or () if column not in names]
-        if missing:
-            raise RejectedInputError(
-                "missing_column",
-                "Parquet file lacks a column",
-                where=str(path),
-                expected=", ".join(missing),
-                got="columns " + ", ".join(names),
-            )
-        return file.read(columns=None if columns is None else list(columns))
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RejectedInputError(
-            "unreadable", "Parquet file cannot be read", where=str(path), got=str(error)
-        ) from error
 
 
 @dataclass(frozen=True)
@@ -87,13 +54,7 @@ class LeRobotV3Dataset:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.info: dict[str, Any] = read_json(root / "meta" / "info.json")
-        version = str(self.info.get("codebase_version"))
-        if version != VERSION:
-            raise DataError("Dataset has another version", where=str(root), expected=VERSION, got=version)
-        for key in ("fps", "features"):
-            if key not in self.info:
-                raise DataError("meta/info.json lacks a key", where=str(root), expected=key, got=", ".join(self.info))
+        self.info = read_info(root, VERSION)
         self._data: dict[Path, pa.Table] = {}
 
     @property
@@ -109,18 +70,13 @@ class LeRobotV3Dataset:
         return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     @cached_property
-    def episodes(self) -> list[dict[str, Any]]:
-        """Rows of meta/episodes without the statistics, by episode_index."""
+    def episodes(self) -> EpisodeTable:
+        """The rows of meta/episodes without the statistics."""
         folder = self.root / "meta" / "episodes"
-        files = sorted(folder.glob("*/*.parquet"))
+        files = find_files(folder, "*/*.parquet")
         if not files:
             raise DataError("Dataset lists no episodes", where=str(folder), expected="chunk-*/file-*.parquet")
-        rows: list[dict[str, Any]] = []
-        for file in files:
-            table = read_table(file)
-            wanted = [name for name in table.column_names if not name.startswith("stats/")]
-            rows += table.select(wanted).to_pylist()
-        return sorted(rows, key=lambda row: row["episode_index"])
+        return EpisodeTable.from_parquet(files, folder)
 
     @cached_property
     def tasks(self) -> dict[int, str]:
@@ -135,36 +91,36 @@ class LeRobotV3Dataset:
                 expected="task",
                 got=", ".join(whole.column_names),
             )
-        return dict(zip(table["task_index"].to_pylist(), whole[label].to_pylist(), strict=True))
+        try:
+            texts = [str(text) for text in whole[label].to_pylist()]
+        except UnicodeDecodeError as error:  # Parquet declares UTF-8 and checks nothing
+            raise DataError(
+                "meta/tasks.parquet holds text that is no UTF-8", where=str(self.root), got=str(error)
+            ) from error
+        return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
 
     def row(self, episode_index: int) -> dict[str, Any]:
         """Metadata row of one episode.
 
         Raises: DataError when the episode is not listed.
         """
-        if not 0 <= episode_index < len(self.episodes):
-            raise DataError(
-                "No such episode",
-                where=str(self.root),
-                expected=f"0..{len(self.episodes) - 1}",
-                got=str(episode_index),
-            )
-        return self.episodes[episode_index]
+        return self.episodes.row(episode_index)
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
         """One data column of an episode: (N,) or (N, D).
 
         Raises: DataError when the column or some rows are missing.
         """
-        row = self.row(episode_index)
+        row, where = self.row(episode_index), f"{self.root}, episode {episode_index}"
         relative = fill_template(
             str(self.info.get("data_path", DATA_PATH)),
-            chunk_index=row["data/chunk_index"],
-            file_index=row["data/file_index"],
+            chunk_index=whole_number(row, "data/chunk_index", where),
+            file_index=whole_number(row, "data/file_index", where),
         )
         path = inside(self.root, relative)
         if path not in self._data:
-            self._data[path] = read_table(path)
+            self._data = {path: read_table(path)}  # one file at a time: episodes are read in the order of files
+        note_file(path)
         table = self._data[path]
         for needed in (name, "index"):
             if needed not in table.column_names:
@@ -175,9 +131,12 @@ class LeRobotV3Dataset:
                     expected=needed,
                     got=", ".join(table.column_names),
                 )
-        offset = row["dataset_from_index"] - int(table["index"][0].as_py()) if len(table) else 0
-        length = row["dataset_to_index"] - row["dataset_from_index"]
-        values = table[name].slice(offset, length).combine_chunks() if offset >= 0 else table[name].slice(0, 0)
+        begin = whole_number(row, "dataset_from_index", where)
+        length = whole_number(row, "dataset_to_index", where) - begin
+        first = table["index"][0].as_py() if len(table) else begin
+        offset = begin - int(first) if isinstance(first, int) else -1
+        inside_file = offset >= 0 and length >= 0
+        values = table[name].slice(offset, length).combine_chunks() if inside_file else table[name].slice(0, 0)
         if len(values) != length:
             raise RejectedInputError(
                 "length_mismatch",
@@ -205,14 +164,33 @@ class LeRobotV3Dataset:
                 expected=key,
                 got=", ".join(self.video_keys),
             )
-        chunk, file, start = (row[name] for name in names)
+        where = f"{self.root}, episode {episode_index}"
+        chunk, file = (whole_number(row, name, where) for name in names[:2])
+        start = row[names[2]]
+        if not isinstance(start, int | float) or not 0 <= start < math.inf:
+            raise RejectedInputError(
+                "unreadable",
+                "Video has no usable place",
+                where=f"{where}, {names[2]}",
+                expected="seconds",
+                got=repr(start),
+            )
         template = str(self.info.get("video_path", VIDEO_PATH))
         path = inside(self.root, fill_template(template, video_key=key, chunk_index=chunk, file_index=file))
         return VideoPlace(path, float(start))
 
+    def clip(self, episode_index: int, key: str) -> VideoClip:
+        """One episode's video as it is encoded, inside of a file that holds several."""
+        place = self.video(episode_index, key)
+        return VideoClip(place.path, int(self.row(episode_index)["length"]), self.fps, from_time=place.from_time)
+
     def video_rate(self, episode_index: int, key: str) -> float:
         """Frames per second that the container states."""
         return video_size(self.video(episode_index, key).path)[2]
+
+    def image_size(self, episode_index: int, key: str) -> tuple[int, int]:
+        """(height, width) that the container states."""
+        return video_size(self.video(episode_index, key).path)[:2]
 
     def frames(self, episode_index: int, key: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """uint8 (len, H, W, 3) frames of one episode.
@@ -220,19 +198,18 @@ class LeRobotV3Dataset:
         Raises: DataError when the video is missing, truncated or too short.
         """
         place = self.video(episode_index, key)
-        length = self.row(episode_index)["length"]
+        length = whole_number(self.row(episode_index), "length", f"{self.root}, episode {episode_index}")
         return decode_segment(place.path, place.from_time, length, self.fps, indices)
 
 
 def column_to_numpy(values: pa.Array, where: str) -> np.ndarray:
     """(N,) or, for lists of equal length, (N, D).
 
-    Raises: DataError for empty rows or rows of different length.
+    Raises: DataError for empty rows, rows of different length, or values that are no numbers.
     """
-    if not (
-        pa.types.is_list(values.type) or pa.types.is_large_list(values.type) or pa.types.is_fixed_size_list(values.type)
-    ):
-        return values.to_numpy(zero_copy_only=False)
+    nested = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    if not any(is_kind(values.type) for is_kind in nested):
+        return _numbers(values, where)
     if values.null_count:
         raise RejectedInputError(
             "nan_state",
@@ -241,15 +218,25 @@ def column_to_numpy(values: pa.Array, where: str) -> np.ndarray:
             expected="a value in each row",
             got=f"{values.null_count} nulls",
         )
-    flat = values.flatten().to_numpy(zero_copy_only=False)
-    if len(values) == 0 or len(flat) % len(values):
+    lengths = pc.min_max(pc.list_value_length(values)).as_py()  # pyright: ignore[reportAttributeAccessIssue]
+    if len(values) == 0 or lengths["min"] != lengths["max"]:
         raise RejectedInputError(
             "length_mismatch",
             "Rows of a data column differ in length",
             where=where,
-            got=f"{len(flat)} values in {len(values)} rows",
+            expected="rows of one length",
+            got=f"{lengths['min']} to {lengths['max']} values",
         )
-    return flat.reshape(len(values), -1)
+    return _numbers(values.flatten(), where).reshape(len(values), -1)
+
+
+def _numbers(values: pa.Array, where: str) -> np.ndarray:
+    numeric = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    if not any(is_kind(values.type) for is_kind in numeric):
+        raise RejectedInputError(
+            "unreadable", "Data column is not numeric", where=where, expected="numbers", got=str(values.type)
+        )
+    return values.to_numpy(zero_copy_only=False)
 
 
 def write_table(path: Path, table: pa.Table, *, rows_per_group: Sequence[int] | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from worldline_core.data.lerobot_v3 import (
     write_table,
 )
 from worldline_core.data.statistics import as_json, image_statistics, vector_statistics
+from worldline_core.data.thumbnail_cache import cache_path
 from worldline_core.data.video import concatenate_videos
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
@@ -98,7 +100,8 @@ def _data_table(parts: Sequence[Part], starts: np.ndarray, task_of: dict[str, in
             "task_index": np.full(length, task_of[part["instruction"]], dtype=np.int64),
         }
         for name, value in values.items():
-            columns.setdefault(name, []).append(value)
+            if value.size:  # an episode without states has no such columns: LeRobot knows no empty feature
+                columns.setdefault(name, []).append(value)
     arrays: dict[str, pa.Array] = {}
     for name, chunks in columns.items():
         joined = np.concatenate(chunks)
@@ -107,19 +110,44 @@ def _data_table(parts: Sequence[Part], starts: np.ndarray, task_of: dict[str, in
     return pa.table(arrays)
 
 
+def _video_files(parts: Sequence[Part], view: str, megabytes: int) -> list[list[Part]]:
+    """Which episodes share a file: those encoded here up to a size, none where the video was copied as it was recorded.
+
+    Copied videos may differ in parameter sets, and have frames stored out of order: joined they could not be found again
+    exactly.
+    """
+    files: list[list[Part]] = []
+    filled, open_to_more = 0, False
+    for part in parts:
+        size = part.video(view).stat().st_size
+        joins = open_to_more and not part.copied(view) and filled + size <= megabytes * 2**20
+        if joins:
+            files[-1].append(part)
+        else:
+            files.append([part])
+        filled = filled + size if joins else size
+        open_to_more = not part.copied(view)
+    return files
+
+
 def _write_videos(root: Path, view: str, parts: Sequence[Part], megabytes: int) -> list[dict[str, Any]]:
     """Join the clips of one view; returns the videos/<key>/* columns of each episode."""
     key = IMAGE_PREFIX + view
-    files = _files_by_size([part.video(view).stat().st_size for part in parts], megabytes)
     rows: list[dict[str, Any]] = []
-    for file in sorted(set(files)):
-        members = [part for part, other in zip(parts, files, strict=True) if other == file]
+    for file, members in enumerate(_video_files(parts, view, megabytes)):
         chunk_index, file_index = file // _CHUNK_SIZE, file % _CHUNK_SIZE
         target = root / VIDEO_PATH.format(video_key=key, chunk_index=chunk_index, file_index=file_index)
         with atomic_path(target) as temporary:
-            concatenate_videos(
-                temporary, [(part.video(view), part["video_frames"]) for part in members], members[0]["fps"]
-            )
+            if members[0].copied(view):
+                _link(members[0].video(view), temporary)
+            else:
+                concatenate_videos(
+                    temporary, [(part.video(view), part["video_frames"]) for part in members], members[0]["fps"]
+                )
+        if members[0].copied(view):
+            thumbnails = cache_path(root.parents[1], target)
+            thumbnails.parent.mkdir(parents=True, exist_ok=True)
+            _link(members[0].thumbnails(view), thumbnails)
         frame = 0
         for part in members:
             rows.append(
@@ -132,6 +160,15 @@ def _write_videos(root: Path, view: str, parts: Sequence[Part], megabytes: int) 
             )
             frame += part["video_frames"]
     return rows
+
+
+def _link(existing: Path, name: Path) -> None:
+    """A second name of a file that is never changed, or a copy where the file system has no links."""
+    name.unlink(missing_ok=True)
+    try:
+        name.hardlink_to(existing)
+    except OSError:
+        shutil.copyfile(existing, name)
 
 
 def _column(table: pa.Table, name: str) -> np.ndarray:
@@ -177,7 +214,7 @@ def _info(parts: Sequence[Part], total_tasks: int, video_megabytes: int, fps: fl
     width = first.arrays["state"].shape[1]
     names = first["state_names"] or [f"state_{index}" for index in range(width)]
     features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": [width], "names": names} for key in ("observation.state", "action")
+        key: {"dtype": "float32", "shape": [width], "names": names} for key in ("observation.state", "action") if width
     }
     for view, (image_height, image_width) in first.image_sizes.items():
         features[IMAGE_PREFIX + view] = {
@@ -187,8 +224,8 @@ def _info(parts: Sequence[Part], total_tasks: int, video_megabytes: int, fps: fl
             "info": {
                 "video.height": image_height,
                 "video.width": image_width,
-                "video.codec": "h264",
-                "video.pix_fmt": first["pixel_format"],
+                "video.codec": first["videos"][view]["codec"],
+                "video.pix_fmt": first["videos"][view]["pixel_format"],
                 "video.fps": int(fps) if fps == int(fps) else fps,
                 "video.channels": 3,
                 "has_audio": False,

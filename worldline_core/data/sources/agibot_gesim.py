@@ -11,17 +11,19 @@ along its +z (0.23 m with the hands of v1, 0.15 m with those of v2).
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from worldline_core.data.conventions import along_tool_z
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.images import read_image
+from worldline_core.data.json_file import read_text
+from worldline_core.data.npy_file import read_npy
 from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
 from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.distortion import Distortion
@@ -60,20 +62,22 @@ class AgibotGesimSourceConfig(ForeignSourceConfig):
 class AgibotGesimSource:
     """Reads `sample_*` and `demo_*` folders anywhere below the root."""
 
-    def __init__(self, config: AgibotGesimSourceConfig, root: Path) -> None:
+    def __init__(self, config: AgibotGesimSourceConfig, root: AnyPath) -> None:
         self._config = config
-        found = sorted(p.parent for name in ("actions.npy", "state_joints_0.npy") for p in root.rglob(name))
-        self._folders = {"-".join(folder.relative_to(root).parts) or root.name: folder for folder in found}
+        self._root = root
+        found = sorted(p.parent for name in ("actions.npy", "state_joints_0.npy") for p in find_files(root, name))
+        self._folders = {"-".join(relative_name(folder, root).parts) or root.name: folder for folder in found}
 
     def episode_ids(self) -> list[str]:
         return sorted(f"{self._config.label}-{key}" for key in self._folders)
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        folder = self._folders[episode_id.removeprefix(f"{self._config.label}-")]
-        is_v2 = (folder / "state_joints_0.npy").is_file()
+        found = self._folders[episode_id.removeprefix(f"{self._config.label}-")]
+        folder = inside_folder(self._root, str(relative_name(found, self._root)))
+        is_v2 = is_file(folder / "state_joints_0.npy")
         return self._load_v2(episode_id, folder) if is_v2 else self._load_v1(episode_id, folder)
 
-    def _common(self, episode_id: str, folder: Path, num_frames: int) -> dict[str, Any]:
+    def _common(self, episode_id: str, folder: AnyPath, num_frames: int) -> dict[str, Any]:
         return {
             "episode_id": episode_id,
             "source": self._config.label,
@@ -86,7 +90,7 @@ class AgibotGesimSource:
             "timestamps": np.arange(num_frames) / self._config.fps,
         }
 
-    def _load_v1(self, episode_id: str, folder: Path) -> LoadedEpisode:
+    def _load_v1(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         config = self._config
         raw = _array(folder / "actions.npy", (None, 16))
         opening, overshoot = config.gripper_v1.opening(raw[:, [7, 15]])
@@ -104,7 +108,7 @@ class AgibotGesimSource:
         cameras: dict[str, CameraTrack] = {}
         recorded: dict[str, CameraPose] = {}
         for view, name in AGIBOT_CAMERAS.items():
-            height, width = _read_png(images[view][0]).shape[:2]
+            height, width = read_image(images[view][0]).shape[:2]
             K = _array(folder / f"intrinsic_{name}.npy", (3, 3)).astype(np.float64)
             track = _array(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)).astype(np.float64)
             recorded[view] = camera_pose(view, track, extrinsics="camera_to_base", axes="opencv", where=folder)
@@ -132,10 +136,10 @@ class AgibotGesimSource:
                 **repair_notes({view: pose.repair for view, pose in recorded.items()}),
             },
         )
-        frames: Callable[[str], np.ndarray] = lambda view: np.stack([_read_png(path) for path in images[view]])  # noqa: E731
+        frames: Callable[[str], np.ndarray] = lambda view: np.stack([read_image(path) for path in images[view]])  # noqa: E731
         return LoadedEpisode(episode, VIEWS, frames, no_masks, config.lenses)
 
-    def _load_v2(self, episode_id: str, folder: Path) -> LoadedEpisode:
+    def _load_v2(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         config = self._config
         joints = _array(folder / "state_joints_0.npy", (None, 20))
         num_frames = len(joints)
@@ -154,7 +158,7 @@ class AgibotGesimSource:
         cameras: dict[str, CameraTrack] = {}
         recorded: dict[str, CameraPose] = {}
         for index, view in enumerate(VIEWS):
-            height, width = _read_png(folder / _IMAGE_V2[view]).shape[:2]
+            height, width = read_image(folder / _IMAGE_V2[view]).shape[:2]
             recorded[view] = camera_pose(view, tracks[index], extrinsics="camera_to_base", axes="opencv", where=folder)
             cameras[view] = CameraTrack.from_pose(view, intrinsics[index], recorded[view], width=width, height=height)
         task = folder / "task.txt"
@@ -162,7 +166,7 @@ class AgibotGesimSource:
         names = [f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")]
         episode = Episode(
             **self._common(episode_id, folder, num_frames),
-            instruction=task.read_text().strip() if task.is_file() else "",
+            instruction=read_text(task).strip() if is_file(task) else "",
             state=state.astype(np.float32),
             action=action.astype(np.float32),
             cameras=cameras,
@@ -179,11 +183,11 @@ class AgibotGesimSource:
                 **repair_notes({view: pose.repair for view, pose in recorded.items()}),
             },
         )
-        first: Callable[[str], np.ndarray] = lambda view: _read_png(folder / _IMAGE_V2[view])[None]  # noqa: E731
+        first: Callable[[str], np.ndarray] = lambda view: read_image(folder / _IMAGE_V2[view])[None]  # noqa: E731
         return LoadedEpisode(episode, VIEWS, first, no_masks, config.lenses)
 
 
-def _fewer(images: int, states: int, folder: Path) -> int | None:
+def _fewer(images: int, states: int, folder: AnyPath) -> int | None:
     if images > states:
         raise RejectedInputError(
             "length_mismatch",
@@ -196,13 +200,10 @@ def _fewer(images: int, states: int, folder: Path) -> int | None:
     return None if images == states else images
 
 
-def _array(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "File is missing", where=path)
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise RejectedInputError("unreadable", "Array cannot be read", where=path, got=str(error)) from error
+def _array(path: AnyPath, shape: tuple[int | None, ...]) -> np.ndarray:
+    values = read_npy(path)
+    if values.dtype.kind not in "fiu":
+        raise RejectedInputError("unreadable", "Array is not numeric", where=path, expected="numbers", got=values.dtype)
     if values.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, values.shape, strict=True)
     ):
@@ -217,17 +218,8 @@ def _array(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
     return values
 
 
-def _png_folder(folder: Path) -> list[Path]:
-    files = sorted((p for p in folder.glob("*.png") if p.stem.isdigit()), key=lambda p: int(p.stem))
+def _png_folder(folder: AnyPath) -> list[AnyPath]:
+    files = sorted((p for p in find_files(folder, "*.png") if p.stem.isdigit()), key=lambda p: int(p.stem))
     if not files:
         raise RejectedInputError("missing_file", "No images", where=folder, expected="0.png, 1.png, ...", got="none")
     return files
-
-
-def _read_png(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise RejectedInputError("missing_file", "Image is missing", where=path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise RejectedInputError("unreadable", "Image cannot be decoded", where=path)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -14,7 +14,6 @@ state is not the two-gripper layout of this embodiment.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -23,10 +22,10 @@ from pydantic import Field
 from worldline_core.data.conventions import along_tool_z
 from worldline_core.data.episode import CameraTrack, Episode
 from worldline_core.data.hdf5 import Hdf5File, open_hdf5, require_h5py
-from worldline_core.data.lerobot_v3 import read_json
+from worldline_core.data.json_file import read_json
 from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import inside
+from worldline_core.data.source_paths import AnyPath, find_folders, inside
 from worldline_core.data.sources.agibot_gesim import (
     AGIBOT_CAMERAS,
     GRIPPER_COMMAND_RAW,
@@ -35,6 +34,7 @@ from worldline_core.data.sources.agibot_gesim import (
 )
 from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.data.video import decode_video, video_size
+from worldline_core.data.video_clip import VideoClip
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.pose_formats import pose_from_quaternion_xyzw
 
@@ -43,6 +43,7 @@ _STATE_NAMES = tuple(
     f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")
 )
 _POSTURE = {"head": ("head_yaw_rad", "head_pitch_rad"), "waist": ("waist_pitch_rad", "waist_lift_m")}
+_MAX_NUMBER = 1e12
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 
 
@@ -75,15 +76,14 @@ class AgibotWorldSource:
     Arrays are read an episode at a time, videos when their frames are asked for.
     """
 
-    def __init__(self, config: AgibotWorldSourceConfig, root: Path) -> None:
+    def __init__(self, config: AgibotWorldSourceConfig, root: AnyPath) -> None:
         require_h5py()
         self._config = config
         self._root = root
         found = {
             (folder.parent.name, folder.name)
             for part in ("proprio_stats", "observations")
-            for folder in (root / part).glob("*/*")
-            if folder.is_dir()
+            for folder in find_folders(root / part, 2)
         }
         self._episodes = {f"{config.label}-{task}-{episode}": (task, episode) for task, episode in found}
         self._task_info: tuple[str, dict[str, Any]] | None = None
@@ -156,10 +156,11 @@ class AgibotWorldSource:
             lambda view: decode_video(videos[view], length),
             no_masks,
             {view: lens.distortion for view, lens in config.distortions.items()},
+            clips={view: VideoClip.whole_file(video, length, config.fps) for view, video in videos.items()},
         )
 
     def _vector(
-        self, file: Hdf5File, track: str, length: int, gripper: GripperRange, path: Path
+        self, file: Hdf5File, track: str, length: int, gripper: GripperRange, path: AnyPath
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """(N, 16) in the embodiment's order, the openings (N, 2), and how many readings were clipped."""
         joints = file.array(f"{track}/joint/position", (length, 14))
@@ -177,7 +178,7 @@ class AgibotWorldSource:
         vector = np.concatenate([joints[:, :7], opening[:, :1], joints[:, 7:], opening[:, 1:]], axis=1)
         return vector, opening, overshoot
 
-    def _size(self, path: Path) -> tuple[int, int]:
+    def _size(self, path: AnyPath) -> tuple[int, int]:
         """(height, width) of a video of the right rate."""
         height, width, rate = video_size(path)
         if abs(rate - self._config.fps) > 0.02:
@@ -241,7 +242,7 @@ class AgibotWorldSource:
         return info
 
 
-def _extrinsics(path: Path, length: int) -> np.ndarray:
+def _extrinsics(path: AnyPath, length: int) -> np.ndarray:
     """(N or 1, 4, 4) camera-to-base."""
     listed = read_json(path)
     if not isinstance(listed, list) or len(listed) not in (1, length):
@@ -277,15 +278,19 @@ def _extrinsics(path: Path, length: int) -> np.ndarray:
     return matrices
 
 
-def _number(record: Any, key: str, path: Path) -> float:
+def _number(record: Any, key: str, path: AnyPath) -> float:
     value = record.get(key) if isinstance(record, dict) else None
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise RejectedInputError(
             "missing_column", "Intrinsics lack a number", where=path, expected=f"intrinsic.{key}", got=repr(value)
         )
-    if not np.isfinite(value):
+    if not abs(value) <= _MAX_NUMBER:  # NaN is not either
         raise RejectedInputError(
-            "singular_intrinsics", "Intrinsics are not finite", where=path, expected="a number", got=f"{key}: {value}"
+            "singular_intrinsics",
+            "Intrinsics are not finite",
+            where=path,
+            expected="a number",
+            got=f"{key}: {str(value)[:40]}",
         )
     return float(value)
 

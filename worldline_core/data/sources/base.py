@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,6 +14,9 @@ from worldline_core.config.base import StrictModel
 from worldline_core.data.conventions import RecordedConventions
 from worldline_core.data.curate_checks import TRAINING_SPLITS
 from worldline_core.data.episode import Episode, Outcome, Split, TaskFamily
+from worldline_core.data.resize import Fit
+from worldline_core.data.source_paths import SourceFolder
+from worldline_core.data.video_clip import VideoClip, read_clip
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.distortion import Distortion, DistortionModel
 
@@ -23,11 +25,18 @@ from worldline_core.geometry.distortion import Distortion, DistortionModel
 class LoadedEpisode:
     """An episode at the source's own rate and image size.
 
+    A source whose views are videos names them in `clips` (`VideoClip.whole_file(path, num_frames, fps)`, or with
+    `from_time` inside of a joined file): curation then decodes them once, frame by frame, and stores them without
+    encoding where nothing changes. One whose images are single files or messages gives `images`, so that no view is ever
+    in memory as a whole. `frames` alone is enough for short recordings.
+
     Attributes:
         views: views that have images.
         frames: view -> uint8 (episode.num_video_frames, H, W, 3); decodes when called.
         robot_masks: view -> bool (N, H, W), or None where the source has none.
         distortions: lenses of the views whose images are not those of a pinhole; K is then that of the lens.
+        clips: view -> its encoded video, of the views that are videos as they are.
+        images: view -> uint8 (H, W, 3) RGB frame by frame, for views that are no clips.
     """
 
     episode: Episode
@@ -35,6 +44,21 @@ class LoadedEpisode:
     frames: Callable[[str], np.ndarray]
     robot_masks: Callable[[str], np.ndarray | None]
     distortions: Mapping[str, Distortion] = field(default_factory=dict)
+    clips: Mapping[str, VideoClip] = field(default_factory=dict)
+    images: Callable[[str], Iterator[np.ndarray]] | None = None
+
+    def each_image(self, view: str) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB frame by frame, in the way that holds the least of them in memory.
+
+        Raises: RejectedInputError, while it is iterated, for whatever cannot be read.
+        """
+        if view in self.clips:
+            for picture in read_clip(self.clips[view]):
+                yield picture.rgb
+        elif self.images is not None:
+            yield from self.images(view)
+        else:
+            yield from self.frames(view)
 
 
 class EpisodeSource(Protocol):
@@ -48,7 +72,7 @@ class EpisodeSource(Protocol):
 class SourceConfigBase(StrictModel):
     """Fields of every source."""
 
-    path: Path = Field(description="folder of the recordings")
+    path: SourceFolder = Field(description="folder of the recordings, or a URL (s3://bucket/folder)")
     name: str | None = Field(default=None, description="name of the source in the index; default: the folder's name")
     include: tuple[str, ...] | None = Field(
         default=None, description="shell patterns of the episode ids to read; null: all"
@@ -57,6 +81,33 @@ class SourceConfigBase(StrictModel):
         default=RecordedConventions(),
         description="how these recordings depart from the contract; `worldline calibrate check` finds out",
     )
+
+    license: str = Field(
+        default="unknown", description="licence of the recordings: an SPDX identifier (CC-BY-4.0), or its name"
+    )
+    redistribution: Literal["yes", "no", "unknown"] = Field(
+        default="unknown", description="whether the licence lets others have these recordings"
+    )
+    image_size: tuple[int, int] | None = Field(
+        default=None, description="(height, width) of this source's images; null: curate.image_size"
+    )
+    fit: Fit | None = Field(default=None, description="how they come to that size; null: curate.fit")
+    target_fps: float | None = Field(
+        default=None, gt=0, description="rate of this source's episodes in the set; null: curate.fps"
+    )
+    stride: int | None = Field(
+        default=None, ge=1, description="instead of a rate: keep every so many frames of this source"
+    )
+    primary_view: str | None = Field(
+        default=None,
+        description="task-facing view of this source; null: curate.primary_view, else what the recording says",
+    )
+
+    @model_validator(mode="after")
+    def _one_rate(self) -> SourceConfigBase:
+        if self.target_fps is not None and self.stride is not None:
+            raise ValueError("target_fps and stride both say how frames are thinned: give one of them")
+        return self
 
     @property
     def label(self) -> str:
@@ -112,6 +163,12 @@ class GripperRange(StrictModel):
 
     closed: float
     open: float
+
+    @model_validator(mode="after")
+    def _two_ends(self) -> GripperRange:
+        if not (np.isfinite(self.closed) and np.isfinite(self.open) and self.closed != self.open):
+            raise ValueError(f"closed ({self.closed}) and open ({self.open}) must be two different readings")
+        return self
 
     def opening(self, raw: np.ndarray) -> tuple[np.ndarray, int]:
         """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside."""

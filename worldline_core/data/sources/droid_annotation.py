@@ -7,7 +7,6 @@ two exterior cameras and a wrist camera, without published calibration: such epi
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -16,11 +15,14 @@ from pydantic import Field
 from worldline_core.data.conventions import along_tool_z
 from worldline_core.data.curate_checks import EVALUATION_LAYOUTS
 from worldline_core.data.episode import Episode
-from worldline_core.data.lerobot_v3 import read_json
+from worldline_core.data.instructions import one_annotation
+from worldline_core.data.json_file import read_json, well_formed
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import inside
+from worldline_core.data.source_paths import AnyPath, find_files, inside, relative_name
 from worldline_core.data.sources.base import EvaluationSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.video import decode_video, video_size
+from worldline_core.data.video_clip import VideoClip
+from worldline_core.data.video_times import frame_times
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
 
 _DIGITS = re.compile(r"(\d+)")
@@ -41,22 +43,27 @@ class DroidAnnotationSourceConfig(EvaluationSourceConfig):
 class DroidAnnotationSource:
     """Reads every `annotation/<split>/<id>.json` below the root."""
 
-    def __init__(self, config: DroidAnnotationSourceConfig, root: Path) -> None:
+    def __init__(self, config: DroidAnnotationSourceConfig, root: AnyPath) -> None:
         self._config = config
         self._root = root
-        self._files: dict[str, tuple[Path, Path]] = {}
-        for file in sorted(root.rglob("annotation/*/*.json")):
+        self._files: dict[str, tuple[AnyPath, AnyPath]] = {}
+        for file in find_files(root, "annotation/*/*.json"):
             subset = file.parents[2]
-            parts = [*subset.relative_to(root).parts, file.parent.name, file.stem]
+            parts = [*relative_name(subset, root).parts, file.parent.name, file.stem]
             self._files["-".join([config.label, *parts])] = (subset, file)
 
     def episode_ids(self) -> list[str]:
         return sorted(self._files, key=lambda name: [int(t) if t.isdigit() else t for t in _DIGITS.split(name)])
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        config = self._config
-        subset, file = self._files[episode_id]
+        subset, found = self._files[episode_id]
+        file = inside(self._root, str(relative_name(found, self._root)))
         record = read_json(file)
+        with well_formed(file, "an annotation: a mapping with states, joints, videos and texts"):
+            return self._read(episode_id, subset, file, record)
+
+    def _read(self, episode_id: str, subset: AnyPath, file: AnyPath, record: dict[str, Any]) -> LoadedEpisode:
+        config = self._config
         states = _rows(record, "states", 7, file)
         listed = record.get("videos") or []
         videos = {
@@ -74,7 +81,7 @@ class DroidAnnotationSource:
         command = self._command(record, len(states))
         pose = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6])[:, None]
         success = record.get("success")
-        texts = [text for text in record.get("texts", []) if text]
+        texts = [str(text) for text in record.get("texts", []) if text]
         frames = dict(videos.items())
         episode = Episode(
             episode_id=episode_id,
@@ -82,7 +89,7 @@ class DroidAnnotationSource:
             embodiment=config.embodiment,
             scene=config.scene or f"{config.label}-{subset.name}-{file.stem}",
             task_family=config.task_family,
-            instruction=texts[0] if texts else "",
+            instruction=one_annotation(texts),
             outcome=config.outcome if success is None else "success" if success else "failure",
             split=config.split,
             fps=fps,
@@ -101,9 +108,15 @@ class DroidAnnotationSource:
         )
         for view, path in videos.items():
             self._check_length(path, view, len(states))
-        return LoadedEpisode(episode, tuple(frames), lambda view: decode_video(frames[view], len(states)), no_masks)
+        return LoadedEpisode(
+            episode,
+            tuple(frames),
+            lambda view: decode_video(frames[view], len(states)),
+            no_masks,
+            clips={view: VideoClip.whole_file(path, len(states), fps) for view, path in videos.items()},
+        )
 
-    def _rate(self, videos: dict[str, Path], file: Path) -> float:
+    def _rate(self, videos: dict[str, AnyPath], file: AnyPath) -> float:
         rates = {view: video_size(path)[2] for view, path in videos.items()}
         wanted = self._config.fps or next(iter(rates.values()))
         if any(abs(rate - wanted) > 1e-3 for rate in rates.values()):
@@ -117,7 +130,7 @@ class DroidAnnotationSource:
             )
         return wanted
 
-    def _joints(self, record: dict[str, Any], length: int, file: Path) -> np.ndarray:
+    def _joints(self, record: dict[str, Any], length: int, file: AnyPath) -> np.ndarray:
         if "joints" in record:
             joints = _rows(record, "joints", 8, file)[:, :7]
         else:
@@ -140,8 +153,8 @@ class DroidAnnotationSource:
         command = np.concatenate([np.asarray(joints)[::3], 1.0 - np.asarray(gripper)[::3, None]], axis=1)
         return command if command.shape == (length, 8) else None
 
-    def _check_length(self, path: Path, view: str, states: int) -> None:
-        frames = len(decode_video(path))
+    def _check_length(self, path: AnyPath, view: str, states: int) -> None:
+        frames = len(frame_times(path))
         if frames != states:
             raise RejectedInputError(
                 "length_mismatch",
@@ -153,7 +166,7 @@ class DroidAnnotationSource:
             )
 
 
-def _rows(record: dict[str, Any], key: str, width: int, file: Path) -> np.ndarray:
+def _rows(record: dict[str, Any], key: str, width: int, file: AnyPath) -> np.ndarray:
     if key not in record:
         raise RejectedInputError(
             "missing_column", "Annotation lacks a key", where=file, expected=key, got=", ".join(record)

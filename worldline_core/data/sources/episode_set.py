@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 from worldline_core.data.episode_set import EpisodeSet
 from worldline_core.data.recorded_poses import with_rigid_poses
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath
 from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
 
 
@@ -23,14 +25,24 @@ class EpisodeSetSource:
     Raises: DataError when the set has no readable index.
     """
 
-    def __init__(self, config: EpisodeSetSourceConfig, root: Path) -> None:
+    def __init__(self, config: EpisodeSetSourceConfig, root: AnyPath) -> None:
         self._name = config.name
         self._set = EpisodeSet.open(root, allow_linked=False)
+        self._listed = Counter(row.episode_id for row in self._set.rows)
 
     def episode_ids(self) -> list[str]:
         return [row.episode_id for row in self._set.rows]
 
     def load(self, episode_id: str) -> LoadedEpisode:
+        if self._listed[episode_id] > 1:
+            raise RejectedInputError(
+                "duplicate_id",
+                "Several episodes of the set have this id",
+                where=str(self._set.root),
+                expected="one row an episode",
+                got=f"{self._listed[episode_id]} rows of {episode_id}",
+                evidence={"rows": self._listed[episode_id]},
+            )
         position = self._set.position(episode_id)
         episode = with_rigid_poses(self._set.episode(position))
         if self._name is not None:
@@ -40,4 +52,5 @@ class EpisodeSetSource:
             self._set.rows[position].views,
             lambda view: self._set.frames(position, view),
             lambda view: self._set.robot_masks(position, view),
+            clips={view: self._set.clip(position, view) for view in self._set.rows[position].views},
         )

@@ -1,111 +1,135 @@
-"""Foreign LeRobot datasets, v2.1 and v3.0, without a camera sidecar.
+"""Foreign LeRobot datasets, v2.1 and v3.0 (Galaxea, RoboCOIN, DROID's port and many more), without our camera sidecar.
 
-LeRobot states neither the unit of joint angles nor what a gripper reading means, so both are declared in the
-configuration. Without calibration such episodes serve action-free training.
+LeRobot states neither the unit of joint angles, nor what a gripper reading means, nor where cameras are, so all three are
+declared in the configuration. Without calibration such episodes serve action-free training.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
+from worldline_core.data.curate_checks import EVALUATION_ONLY, TRAINING_SPLITS, says_droid
 from worldline_core.data.episode import Episode
 from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
 from worldline_core.data.lerobot_v21 import LeRobotV21Dataset
+from worldline_core.data.recorded_poses import repair_notes
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LoadedEpisode, no_masks
+from worldline_core.data.source_paths import AnyPath, fill_template, inside
+from worldline_core.data.sources.base import LoadedEpisode, no_masks
+from worldline_core.data.sources.calibration_file import (
+    CalibratedView,
+    CalibrationFile,
+    calibrated_view,
+    read_calibration,
+)
+from worldline_core.data.sources.lerobot_columns import ArmVectors, flat_names
+from worldline_core.data.sources.lerobot_config import LeRobotSourceConfig
 from worldline_core.errors import ConfigError
 
+__all__ = ["LeRobotSource", "LeRobotSourceConfig"]
+
 _RATE_TOLERANCE = 1e-2
-
-
-class LeRobotSourceConfig(ForeignSourceConfig):
-    """A LeRobotDataset and what it does not say about itself."""
-
-    kind: Literal["lerobot_v21", "lerobot_v3"]
-    embodiment: str
-    angle_unit: Literal["rad", "deg"] = Field(description="unit of the joint columns")
-    views: dict[str, str] = Field(description="video key of the dataset -> view, for example {...cam_high: head}")
-    primary_view: str = "head"
-    grippers: dict[str, GripperRange] = Field(
-        default={}, description="state column -> its readings when closed and open"
-    )
+_DROID_VIDEOS = {"observation.images.exterior_1_left", "observation.images.exterior_2_left"}
 
 
 class LeRobotSource:
     """Reads a LeRobotDataset.
 
-    Raises: DataError when the folder is no such dataset; ConfigError when a declared column or view is unknown.
+    Raises: DataError when the folder is no such dataset; ConfigError when a declared column or view is unknown, or when
+        the dataset is DROID and its split would train or select a model.
     """
 
-    def __init__(self, config: LeRobotSourceConfig, root: Path) -> None:
+    def __init__(self, config: LeRobotSourceConfig, root: AnyPath, label: str | None = None) -> None:
         self._config = config
-        self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)
-        self._names = _flat_names(self._dataset.features.get("observation.state", {}))
-        for what, wanted, known in (
-            ("video key", config.views, self._dataset.video_keys),
-            ("state column", config.grippers, self._names),
-        ):
-            unknown = sorted(set(wanted) - set(known))
+        self._root = root
+        self._label = label or config.label
+        self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)  # pyright: ignore[reportArgumentType]
+        features = self._dataset.features
+        self._evaluation_only = config.evaluation_only or _is_droid(config, root, self._dataset.info)
+        if self._evaluation_only and config.split in TRAINING_SPLITS:
+            raise ConfigError(
+                "DROID is for evaluation only",
+                where=str(root),
+                expected="split test or ood_test",
+                got=config.split,
+                next_step="set the source's split, or name datasets that are not DROID otherwise",
+            )
+        self._names = flat_names(features.get("observation.state", {}))
+        known = {"video key": self._dataset.video_keys, "state column": self._names, "feature": list(features)}
+        columns = [name for name in (config.task_column, config.success_column) if name is not None]
+        for what, wanted in (("video key", config.views), ("state column", config.grippers), ("feature", columns)):
+            unknown = sorted(set(wanted) - set(known[what]) - {"task_index"})
             if unknown:
                 raise ConfigError(
                     f"The dataset has no {what} of this name",
                     where=str(root),
-                    expected=", ".join(known),
+                    expected=", ".join(known[what]),
                     got=", ".join(unknown),
                 )
+        self._arms = None if config.arms is None else ArmVectors(config.arms, features, str(root))
+        self._calibration: tuple[str, CalibrationFile] | None = None
 
     def episode_ids(self) -> list[str]:
-        return [f"{self._config.label}-{row['episode_index']:06d}" for row in self._dataset.episodes]
+        return [f"{self._label}-{int(index):06d}" for index in self._dataset.episodes.indices]
 
     def load(self, episode_id: str) -> LoadedEpisode:
         config, dataset = self._config, self._dataset
         index = int(episode_id.rsplit("-", 1)[1])
-        state, overshoot = self._normalised(dataset.column(index, "observation.state"))
-        action, command_overshoot = self._normalised(dataset.column(index, "action"))
+        state, action, overshoot = self._vectors(index)
         times = dataset.column(index, "timestamp").reshape(-1).astype(np.float64)
-        tasks = dataset.tasks
-        task_index = int(dataset.column(index, "task_index").reshape(-1)[0])
+        instruction, tasks = self._instruction(index)
         key_of = {view: key for key, view in config.views.items()}
+        clips = {view: dataset.clip(index, key) for view, key in key_of.items()}
         for view, key in key_of.items():
-            rate = dataset.video_rate(index, key)
-            if abs(rate - dataset.fps) > _RATE_TOLERANCE * dataset.fps:
-                raise RejectedInputError(
-                    "wrong_fps",
-                    "Video and dataset differ in frame rate",
-                    where=f"{episode_id}, view {view}",
-                    expected=f"{dataset.fps} fps",
-                    got=f"{rate} fps",
-                    evidence={"expected_fps": dataset.fps, "video_fps": rate},
-                )
+            self._check_rate(dataset.video_rate(index, key), f"{episode_id}, view {view}")
+        cameras = self._cameras(index, key_of, len(times))
         episode = Episode(
             episode_id=episode_id,
             source=config.label,
             embodiment=config.embodiment,
-            scene=config.scene or config.label,
+            scene=config.scene or self._label,
             task_family=config.task_family,
-            instruction=tasks.get(task_index, ""),
-            outcome=config.outcome,
+            instruction=instruction,
+            outcome=self._outcome(index),
             split=config.split,
             fps=dataset.fps,
             state=state,
             action=action,
             timestamps=times - times[0],
-            primary_view=config.primary_view,
-            state_names=tuple(self._names) or None,
+            cameras={view: camera.track for view, camera in cameras.items()},
+            primary_view=config.primary_view or "head",
+            state_names=self._arms.names if self._arms is not None else tuple(self._names) or None,
             conventions={
                 "layout": f"lerobot {dataset.info['codebase_version']}",
                 "declared_angle_unit": config.angle_unit,
-                "gripper_overshoot": overshoot + command_overshoot,
+                "gripper_overshoot": overshoot,
+                **({EVALUATION_ONLY: "true"} if self._evaluation_only else {}),
+                **({"action": "repeats the state"} if self._arms is not None and self._arms.repeats_state else {}),
+                **({"tasks": tasks} if tasks > 1 else {}),
+                **repair_notes({view: camera.pose.repair for view, camera in cameras.items()}),
             },
         )
-        return LoadedEpisode(episode, tuple(key_of), lambda view: dataset.frames(index, key_of[view]), no_masks)
+        return LoadedEpisode(
+            episode,
+            tuple(key_of),
+            lambda view: dataset.frames(index, key_of[view]),
+            no_masks,
+            {view: camera.lens.distortion for view, camera in cameras.items() if camera.lens is not None},
+            clips=clips,
+        )
+
+    def _vectors(self, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """State and action in the contract's layout, and how many gripper readings were clipped."""
+        if self._arms is not None:
+            degrees = self._config.angle_unit == "deg"
+            return self._arms.read(lambda feature: self._dataset.column(index, feature), degrees=degrees)
+        state, overshoot = self._normalised(self._dataset.column(index, "observation.state"))
+        action, more = self._normalised(self._dataset.column(index, "action"))
+        return state, action, overshoot + more
 
     def _normalised(self, values: np.ndarray) -> tuple[np.ndarray, int]:
-        """Radians and openings; how many gripper readings were clipped."""
         result = values.astype(np.float64)
         result = result[:, None] if result.ndim == 1 else result
         grippers = [self._names.index(name) for name in self._config.grippers]
@@ -118,12 +142,75 @@ class LeRobotSource:
             overshoot += outside
         return result.astype(np.float32), overshoot
 
+    def _instruction(self, index: int) -> tuple[str, int]:
+        """The first frame's task, and how many different ones the episode has."""
+        values = self._dataset.column(index, self._config.task_column).reshape(-1)
+        text = self._dataset.tasks.get(int(values[0]), "")
+        separator = self._config.task_separator
+        return (text if separator is None else text.rsplit(separator, 1)[-1]).strip(), len(set(values.tolist()))
 
-def _flat_names(feature: dict[str, Any]) -> list[str]:
-    """LeRobot writes names as a list, a list of one list, or a dict of a list."""
-    names = feature.get("names") or []
-    if isinstance(names, dict):
-        names = next(iter(names.values()), [])
-    if names and isinstance(names[0], list):
-        names = names[0]
-    return [str(name) for name in names]
+    def _outcome(self, index: int) -> str:
+        if self._config.success_column is None:
+            return self._config.outcome
+        return (
+            "success" if bool(self._dataset.column(index, self._config.success_column).reshape(-1)[-1]) else "failure"
+        )
+
+    def _check_rate(self, rate: float, where: str) -> None:
+        if abs(rate - self._dataset.fps) > _RATE_TOLERANCE * self._dataset.fps:
+            raise RejectedInputError(
+                "wrong_fps",
+                "Video and dataset differ in frame rate",
+                where=where,
+                expected=f"{self._dataset.fps} fps",
+                got=f"{rate} fps",
+                evidence={"expected_fps": self._dataset.fps, "video_fps": rate},
+            )
+
+    def _cameras(self, index: int, key_of: dict[str, str], length: int) -> dict[str, CalibratedView]:
+        """Calibrated views; one whose pose was never measured is left out."""
+        if self._config.calibration is None:
+            return {}
+        name = fill_template(self._config.calibration, episode_index=index)
+        if self._calibration is None or self._calibration[0] != name:
+            self._calibration = name, read_calibration(inside(self._root, name))
+        where = f"{self._root}, {name}"
+        unknown = sorted(set(self._calibration[1].views) - set(key_of))
+        if unknown:
+            raise RejectedInputError(
+                "missing_view",
+                "Calibration names views that are not read",
+                where=where,
+                expected=", ".join(key_of),
+                got=", ".join(unknown),
+                evidence={"missing": unknown, "found": sorted(key_of)},
+            )
+        found = {
+            view: calibrated_view(
+                view,
+                entry,
+                image_size=self._dataset.image_size(index, key_of[view]),
+                num_frames=length,
+                read_feature=lambda feature: self._pose_column(index, feature, where),
+                where=where,
+            )
+            for view, entry in self._calibration[1].views.items()
+        }
+        return {view: camera for view, camera in found.items() if camera is not None}
+
+    def _pose_column(self, index: int, feature: str, where: str) -> np.ndarray:
+        if feature not in self._dataset.features:
+            raise RejectedInputError(
+                "missing_column",
+                "Calibration names a feature that the dataset does not have",
+                where=where,
+                expected=", ".join(self._dataset.features),
+                got=feature,
+            )
+        return self._dataset.column(index, feature)
+
+
+def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: dict[str, Any]) -> bool:
+    """Whether a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
+    said = (config.label, config.embodiment, root.name, str(info.get("robot_type")), str(info.get("repo_id")))
+    return says_droid(*said) or set(info["features"]) >= _DROID_VIDEOS

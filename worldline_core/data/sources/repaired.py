@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,10 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
             )
         return values[images]
 
+    def cut_images(view: str) -> Iterator[np.ndarray]:
+        kept = range(recorded.num_video_frames)[images] if lagging else range(recorded.num_video_frames)
+        return (image for number, image in enumerate(loaded.each_image(view)) if number in kept)
+
     def masks(view: str) -> np.ndarray | None:
         recorded_masks = loaded.robot_masks(view)
         return None if recorded_masks is None else cut(recorded_masks, view)
@@ -61,4 +66,6 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
         episode=replace(repaired, conventions={**repaired.conventions, **declared}),
         frames=lambda view: cut(loaded.frames(view), view),
         robot_masks=masks,
+        clips={view: clip.cut(images.start, images.stop) if lagging else clip for view, clip in loaded.clips.items()},
+        images=cut_images,
     )

@@ -12,20 +12,21 @@ repeats it. Images are JPEG files that OpenCV wrote from RGB arrays, so their ch
 from __future__ import annotations
 
 import re
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from worldline_core.data.curate_checks import EVALUATION_LAYOUTS
 from worldline_core.data.episode import CameraTrack, Episode
 from worldline_core.data.hdf5 import Hdf5File, open_hdf5, require_h5py
-from worldline_core.data.lerobot_v3 import read_json
+from worldline_core.data.hdf5_images import Channels, hdf5_images
+from worldline_core.data.images import image_size
+from worldline_core.data.json_file import read_json
 from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import inside
+from worldline_core.data.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.base import EvaluationSourceConfig, GripperRange, LoadedEpisode, no_masks
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
@@ -50,7 +51,7 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
         description="view -> camera of the file",
     )
     tool_offset_m: float = Field(default=0.12, description="end pose to gripper centre along the end pose's +x")
-    channels: Literal["as_written", "standard"] = Field(
+    channels: Channels = Field(
         default="as_written", description="standard: for images that were encoded again with the usual channel order"
     )
 
@@ -58,19 +59,19 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
 class RobotwinSource:
     """Reads every `episode*.hdf5` below the root; images are decoded when their frames are asked for."""
 
-    def __init__(self, config: RobotwinSourceConfig, root: Path) -> None:
+    def __init__(self, config: RobotwinSourceConfig, root: AnyPath) -> None:
         require_h5py()
         self._config = config
         self._root = root
-        found = sorted(root.rglob("episode*.hdf5"))
-        self._files = {"-".join([config.label, *p.relative_to(root).with_suffix("").parts]): p for p in found}
+        found = find_files(root, "episode*.hdf5")
+        self._files = {"-".join([config.label, *relative_name(p, root).with_suffix("").parts]): p for p in found}
 
     def episode_ids(self) -> list[str]:
         return sorted(self._files, key=lambda name: [int(t) if t.isdigit() else t for t in _DIGITS.split(name)])
 
     def load(self, episode_id: str) -> LoadedEpisode:
         config = self._config
-        path = inside(self._root, str(self._files[episode_id].relative_to(self._root)))
+        path = inside(self._root, str(relative_name(self._files[episode_id], self._root)))
         cameras: dict[str, CameraTrack] = {}
         recorded: dict[str, CameraPose] = {}
         with open_hdf5(path) as file:
@@ -97,7 +98,7 @@ class RobotwinSource:
         # From between the fingertips, with +z out of the gripper, to the recorded end pose.
         T_end_tool = _END_FROM_TOOL.copy()
         T_end_tool[0, 3] = config.tool_offset_m
-        setting = "-".join(path.relative_to(self._root).parts[:-2])
+        setting = "-".join(relative_name(path, self._root).parts[:-2])
         episode = Episode(
             episode_id=episode_id,
             source=config.label,
@@ -125,10 +126,16 @@ class RobotwinSource:
                 **repair_notes({view: pose.repair for view, pose in recorded.items()}),
             },
         )
-        return LoadedEpisode(episode, tuple(config.views), lambda view: self._frames(path, view, length), no_masks)
+
+        def images(view: str) -> Iterator[np.ndarray]:
+            return hdf5_images(path, f"observation/{config.views[view]}/rgb", length, config.channels)
+
+        return LoadedEpisode(
+            episode, tuple(config.views), lambda view: np.stack(list(images(view))), no_masks, images=images
+        )
 
     def _camera(
-        self, file: Hdf5File, path: Path, view: str, camera: str, length: int
+        self, file: Hdf5File, path: AnyPath, view: str, camera: str, length: int
     ) -> tuple[CameraTrack, CameraPose]:
         group = f"observation/{camera}"
         found = file.names("observation")
@@ -141,7 +148,7 @@ class RobotwinSource:
                 got=", ".join(found) or "none",
                 evidence={"missing": [view], "found": found},
             )
-        first = file.encoded_images(f"{group}/rgb", length, stop=1)[0]
+        first = next(file.image_files(f"{group}/rgb", length))
         intrinsics = file.array(f"{group}/intrinsic_cv", (length, 3, 3))
         if np.ptp(intrinsics, axis=0).max() > 1e-6:
             raise RejectedInputError(
@@ -168,36 +175,14 @@ class RobotwinSource:
                 got=f"{disagreement:.3g} apart",
                 evidence={"view": view, "disagreement": disagreement, "largest_allowed": _MAX_DISAGREEMENT},
             )
-        height, width = self._decode(first, f"{path}, {group}/rgb, frame 0").shape[:2]
+        height, width = image_size(first, f"{path}, {group}/rgb, frame 0")
         return CameraTrack.from_pose(view, intrinsics[0], pose, width=width, height=height), pose
 
-    def _frames(self, path: Path, view: str, length: int) -> np.ndarray:
-        key = f"observation/{self._config.views[view]}/rgb"
-        with open_hdf5(path) as file:
-            images = file.encoded_images(key, length)
-        decoded = [self._decode(image, f"{path}, {key}, frame {n}") for n, image in enumerate(images)]
-        sizes = sorted({image.shape for image in decoded})
-        if len(sizes) != 1:
-            raise RejectedInputError(
-                "unreadable", "Images differ in size", where=f"{path}, {key}", expected="one size", got=sizes
-            )
-        return np.stack(decoded)
-
-    def _decode(self, content: bytes, where: str) -> np.ndarray:
-        """uint8 (H, W, 3) RGB."""
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
-        except cv2.error as error:
-            raise RejectedInputError("unreadable", "Image cannot be decoded", where=where, got=str(error)) from error
-        if image is None:
-            raise RejectedInputError("unreadable", "Image cannot be decoded", where=where, expected="a JPEG file")
-        return image if self._config.channels == "as_written" else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-    def _instruction(self, path: Path) -> str:
+    def _instruction(self, path: AnyPath) -> str:
         """The first of the seen instructions; they are generated apart from the recording and may not be there."""
-        relative = path.relative_to(self._root).parent.parent / "instructions" / f"{path.stem}.json"
+        relative = relative_name(path, self._root).parent.parent / "instructions" / f"{path.stem}.json"
         file = inside(self._root, str(relative))
-        if not file.is_file():
+        if not is_file(file):
             return ""
         record = read_json(file)
         seen = record.get("seen") if isinstance(record, dict) else None

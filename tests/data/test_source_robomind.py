@@ -1,0 +1,295 @@
+"""RoboMIND 1 and 2 in their published layouts, written here with h5py and OpenCV, read by the source."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+
+from published_robomind import (
+    GRIPPER,
+    LENGTH,
+    RGB,
+    franka,
+    jpegs,
+    trajectory,
+    wave,
+    write_agilex,
+    write_franka,
+    write_images,
+    write_version_2,
+)
+
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.hdf5 import open_hdf5
+from worldline_core.data.sources.robomind import LayoutName, RobomindSource, RobomindSourceConfig
+from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS
+from worldline_core.errors import DataError
+
+
+def settings(root: Path, layout: str = "h5_franka_3rgb", **changes: Any) -> CurateConfig:
+    source = {"kind": "robomind", "path": str(root), "name": "robomind", "layout": layout, "fps": 10}
+    return CurateConfig.model_validate({"sources": [{**source, "gripper_state": GRIPPER, "split": "train", **changes}]})
+
+
+def run(tmp_path: Path, config: CurateConfig) -> tuple[dict[str, Any], EpisodeSet]:
+    counts = curate(config, {}, tmp_path / "out")
+    assert counts["kept"] + counts["quarantined"] == counts["found"]
+    return counts, EpisodeSet.open(tmp_path / "out")
+
+
+def test_franka_of_version_1(tmp_path: Path) -> None:
+    write_franka(tmp_path / "h5_franka_3rgb")
+    write_franka(tmp_path / "h5_franka_3rgb", "close_drawer", "1014_144602", seed=1)
+    counts, curated = run(tmp_path, settings(tmp_path / "h5_franka_3rgb"))
+    assert (counts["found"], counts["kept"]) == (2, 2)
+    row, episode = curated.rows[0], curated.episode(0)
+    assert row.episode_id == "robomind-bread_in_basket-success_episodes-train-1014_144602"
+    assert (row.scene, row.outcome, row.instruction) == (
+        "robomind-bread_in_basket",
+        "success",
+        "put bread into the basket",
+    )
+    assert (row.embodiment, row.fps, row.num_frames, row.stage2_ok) == ("franka_panda", 10.0, LENGTH, False)
+    assert np.allclose(episode.state[:, :7], franka(), atol=1e-6)
+    assert np.allclose(episode.state[:, 7], 1 - np.linspace(0, 1.02, LENGTH).clip(0, 1), atol=1e-6)
+    assert np.array_equal(episode.state, episode.action)
+    assert episode.conventions["action"] == "repeats the state"
+    assert episode.conventions["gripper_overshoot"] == 1
+    assert episode.state_names == (*(f"right/joint_{i}" for i in range(1, 8)), "right/gripper")
+    colour = np.median(curated.frames(0, "head").reshape(-1, 3), axis=0)
+    assert np.abs(colour - RGB).max() < 8
+
+
+def test_agilex_of_version_1(tmp_path: Path) -> None:
+    write_agilex(tmp_path / "h5_agilex_3rgb")
+    config = settings(
+        tmp_path / "h5_agilex_3rgb",
+        "h5_agilex_3rgb",
+        gripper_state={"closed": 0, "open": 0.1},
+        gripper_command={"closed": 0, "open": 5},
+    )
+    counts, curated = run(tmp_path, config)
+    assert counts["kept"] == 1
+    episode = curated.episode(0)
+    assert curated.rows[0].views == ("head", "left_wrist", "right_wrist")
+    for start, number in ((0, 0), (7, 1)):
+        assert np.allclose(episode.state[:, start : start + 6], wave(6, number), atol=1e-6)
+        assert np.allclose(episode.action[:, start : start + 6], wave(6, number) + 0.05, atol=1e-6)
+        for values in (episode.state, episode.action):
+            assert np.allclose(values[:, start + 6], np.linspace(0, 1, LENGTH), atol=1e-6)
+    assert np.abs(np.median(curated.frames(0, "head").reshape(-1, 3), axis=0) - RGB).max() < 8
+
+
+def test_a_robot_with_hands_has_joints_alone(tmp_path: Path) -> None:
+    path = trajectory(tmp_path / "raw", "plate_push", "2024-11-13-16-52-40")
+    with h5py.File(path, "w") as file:
+        write_images(file, "observations/rgb_images/camera_top", jpegs(0, rgb_for_bgr=True))
+        file["puppet/joint_position"], file["puppet/end_effector"] = wave(14), wave(12)
+    _, curated = run(tmp_path, settings(tmp_path / "raw", "h5_tienkung_xsens_1rgb", gripper_state=None))
+    episode = curated.episode(0)
+    assert np.allclose(episode.state, wave(14), atol=1e-6)
+    assert episode.state_names is not None
+    assert episode.state_names[6:8] == ("left/joint_7", "right/joint_1")
+
+
+def test_version_2(tmp_path: Path) -> None:
+    write_version_2(tmp_path / "franka")
+    config = settings(tmp_path / "franka", "v2_franka", gripper_command=GRIPPER, channels="standard", fps=14)
+    counts, curated = run(tmp_path, config)
+    assert counts["kept"] == 1
+    episode = curated.episode(0)
+    assert curated.rows[0].episode_id == "robomind-place_coke_bottle_on_tray-success_episodes-0416_130751"
+    assert curated.rows[0].instruction == "place coke bottle on tray"
+    assert episode.conventions["collector"] == "station_3"
+    assert episode.state.shape == (LENGTH, 16)
+    assert np.allclose(episode.state[:, 8:15], wave(8, 1)[:, :7], atol=1e-6)
+    assert np.allclose(episode.action[:, :7], wave(8)[:, :7] + 0.05, atol=1e-6)
+    assert np.allclose(episode.state[:, [7, 15]], np.linspace(1, 0, LENGTH)[:, None], atol=1e-6)
+
+
+def test_images_are_read_one_by_one(tmp_path: Path) -> None:
+    path = write_franka(tmp_path / "raw")
+    source = RobomindSource(settings(tmp_path / "raw").sources[0], tmp_path / "raw")  # type: ignore[arg-type]
+    loaded = source.load(source.episode_ids()[0])
+    assert loaded.images is not None
+    with h5py.File(path, "r") as file:
+        expected = cv2.imdecode(file["observations/rgb_images/camera_top"][0], cv2.IMREAD_COLOR)[..., ::-1]
+    images = loaded.each_image("head")
+    first = next(images)
+    assert np.array_equal(first, expected)
+    assert len(list(images)) == LENGTH - 1
+    assert np.array_equal(loaded.frames("head")[0], first)
+
+
+def test_instructions_of_the_table(tmp_path: Path) -> None:
+    write_franka(tmp_path / "raw")
+    write_franka(tmp_path / "raw", "close_drawer", seed=1)
+    (tmp_path / "raw/instr.csv").write_text(',task,instruction\n0,bread_in_basket,"take bread, put it in"\n1,x,y\n')
+    counts, curated = run(tmp_path, settings(tmp_path / "raw", instructions="instr.csv"))
+    assert counts["reasons"] == {"missing_column": 1}
+    assert curated.rows[0].instruction == "take bread, put it in"
+
+
+def edit(change: Callable[[Any], None]) -> Callable[[Path], None]:
+    def apply(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            change(file)
+
+    return apply
+
+
+def replaced(key: str, make: Callable[[np.ndarray], Any]) -> Callable[[Path], None]:
+    def change(file: Any) -> None:
+        values = make(file[key][()])
+        del file[key]
+        file[key] = values
+
+    return edit(change)
+
+
+def image(make: Callable[[np.ndarray], np.ndarray], frame: int = 3) -> Callable[[Path], None]:
+    def change(file: Any) -> None:
+        images = file["observations/rgb_images/camera_top"]
+        images[frame] = make(images[frame])
+
+    return edit(change)
+
+
+def claims(height: int, width: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(content: np.ndarray) -> np.ndarray:
+        data = content.tobytes()
+        place = data.index(b"\xff\xc0") + 5
+        return np.frombuffer(data[:place] + struct.pack(">HH", height, width) + data[place + 4 :], np.uint8)
+
+    return change
+
+
+def with_nan(values: np.ndarray) -> np.ndarray:
+    values[2] = np.nan
+    return values
+
+
+def smaller(content: np.ndarray) -> np.ndarray:
+    decoded = cv2.imdecode(content, cv2.IMREAD_COLOR)
+    return cv2.imencode(".jpg", decoded[::2, ::2])[1].reshape(-1)
+
+
+def uncompressed(file: Any) -> None:
+    file.attrs["compress"] = False
+
+
+def linked(file: Any) -> None:
+    del file["puppet/joint_position"]
+    file["puppet/joint_position"] = h5py.ExternalLink("/etc/other.hdf5", "x")
+
+
+def huge_chunk(file: Any) -> None:
+    del file["puppet/joint_position"]
+    file.create_dataset(
+        "puppet/joint_position", (LENGTH, 8), "f8", chunks=(2**25, 8), maxshape=(None, 8), compression="gzip"
+    )
+
+
+def truncated(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 3])
+
+
+FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "truncated file": (truncated, "unreadable"),
+    "no joints": (edit(lambda f: f.__delitem__("puppet/joint_position")), "missing_column"),
+    "joints of another robot": (replaced("puppet/joint_position", lambda v: v[:, :7]), "length_mismatch"),
+    "a joint that is no number": (replaced("puppet/joint_position", with_nan), "nan_state"),
+    "one state fewer": (replaced("puppet/joint_position", lambda v: v[:-1]), "length_mismatch"),
+    "no such camera": (edit(lambda f: f.__delitem__("observations/rgb_images/camera_top")), "missing_view"),
+    "an image header of 60,000 x 60,000": (image(claims(60_000, 60_000)), "too_large"),
+    "an image that is none": (image(lambda v: v[::-1].copy()), "unreadable"),
+    "an empty image": (image(lambda v: v[:0]), "unreadable"),
+    "half an image header": (image(lambda v: v[:30]), "unreadable"),
+    "an image of another size": (image(smaller), "unreadable"),
+    "images without compression": (edit(uncompressed), "unreadable"),
+    "joints in another file": (edit(linked), "path_traversal"),
+    "a chunk of gigabytes": (edit(huge_chunk), "too_large"),
+    "joints as texts": (replaced("puppet/joint_position", lambda v: v.astype("S8")), "unreadable"),
+    "joints in degrees": (replaced("puppet/joint_position", lambda v: np.rad2deg(v) + 10), "joint_out_of_range"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_quarantines_its_episode_alone(tmp_path: Path, fault: str) -> None:
+    damage, reason = FAULTS[fault]
+    damage(write_franka(tmp_path / "raw"))
+    write_franka(tmp_path / "raw", "close_drawer", seed=1)
+    counts, curated = run(tmp_path, settings(tmp_path / "raw"))
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (2, 1, {reason: 1})
+    assert curated.rows[0].scene == "robomind-close_drawer"
+
+
+def test_a_dexterous_hand_is_no_gripper(tmp_path: Path) -> None:
+    write_version_2(tmp_path / "raw", hand=6)
+    config = settings(tmp_path / "raw", "v2_franka", gripper_command=GRIPPER, channels="standard")
+    with pytest.raises(DataError, match=r"(?s)No episode was kept.*invalid_gripper"):
+        curate(config, {}, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("layout", "changes", "missing"),
+    [
+        ("h5_franka_3rgb", {"gripper_state": None}, "gripper_state"),
+        ("h5_agilex_3rgb", {}, "gripper_command"),
+        ("h5_franka_3rgb", {"action": "master"}, "gripper_command"),
+        ("h5_franka_1rgb", {}, "channels"),
+        ("v2_ur", {"gripper_command": GRIPPER}, "channels"),
+    ],
+)
+def test_what_the_release_does_not_say_must_be_declared(
+    tmp_path: Path, layout: str, changes: dict[str, Any], missing: str
+) -> None:
+    with pytest.raises(ValidationError, match=rf"does not say it of {layout}, so declare {missing}"):
+        settings(tmp_path, layout, **changes)
+
+
+def test_every_layout_can_be_asked_for() -> None:
+    assert set(get_args(LayoutName)) == set(ROBOMIND_LAYOUTS)
+    for layout in ROBOMIND_LAYOUTS.values():
+        assert all(arm.num_joints + (arm.gripper is not None) <= 8 for arm in layout.arms)
+        assert "head" in layout.views
+
+
+def test_texts_and_attributes(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["scalar"], file["single"], file["many"] = "wipe", [b"w\xc3\xa4sch"], [b"a", b"b"]
+        file.attrs["count"] = np.int64(3)
+        file.create_group("group").attrs["list"] = [1, 2]
+        file["long"] = "x" * 2_000_000
+    with open_hdf5(tmp_path / "a.hdf5") as file:
+        assert (file.text("scalar"), file.text("single"), file.text("none")) == ("wipe", "wäsch", None)
+        assert (file.attribute("/", "count"), file.attribute("/", "other"), file.attribute("no", "x")) == (
+            "3",
+            None,
+            None,
+        )
+        with pytest.raises(DataError, match="no single text"):
+            file.text("many")
+        with pytest.raises(DataError, match="Entry is no text"):
+            file.attribute("group", "list")
+        with pytest.raises(DataError, match="Text is too long"):
+            file.text("long")
+
+
+def test_the_shipped_configurations_are_complete(project_root: Path) -> None:
+    for file in sorted((project_root / "configs/sources").glob("robomind*.yaml")):
+        for source in yaml.safe_load(file.read_text())["curate"]["sources"]:
+            RobomindSourceConfig.model_validate(source)

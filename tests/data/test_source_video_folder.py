@@ -1,0 +1,257 @@
+"""Plain videos with captions beside them, written here with PyAV alone, from the folder to a step of Stage I."""
+
+from __future__ import annotations
+
+import csv
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.data.captions import caption_table
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.episode import Episode
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.video_times import frame_times
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
+
+HEIGHT, WIDTH, FRAMES, RATE = 64, 96, 33, 16
+
+
+def pictures(seed: int, count: int = FRAMES, *, moving: bool = True) -> np.ndarray:
+    """A textured table that stands still; over it two blocks move on their own ways."""
+    random = np.random.default_rng(seed)
+    coarse = random.integers(60, 200, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+    frames = np.repeat(np.repeat(np.tile(coarse, (count, 1, 1, 1)), 8, 1), 8, 2)
+    for n in range(count if moving else 0):
+        left, top = int(30 + 25 * np.sin(0.35 * n + seed)), int(24 + 18 * np.cos(0.25 * n))
+        frames[n, top : top + 16, left : left + 16] = (230, 40, 30)
+        frames[n, 48 - top // 2 : 60 - top // 2, 90 - left : 102 - left] = (20, 60, 220)
+    return frames
+
+
+def write_video(
+    path: Path, frames: np.ndarray, *, rate: int = RATE, times: list[int] | None = None, codec: str = "libx264"
+) -> None:
+    """With B frames, so that file order is not the order of presentation; `times` in ticks of 1/(10 rate)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w", format="mp4") as out:
+        stream = out.add_stream(codec, rate=rate, options={"bf": "2", "crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 10 * rate)
+        for n, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            picture.pts = 10 * n if times is None else times[n]
+            picture.time_base = stream.codec_context.time_base
+            out.mux(stream.encode(picture))
+        out.mux(stream.encode(None))
+
+
+def settings(root: Path, **changes: Any) -> CurateConfig:
+    source = {"kind": "video_folder", "path": str(root), "name": "web", "split": "train", **changes}
+    return CurateConfig.model_validate({"sources": [source]})
+
+
+def test_videos_with_captions_beside_them_come_through(tmp_path: Path) -> None:
+    root = tmp_path / "raw"
+    write_video(root / "kitchen" / "one.mp4", pictures(1))
+    (root / "kitchen" / "one.txt").write_text("  pour the\n tea ")
+    write_video(root / "two.MP4", pictures(2, 20))
+    counts = curate(settings(root), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["splits"]) == (2, 2, {"train": 2})
+    curated = EpisodeSet.open(tmp_path / "out")
+    one, two = curated.rows
+    assert (one.episode_id, one.scene, one.instruction) == ("web-kitchen-one", "web-kitchen", "pour the tea")
+    assert (two.episode_id, two.scene, two.instruction) == ("web-two", "web", "")
+    assert (one.fps, one.num_frames, two.num_frames, one.views) == (RATE, FRAMES, 20, ("head",))
+    assert (one.stage1_ok, one.stage2_ok, one.stage2_reason) == (True, False, "missing_actions")
+    episode = curated.episode(0)
+    assert (episode.state_kind, episode.state.shape, episode.action.shape) == ("none", (FRAMES, 0), (FRAMES, 0))
+    # In order of presentation, although the file is not.
+    found = curated.frames(0, "head").astype(int)
+    assert np.abs(found - pictures(1)).mean() < 6
+    assert all(np.abs(found[n] - pictures(1)[n]).mean() < np.abs(found[n] - pictures(1)[n - 1]).mean() for n in (5, 20))
+
+
+def test_the_set_has_no_empty_columns_and_opens_in_lerobots_terms(tmp_path: Path) -> None:
+    write_video(tmp_path / "raw" / "one.mp4", pictures(1))
+    curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
+    info = json.loads((tmp_path / "out/datasets/unspecified/meta/info.json").read_text())
+    assert not {"observation.state", "action"} & set(info["features"])
+    stats = json.loads((tmp_path / "out/datasets/unspecified/meta/stats.json").read_text())
+    assert not {"observation.state", "action"} & set(stats)
+    contract = json.loads((tmp_path / "out/datasets/unspecified/meta/worldline/contract.json").read_text())
+    assert (contract["state_kind"], contract["action"]) == ("none", "none")
+
+
+@pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
+def test_lerobots_own_class_reads_a_set_without_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    write_video(tmp_path / "raw" / "one.mp4", pictures(1))
+    curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    opened = LeRobotDataset("local/set", root=tmp_path / "out/datasets/unspecified", video_backend="pyav")
+    assert len(opened) == FRAMES
+    assert opened[7]["observation.images.head"].shape == (3, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".jsonl", ".csv", "object"])
+def test_captions_may_be_in_one_table(tmp_path: Path, suffix: str) -> None:
+    rows = [{"clip": "kitchen/one.mp4", "text": 'pour, "slowly"'}, {"clip": "./two.mp4", "text": "wipe  it"}]
+    path = tmp_path / f"captions{'.json' if suffix == 'object' else suffix}"
+    if suffix == ".json":
+        path.write_text(json.dumps(rows))
+    elif suffix == "object":
+        path.write_text(json.dumps({row["clip"]: row["text"] for row in rows}))
+    elif suffix == ".jsonl":
+        path.write_text("\n".join(json.dumps(row) for row in rows) + "\n\n")
+    else:
+        with path.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, ["clip", "text"])
+            writer.writeheader()
+            writer.writerows(rows)
+    assert caption_table(path, "clip", "text") == {"kitchen/one.mp4": 'pour, "slowly"', "two.mp4": "wipe it"}
+    if suffix != "object":
+        with pytest.raises(ConfigError, match=r"(?s)lacks a text.*row 1.*named video.*clip, text"):
+            caption_table(path, "video", "text")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("captions.json", "{", "not valid JSON"),
+        ("captions.json", "3", "wrong shape"),
+        ("captions.jsonl", '{"video": "a.mp4", "caption": "x"}\n{"video": "a.mp4", "caption": "y"}', "two captions"),
+        ("captions.json", "[" * 100_000, "nested too deeply"),
+        ("captions.csv", "video,caption\na.mp4", "lacks a text"),
+        ("captions.xlsx", "", "unknown kind"),
+    ],
+)
+def test_damaged_tables_are_refused(tmp_path: Path, name: str, content: str, message: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(
+        DataError if message != "unknown kind" and message != "lacks a text" else ConfigError, match=message
+    ):
+        caption_table(tmp_path / name, "video", "caption")
+
+
+def test_what_is_no_usable_video_is_quarantined_and_the_rest_goes_on(tmp_path: Path) -> None:
+    root = tmp_path / "raw"
+    write_video(root / "good.mp4", pictures(1))
+    (root / "good.txt").write_text("push")
+    write_video(root / "silent.mp4", pictures(4))
+    write_video(root / "late.mp4", pictures(2, 20), times=[10 * n + (40 if n > 9 else 0) for n in range(20)])
+    (root / "late.txt").write_text("push")
+    content = (root / "good.mp4").read_bytes()
+    for name, cut in (("empty", b""), ("garbage", bytes(range(256)) * 8), ("cut", content[: len(content) // 2])):
+        (root / f"{name}.mp4").write_bytes(cut)
+        (root / f"{name}.txt").write_text("push")
+    (root / "strange.mp4").write_bytes(content[::1])
+    (root / "strange.txt").write_bytes(b"\xff\xfe\xfa")
+    (tmp_path / "secret.mp4").write_bytes(content)
+    (root / "link.mp4").symlink_to(tmp_path / "secret.mp4")
+    counts = curate(settings(root, require_caption=True), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (8, 1)
+    found = {row.episode_id.removeprefix("web-"): row.reason for row in EpisodeSet.open(tmp_path / "out").quarantine()}
+    assert found.pop("garbage") in ("unreadable", "truncated_video")
+    assert found == {
+        "silent": "missing_column",
+        "late": "wrong_fps",
+        "empty": "truncated_video",
+        "cut": "truncated_video",
+        "strange": "unreadable",
+        "link": "path_traversal",
+    }
+
+
+def test_paths_that_would_share_an_id_are_told_apart(tmp_path: Path) -> None:
+    write_video(tmp_path / "raw" / "a-b" / "c.mp4", pictures(1))
+    write_video(tmp_path / "raw" / "a" / "b-c.mp4", pictures(2))
+    counts = curate(settings(tmp_path / "raw"), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"]) == (2, 2)
+    assert len({row.episode_id for row in EpisodeSet.open(tmp_path / "out").rows}) == 2
+
+
+def test_frame_times_are_those_of_decoding(tmp_path: Path) -> None:
+    write_video(tmp_path / "one.mp4", pictures(3, 21))
+    with av.open(str(tmp_path / "one.mp4")) as container:
+        decoded = [frame.time for frame in container.decode(video=0)]
+    assert np.allclose(frame_times(tmp_path / "one.mp4"), np.asarray(decoded) - decoded[0], atol=1e-9)
+
+
+def test_a_state_without_columns_is_none_and_only_that() -> None:
+    about: dict[str, Any] = dict.fromkeys(("episode_id", "source", "embodiment", "scene", "instruction"), "x")
+    about |= {"task_family": "unknown", "outcome": "unknown", "split": "test", "fps": 8.0, "timestamps": np.zeros(1)}
+    for width, kind in ((0, "joints"), (1, "none")):
+        values = np.zeros((1, width), np.float32)
+        with pytest.raises(DataError, match="State has"):
+            Episode(**about, state=values, action=values, state_kind=kind)
+
+
+def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_root: Path, sample: Any) -> None:
+    """Together with a robot's recording: Stage I takes both, Stage II and the action tracks the robot's alone."""
+    import torch
+
+    from worldline_core.data.episode_set import EpisodeSetWriter
+    from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
+    from worldline_core.training.episode_rows import training_rows
+    from worldline_core.training.latent_store import LatentStore
+    from worldline_core.training.stage1 import Stage1Config, train_stage1
+
+    torch.set_num_threads(1)
+    root, robot = tmp_path / "raw", tmp_path / "robot"
+    write_video(root / "moving.mp4", pictures(1))
+    (root / "moving.txt").write_text("push the red block")
+    write_video(root / "still.mp4", pictures(2, moving=False))
+    with EpisodeSetWriter(robot, fps=8) as writer:
+        writer.add(*sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH))
+    config = settings(root)
+    both = CurateConfig(sources=(*config.sources, *_robot(robot)))
+    assert curate(both, {}, tmp_path / "set")["kept"] == 3
+
+    counts = filter_episodes(FilterConfig(), {"episodes": tmp_path / "set"}, tmp_path / "filtered")
+    assert counts["reasons"].get("static") == 1
+    rows = {row.episode_id: row for row in EpisodeSet.open(tmp_path / "filtered").rows}
+    assert (rows["web-moving"].stage1_ok, rows["web-moving"].stage2_reason) == (True, "missing_actions")
+
+    rendered = render_actions(
+        RenderActionsConfig.model_validate({"previews": 0}), {"episodes": tmp_path / "set"}, tmp_path / "tracks"
+    )
+    assert (rendered["found"], rendered["kept"]) == (3, 1)
+    assert rendered["quarantine_reasons"] == {"missing_actions": 2}
+
+    tokenizer = project_root / "artifacts" / "shipped" / "models" / "tokenizer"
+    inputs = {"episodes": tmp_path / "set", "tokenizer": tokenizer}
+    encode_latents(EncodeLatentsConfig(primary_alone=True), inputs, tmp_path / "latents")
+    store = LatentStore.open(tmp_path / "latents")
+    assert store.row("web-moving").views == ("head",)
+    assert len(store.row("episode-000").views) == 3
+    episodes = EpisodeSet.open(tmp_path / "set")
+    assert {row.episode_id for row in training_rows(store, episodes, stage=2)} == {"episode-000"}
+    assert len(training_rows(store, episodes, stage=1)) == 3
+
+    model = {
+        "latent_channels": store.latent_shape[0], "hidden_size": 24, "num_layers": 2, "num_heads": 2, "num_kv_heads": 1,
+        "head_dim": 12, "intermediate_size": 32, "rope_sections": [2, 2, 2], "vocab_size": 300,
+    }  # fmt: skip
+    stage1 = Stage1Config.model_validate(
+        {"model": model, "trainer": {"steps": 2, "batch_size": 3, "precision": "fp32"}, "clips": {"lengths": [9],
+         "view_weights": {"primary": 1}}}
+    )  # fmt: skip
+    metrics = train_stage1(stage1, {"episodes": tmp_path / "set", "latents": tmp_path / "latents"}, tmp_path / "stage1")
+    assert (metrics["steps"], metrics["clips"]) == (2, 6)
+    assert (tmp_path / "stage1" / "model.safetensors").is_file()
+
+
+def _robot(folder: Path) -> Any:
+    return CurateConfig.model_validate({"sources": [{"kind": "episode_set", "path": str(folder)}]}).sources

@@ -1,0 +1,220 @@
+"""Calibration that lies beside a dataset whose format has no place for it, in JSON or YAML.
+
+    views:
+      head:
+        width: 1280                  # of the image that K belongs to
+        height: 720
+        K: [[910.0, 0.0, 640.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]]
+        maps: camera_to_base         # what T maps: camera_to_base or base_to_camera
+        axes: opencv                 # opencv (x right, y down, z forward) or opengl (x right, y up, z backward)
+        T: [[...], [...], [...], [0, 0, 0, 1]]        # one matrix of a fixed camera, or a list of one a frame; metres
+        distortion: {model: radtan, coefficients: [...]}      # only where the images still have it
+
+Instead of T a view may name a feature of the dataset that holds the pose of each frame: `T_feature: {name: ..., format:
+xyz_rpy_fixed}` (x y z [m], roll pitch yaw [rad] about fixed axes) or `format: matrix` (16 numbers, row by row).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from worldline_core.config.base import StrictModel
+from worldline_core.data.episode import CameraTrack
+from worldline_core.data.json_file import read_json
+from worldline_core.data.limits import regular_file, too_large
+from worldline_core.data.recorded_poses import Extrinsics, camera_pose
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath
+from worldline_core.data.sources.base import LensConfig
+from worldline_core.geometry.camera_pose import CameraAxes, CameraPose
+from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
+
+MAX_YAML_BYTES = 16 << 20
+"""PyYAML takes about a hundred bytes of memory for each; calibrations of each frame belong into JSON."""
+_ASPECT_TOLERANCE = 0.01
+
+
+class PoseFeature(StrictModel):
+    """A feature of the dataset that holds a camera's pose."""
+
+    name: str
+    format: Literal["xyz_rpy_fixed", "matrix"]
+
+
+class CameraEntry(StrictModel):
+    """One view. `T` is checked for its shape when it is read: it may have thousands of rows."""
+
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+    K: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    maps: Extrinsics
+    axes: CameraAxes
+    T: list[Any] | None = None
+    T_feature: PoseFeature | None = None
+    distortion: LensConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> CameraEntry:
+        if (self.T is None) == (self.T_feature is None):
+            raise ValueError("give T or T_feature, one of them")
+        return self
+
+
+class CalibrationFile(StrictModel):
+    """The whole file."""
+
+    views: dict[str, CameraEntry] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class CalibratedView:
+    """A camera at the image size of the recording, its recorded poses, and its lens where images still show it."""
+
+    track: CameraTrack
+    pose: CameraPose
+    lens: LensConfig | None
+
+
+def read_calibration(path: AnyPath) -> CalibrationFile:
+    """A calibration file.
+
+    Raises: RejectedInputError: missing_calibration (no such file), unreadable, too_large, missing_column (a key that is
+        unknown or missing, or a value of another kind).
+    """
+    try:
+        content = read_json(path) if path.suffix.lower() == ".json" else _yaml(path)
+    except RejectedInputError as error:
+        if error.reason != "missing_file":
+            raise
+        raise RejectedInputError(
+            "missing_calibration",
+            "Calibration file is missing",
+            where=str(path),
+            next_step="write the file, or leave `calibration` out: such episodes then serve action-free training",
+            evidence={"file": path.name},
+        ) from error
+    try:
+        return CalibrationFile.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise RejectedInputError(
+            "missing_column",
+            "Calibration file is not understood",
+            where=f"{path}, {'.'.join(map(str, first['loc']))}",
+            expected=first["msg"],
+            next_step="see the layout in docs/sources.md",
+        ) from error
+
+
+def _yaml(path: AnyPath) -> Any:
+    from worldline_core.config.loader import read_yaml
+    from worldline_core.errors import ConfigError
+
+    file = regular_file(path, "Calibration file")
+    size = file.stat().st_size
+    if size > MAX_YAML_BYTES:
+        raise too_large("Calibration file is too large", where=str(path), limit=MAX_YAML_BYTES, got=size, unit="bytes")
+    try:
+        return read_yaml(file)
+    except (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
+        raise RejectedInputError(
+            "unreadable", "Calibration file is no YAML", where=str(path), got=str(error)
+        ) from error
+
+
+def calibrated_view(
+    view: str,
+    entry: CameraEntry,
+    *,
+    image_size: tuple[int, int],
+    num_frames: int,
+    read_feature: Callable[[str], np.ndarray],
+    where: str,
+) -> CalibratedView | None:
+    """The camera of a view; None where the dataset's own column holds no pose (all zeros: it was never measured).
+
+    Args:
+        image_size: (height, width) of the recorded video. K follows where only the scale differs.
+
+    Raises: RejectedInputError: missing_calibration (K is of another picture), length_mismatch, invalid_extrinsics,
+        missing_column.
+    """
+    height, width = image_size
+    if abs(entry.width * height / (entry.height * width) - 1) > _ASPECT_TOLERANCE:
+        raise RejectedInputError(
+            "missing_calibration",
+            "Calibration is of an image of another shape",
+            where=f"{where}, view {view}",
+            expected=f"the aspect of {width}x{height}",
+            got=f"{entry.width}x{entry.height}",
+            next_step="give K for the recorded image: what was cropped cannot be told from the sizes",
+            evidence={"view": view, "calibrated": [entry.width, entry.height], "recorded": [width, height]},
+        )
+    if entry.T_feature is not None:
+        matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")
+        if matrices is None:
+            return None
+    else:
+        matrices = _matrices(entry.T or [], num_frames, f"{where}, view {view}")
+    pose = camera_pose(view, matrices, extrinsics=entry.maps, axes=entry.axes, where=where)
+    track = CameraTrack.from_pose(view, np.asarray(entry.K), pose, width=entry.width, height=entry.height)
+    return CalibratedView(track.resized(width, height), pose, entry.distortion)
+
+
+def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
+    try:
+        values = np.asarray(listed, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise RejectedInputError(
+            "invalid_extrinsics", "Camera matrices have a wrong shape", where=where, expected="(4, 4)", got=str(error)
+        ) from error
+    values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3 or values.shape[1:] != (4, 4):
+        raise RejectedInputError(
+            "invalid_extrinsics",
+            "Camera matrices have a wrong shape",
+            where=where,
+            expected="(4, 4), or (N, 4, 4) with one a frame",
+            got=values.shape,
+            evidence={"shape": list(values.shape)},
+        )
+    if len(values) not in (1, num_frames):
+        raise RejectedInputError(
+            "length_mismatch",
+            "Camera poses and states differ in length",
+            where=where,
+            expected=f"1 or {num_frames} matrices",
+            got=len(values),
+            evidence={"states": num_frames, "extrinsics": len(values)},
+        )
+    return values
+
+
+def _feature_poses(
+    feature: PoseFeature, read_feature: Callable[[str], np.ndarray], num_frames: int, where: str
+) -> np.ndarray | None:
+    """(N or 1, 4, 4); one where all frames agree; None where nothing but zeros is written."""
+    values = read_feature(feature.name).astype(np.float64)
+    wanted = 6 if feature.format == "xyz_rpy_fixed" else 16
+    if values.shape != (num_frames, wanted):
+        raise RejectedInputError(
+            "length_mismatch",
+            "Camera poses have a wrong shape",
+            where=f"{where}, {feature.name}",
+            expected=(num_frames, wanted),
+            got=values.shape,
+            evidence={"feature": feature.name, "shape": list(values.shape)},
+        )
+    if not values.any():
+        return None
+    if (values == values[0]).all():
+        values = values[:1]
+    if feature.format == "matrix":
+        return values.reshape(-1, 4, 4)
+    return pose_from_euler_fixed_xyz(values[:, :3], values[:, 3:])
