@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from worldline_core.calibration.config import CalibrationDoctorConfig, Typical
-from worldline_core.calibration.observation import Motion, Observation, cell_centres
+from worldline_core.calibration.observation import Observation, cell_centres
 from worldline_core.calibration.reading import Reading
 from worldline_core.geometry.rigid import rigid_inverse, rotation_angle_deg
 
@@ -149,13 +149,10 @@ def energy_correlation(observation: Observation, reading: Reading, view: str) ->
     """Correlation over time of the speed of what moves a view (its own arm, or the fastest) with its mean change."""
     states, images = reading.steps(observation.num_images)
     own = [i for i, arm in enumerate(observation.arms) if arm.wrist_view == view]
-    speed = tool_speed(reading.tools)[:, own or slice(None)].max(axis=1)[states]
-    return correlation(speed, mean_change(observation.motion(view))[images])
-
-
-def mean_change(motion: Motion) -> np.ndarray:
-    """(n - 1,) mean change of the picture, of 255."""
-    return motion.change.mean(axis=(1, 2))
+    if "tools" not in reading.speeds:
+        reading.speeds["tools"] = tool_speed(reading.tools)
+    speed = reading.speeds["tools"][:, own or slice(None)].max(axis=1)[states]
+    return correlation(speed, observation.motion(view).mean_change[images])
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:

@@ -47,6 +47,11 @@ class Motion:
         """Whether anything moves at all."""
         return bool((self.change.max(axis=(1, 2)) > _STILL_CHANGE).sum() >= 4)
 
+    @cached_property
+    def mean_change(self) -> np.ndarray:
+        """(n - 1,) mean change of the picture, of 255."""
+        return self.change.mean(axis=(1, 2))
+
 
 @dataclass(frozen=True)
 class Observation:

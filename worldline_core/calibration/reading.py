@@ -51,6 +51,7 @@ class Reading:
     whole_arms: whether the points are those of whole arms.
     first_image: number of the image that belongs to frame 0 (may be negative).
     pose_terms: what poses alone say, once it is computed; shared by readings that differ in their images only.
+    speeds: likewise "tools": how fast they move (`image_evidence.tool_speed`).
     """
 
     conventions: RecordedConventions
@@ -67,6 +68,7 @@ class Reading:
     first_image: int
     _predicted: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
     pose_terms: dict[str, float] = field(default_factory=dict, repr=False)
+    speeds: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from worldline_core.data.episode import CameraTrack, Episode
@@ -9,27 +13,40 @@ from worldline_core.data.recorded_poses import camera_pose
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.errors import ConfigError
 
+if TYPE_CHECKING:
+    from worldline_core.geometry.embodiment import Embodiment
+
 # No joint of a manipulator turns further; larger numbers are degrees or encoder ticks.
 MAX_JOINT_RAD = 4 * np.pi
 _GRIPPER_MARGIN = 0.05
 TRAINING_SPLITS = ("train", "validation")
 EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
 """Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
+EVALUATION_ONLY = "evaluation_only"
+"""Noted in the conventions of episodes of other layouts that never do either."""
+_DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
+
+
+def says_droid(*names: str) -> bool:
+    """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
+    return any(_DROID.search(name) for name in names)
 
 
 def check_split(episode: Episode) -> None:
-    """Raises: ConfigError when an episode of an evaluation-only layout is given a split that trains or selects.
+    """Raises: ConfigError when an episode for evaluation only is given a split that trains or selects a model.
 
-    The layout is noted in the episode itself, so a set that was made of such recordings earlier is refused as well.
+    That is one of an evaluation-only layout, one declared so, and any whose source or robot is called DROID. The layout is noted in the episode itself, so a set that was made of such recordings earlier is refused as well.
     """
     layout = episode.conventions.get("layout")
-    if layout in EVALUATION_LAYOUTS and episode.split in TRAINING_SPLITS:
+    called = says_droid(episode.source, episode.embodiment)
+    kept_out = called or layout in EVALUATION_LAYOUTS or EVALUATION_ONLY in episode.conventions
+    if kept_out and episode.split in TRAINING_SPLITS:
         raise ConfigError(
             "Recordings for evaluation only were assigned to training",
             where=f"episode {episode.episode_id}, scene {episode.scene} ({layout})",
             expected="split test or ood_test",
             got=episode.split,
-            next_step="change curate.splits, or leave these scenes out of its patterns",
+            next_step="change the source's split or curate.splits; what is not DROID must not be called so",
         )
 
 
@@ -59,7 +76,9 @@ def check_joints(episode: Episode, tolerance_rad: float) -> bool:
     """
     if episode.state_kind != "joints":
         return False
-    worst = float(np.abs(episode.state).max())
+    names = episode.state_names or ()
+    joints = [i for i in range(episode.state.shape[1]) if i >= len(names) or not names[i].endswith("gripper")]
+    worst = float(np.abs(episode.state[:, joints]).max()) if joints else 0.0
     if worst > MAX_JOINT_RAD:
         raise RejectedInputError(
             "joint_out_of_range",
@@ -70,11 +89,9 @@ def check_joints(episode: Episode, tolerance_rad: float) -> bool:
             next_step="declare the unit of the source",
             evidence={"max_abs_rad": worst},
         )
-    from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
-
-    if episode.embodiment not in embodiment_names():
+    embodiment = _embodiment(episode.embodiment)
+    if embodiment is None:
         return False
-    embodiment = load_embodiment(episode.embodiment)
     if embodiment.state_size != episode.state.shape[1]:
         raise RejectedInputError(
             "length_mismatch",
@@ -112,6 +129,14 @@ def check_joints(episode: Episode, tolerance_rad: float) -> bool:
             evidence={"min": float(opening.min()), "max": float(opening.max())},
         )
     return True
+
+
+@lru_cache(maxsize=32)
+def _embodiment(name: str) -> Embodiment | None:
+    """None where it is not known. Read once: parsing takes as long as decoding a hundred frames."""
+    from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
+
+    return load_embodiment(name) if name in embodiment_names() else None
 
 
 def check_times(episode: Episode, tolerance: float) -> None:

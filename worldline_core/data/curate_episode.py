@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from functools import partial
 
 import numpy as np
 
 from worldline_core.data.curate_checks import (
     check_camera,
     check_joints,
-    check_split,
     check_times,
     check_values,
     stride_to,
 )
 from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.curate_description import described
 from worldline_core.data.episode import Episode
 from worldline_core.data.rejection import RejectedInputError
 from worldline_core.data.resize import fitted
 from worldline_core.data.sources.base import LoadedEpisode
+from worldline_core.data.thumbnails import ViewThumbnails
+from worldline_core.data.view_recording import RecordedView
 
 
 def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
@@ -56,41 +57,29 @@ def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
 
 @dataclass(frozen=True)
 class PreparedEpisode:
-    """An episode at the wanted rate and size, with its images in memory.
+    """An episode at the wanted rate and size, ready to be written; its images are read while they are.
 
     Attributes:
-        frames: by view, uint8 (N, H, W, 3).
+        frames: by view.
         masks: by view, bool (N, H, W), of the views that have them.
-        fingerprint: digest of the recorded states, actions and images.
+        described: the episode as the configuration describes it, once the thumbnails of its views are there.
     """
 
     episode: Episode
-    frames: dict[str, np.ndarray]
+    frames: dict[str, RecordedView]
     masks: dict[str, np.ndarray]
-    fingerprint: str
+    described: Callable[[Mapping[str, ViewThumbnails]], Episode]
 
 
 def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpisode:
-    """The episode as the set will hold it.
+    """The episode as the set will hold it. No image is decoded yet: that happens once, while the episode is written.
 
-    Raises: RejectedInputError (length_mismatch, too_short, wrong_fps, and whatever decoding raises); ConfigError when a
-        recording for evaluation only is given a training split.
+    Raises: RejectedInputError (too_short, wrong_fps).
     """
-    step = stride_to(loaded.episode, config.fps)
+    recorded = loaded.episode
+    step = config.stride or stride_to(recorded, config.fps)
     views = config.views or loaded.views
-    source_frames = {view: loaded.frames(view) for view in views}
-    for view, images in source_frames.items():
-        if len(images) != loaded.episode.num_video_frames:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Video and states differ in length",
-                where=f"episode {loaded.episode.episode_id}, view {view}",
-                expected=f"{loaded.episode.num_video_frames} frames",
-                got=f"{len(images)} frames",
-                evidence={"states": loaded.episode.num_video_frames, "frames": len(images)},
-            )
-    fingerprint = _fingerprint(loaded.episode, source_frames)
-    episode = loaded.episode if step == 1 else loaded.episode.cut(0, loaded.episode.num_frames, step)
+    episode = recorded if step == 1 else recorded.cut(0, recorded.num_frames, step)
     if episode.num_frames < config.min_frames:
         raise RejectedInputError(
             "too_short",
@@ -100,30 +89,31 @@ def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpis
             got=episode.num_frames,
             evidence={"frames": episode.num_frames},
         )
-    fits = {view: fitted(images.shape[1:3], config.image_size, config.fit) for view, images in source_frames.items()}
-    frames = {view: fits[view].frames(images[::step]) for view, images in source_frames.items()}
+    frames = {
+        view: RecordedView(
+            partial(loaded.each_image, view),
+            recorded.num_video_frames,
+            loaded.clips.get(view),
+            step,
+            config.image_size,
+            config.fit,
+        )
+        for view in views
+    }
     masks: dict[str, np.ndarray] = {}
     for view in views:
         mask = loaded.robot_masks(view)
         if mask is not None:
-            masks[view] = fits[view].masks(mask[::step])
-    cameras = {view: episode.cameras[view].transformed(fits[view]) for view in views if view in episode.cameras}
-    split = next((s for pattern, s in config.splits.items() if fnmatchcase(episode.scene, pattern)), episode.split)
+            masks[view] = fitted(mask.shape[1:3], config.image_size, config.fit).masks(mask[::step])
+    cameras = {
+        view: camera.transformed(fitted((camera.height, camera.width), config.image_size, config.fit))
+        for view in views
+        if (camera := episode.cameras.get(view)) is not None
+    }
     prepared = replace(
         episode,
         fps=config.fps or episode.fps,
         timestamps=np.arange(episode.num_frames) / (config.fps or episode.fps),
         cameras=cameras,
-        split=split,
-        primary_view=config.primary_view or episode.primary_view,
     )
-    check_split(prepared)
-    return PreparedEpisode(prepared, frames, masks, fingerprint)
-
-
-def _fingerprint(episode: Episode, frames: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for array in (episode.state, episode.action, *(frames[view] for view in sorted(frames))):
-        digest.update(str((array.shape, array.dtype.str)).encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    return PreparedEpisode(prepared, frames, masks, partial(described, config, prepared, tuple(views)))

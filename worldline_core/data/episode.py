@@ -21,7 +21,7 @@ VIEWS = ("head", "left_wrist", "right_wrist")
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
 Outcome = Literal["success", "failure", "unknown"]
 Split = Literal["train", "validation", "test", "ood_test", "bank"]
-StateKind = Literal["joints", "ee_pose"]
+StateKind = Literal["joints", "ee_pose", "none"]
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ class Episode:
 
     Attributes:
         state, action: (N, J) float32. With state_kind "joints": for each arm in order (left, right; a single arm is
-            right) joint positions [rad] then gripper opening. With "ee_pose": xyz [m], quaternion xyzw, gripper.
+            right) joint positions [rad] then gripper opening. With "ee_pose": xyz [m], quaternion xyzw, gripper. With
+            "none" (plain videos, for Stage I alone): no columns, (N, 0).
         action: commanded targets, same layout.
         timestamps: (N,) float64 seconds from the first frame.
         cameras: by view; empty when a source publishes no calibration.
@@ -143,6 +144,10 @@ class Episode:
     def __post_init__(self) -> None:
         where = f"episode {self.episode_id}"
         num_frames = len(self.timestamps)
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise RejectedInputError(
+                "wrong_fps", "Frame rate is no rate", where=where, expected="frames a second", got=repr(self.fps)
+            )
         if self.state.ndim != 2 or len(self.state) != num_frames or num_frames == 0:
             raise DataError(
                 "State has a wrong shape",
@@ -174,6 +179,14 @@ class Episode:
                     expected=f"{num_frames} (or 1) poses",
                     got=f"{len(camera.T_base_camera)} poses",
                 )
+        if self.video_frames is not None and not 0 <= self.video_frames <= num_frames:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Images and states differ in number",
+                where=where,
+                expected=f"0..{num_frames} images",
+                got=self.video_frames,
+            )
         if self.T_base_ee is not None and (self.T_base_ee.ndim != 4 or self.T_base_ee.shape[0] != num_frames):
             raise DataError(
                 "Tool poses have a wrong shape",
@@ -189,6 +202,14 @@ class Episode:
         ):
             if value not in allowed:
                 raise DataError(f"Unknown {name}", where=where, expected=" | ".join(allowed), got=repr(value))
+
+        if (self.state_kind == "none") != (self.state.shape[1] == 0):
+            raise DataError(
+                "State has no columns" if self.state.shape[1] == 0 else "State has columns, but is said to be none",
+                where=where,
+                expected="state_kind none for an episode without states, and only for one",
+                got=f"state_kind {self.state_kind}, state {self.state.shape}",
+            )
 
     def __len__(self) -> int:
         return len(self.timestamps)

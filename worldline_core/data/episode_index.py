@@ -10,7 +10,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from worldline_core.data.lerobot_v3 import read_table, write_table
+from worldline_core.data.lerobot_v3 import write_table
+from worldline_core.data.parquet_file import read_table
+from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import is_file
 
 INDEX_FILE = "index.parquet"
 QUARANTINE_FILE = "quarantine.parquet"
@@ -82,6 +85,7 @@ _INDEX = pa.schema(
     ]
 )
 _OPTIONAL = ("stage1_ok", "stage2_ok", "stage2_reason", "conventions")
+_NULLABLE = ("bank", "candidate", "stage2_reason")
 _QUARANTINE = pa.schema([(name, pa.string()) for name in ("episode_id", "source", "reason", "detail", "evidence")])
 
 
@@ -107,15 +111,47 @@ def write_index(root: Path, rows: Iterable[EpisodeRow]) -> None:
 
 
 def read_index(root: Path) -> list[EpisodeRow]:
-    """Rows of index.parquet.
+    """Rows of index.parquet; equal texts are one object.
 
-    Raises: DataError when the file or a column is missing.
+    Raises: DataError when the file or a column is missing, or holds values of another kind.
     """
-    required = [name for name in _INDEX.names if name not in _OPTIONAL]
-    read_table(root / INDEX_FILE, required)
-    whole = read_table(root / INDEX_FILE)
-    table = whole.select([name for name in _INDEX.names if name in whole.column_names])
-    return [EpisodeRow(**(row | {"views": tuple(row["views"])})) for row in table.to_pylist()]
+    path = root / INDEX_FILE
+    table = read_table(path)
+    missing = [name for name in _INDEX.names if name not in table.column_names and name not in _OPTIONAL]
+    if missing:
+        raise RejectedInputError(
+            "missing_column",
+            "Index lacks a column",
+            where=str(path),
+            expected=", ".join(missing),
+            got=", ".join(table.column_names),
+        )
+    names = [name for name in _INDEX.names if name in table.column_names]
+    try:
+        table = table.select(names).cast(pa.schema([_INDEX.field(name) for name in names]))
+    except (pa.ArrowException, ValueError) as error:
+        raise RejectedInputError(
+            "unreadable", "Index holds values of another kind", where=str(path), got=str(error)
+        ) from error
+    empty = [name for name in names if name not in _NULLABLE and table[name].null_count]
+    if empty:
+        raise RejectedInputError(
+            "unreadable", "Index has empty fields", where=str(path), expected="a value", got=", ".join(empty)
+        )
+    columns = {name: _shared_values(table[name]) for name in names}
+    return [EpisodeRow(**dict(zip(names, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+
+
+def _shared_values(column: pa.ChunkedArray) -> list[Any]:
+    """Python values of a column; equal texts, and equal lists of views, are one object each."""
+    if pa.types.is_string(column.type):
+        encoded = column.combine_chunks().dictionary_encode()
+        texts = encoded.dictionary.to_pylist()
+        return [None if index is None else texts[index] for index in encoded.indices.to_pylist()]
+    if pa.types.is_list(column.type):
+        known: dict[tuple[str, ...], tuple[str, ...]] = {}
+        return [known.setdefault(views, views) for views in map(tuple, column.to_pylist())]
+    return column.to_pylist()
 
 
 def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:
@@ -127,4 +163,4 @@ def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:
 def read_quarantine(root: Path) -> list[QuarantineRow]:
     """Rows of quarantine.parquet; a set without the file has an empty quarantine."""
     path = root / QUARANTINE_FILE
-    return [QuarantineRow(**row) for row in read_table(path, _QUARANTINE.names).to_pylist()] if path.is_file() else []
+    return [QuarantineRow(**row) for row in read_table(path, _QUARANTINE.names).to_pylist()] if is_file(path) else []

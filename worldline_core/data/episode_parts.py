@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -15,19 +14,12 @@ from typing import Any
 import numpy as np
 
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.fingerprint import fingerprint
 from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.statistics import image_histogram
-from worldline_core.data.video import PixelFormat, encode_video
+from worldline_core.data.thumbnail_cache import write_thumbnails
+from worldline_core.data.thumbnails import ViewThumbnails
+from worldline_core.data.view_recording import RecordedView, StoredView, VideoSettings, store_view
 from worldline_core.errors import DataError
-
-
-@dataclass(frozen=True)
-class VideoSettings:
-    """How images are encoded."""
-
-    crf: int = 18
-    preset: str = "slow"
-    pixel_format: PixelFormat = "yuv420p"
 
 
 def part_name(episode_id: str) -> str:
@@ -44,15 +36,46 @@ def ordered_views(views: Iterable[str]) -> list[str]:
 def write_part(
     folder: Path,
     episode: Episode,
-    frames: Mapping[str, np.ndarray],
+    views: Mapping[str, RecordedView],
     robot_masks: Mapping[str, np.ndarray] | None,
     video: VideoSettings,
+    described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
 ) -> None:
-    """Write one episode below `folder`; the part appears whole or not at all."""
+    """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
+
+    Args:
+        described: gives the episode as it is stored, where its description depends on what its views show.
+
+    Raises: RejectedInputError where the recordings cannot be read or do not belong to the states; DataError where images,
+        cameras and masks do not fit each other.
+    """
     final = folder / part_name(episode.episode_id)
     working = folder / f".{final.name}.{os.getpid()}"
     shutil.rmtree(working, ignore_errors=True)
     working.mkdir(parents=True)
+    try:
+        stored = {
+            view: store_view(recorded, working / f"{view}.mp4", episode.fps, video) for view, recorded in views.items()
+        }
+        _check_sizes(episode, stored, robot_masks)
+        if described is not None:
+            episode = described({view: kept.thumbnails for view, kept in stored.items()})
+        for view in stored:
+            if stored[view].copied:
+                write_thumbnails(working / f"{view}.arrow", stored[view].path, stored[view].thumbnails)
+        with (working / "arrays.npz").open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **_arrays(episode, stored, robot_masks))
+        description = json.dumps(_description(episode, stored, robot_masks), sort_keys=True)
+        (working / "part.json").write_text(description)
+        shutil.rmtree(final, ignore_errors=True)
+        working.rename(final)
+    finally:
+        shutil.rmtree(working, ignore_errors=True)
+
+
+def _arrays(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {
         "state": episode.state.astype(np.float32),
         "action": episode.action.astype(np.float32),
@@ -66,19 +89,15 @@ def write_part(
         arrays["gripper"] = episode.gripper.astype(np.float64)
     for view, mask in (robot_masks or {}).items():
         arrays[f"mask.{view}"] = np.packbits(mask.astype(bool))
-    for view, images in frames.items():
-        arrays[f"histogram.{view}"] = image_histogram(images)
-        encode_video(
-            working / f"{view}.mp4",
-            images,
-            episode.fps,
-            crf=video.crf,
-            preset=video.preset,
-            pixel_format=video.pixel_format,
-        )
-    with (working / "arrays.npz").open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
-    description = {
+    for view, kept in stored.items():
+        arrays[f"histogram.{view}"] = kept.histogram
+    return arrays
+
+
+def _description(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> dict[str, Any]:
+    return {
         "episode_id": episode.episode_id,
         "source": episode.source,
         "embodiment": episode.embodiment,
@@ -96,14 +115,15 @@ def write_part(
         "conventions": dict(episode.conventions),
         "num_frames": episode.num_frames,
         "video_frames": episode.num_video_frames,
-        "views": [[view, *frames[view].shape[1:3]] for view in ordered_views(frames)],
+        "views": [[view, *stored[view].size] for view in ordered_views(stored)],
+        "videos": {
+            view: {"codec": kept.codec, "pixel_format": kept.pixel_format, "copied": kept.copied}
+            for view, kept in stored.items()
+        },
         "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
         "masks": {view: list(mask.shape) for view, mask in (robot_masks or {}).items()},
-        "pixel_format": video.pixel_format,
+        "fingerprint": fingerprint(episode, {view: kept.thumbnails for view, kept in stored.items()}),
     }
-    (working / "part.json").write_text(json.dumps(description, sort_keys=True))
-    shutil.rmtree(final, ignore_errors=True)
-    working.rename(final)
 
 
 class Part:
@@ -133,6 +153,14 @@ class Part:
     def video(self, view: str) -> Path:
         return self.folder / f"{view}.mp4"
 
+    def copied(self, view: str) -> bool:
+        """Whether a view's video holds the packets of the recording, and so shares no file with other episodes."""
+        return bool(self["videos"][view]["copied"])
+
+    def thumbnails(self, view: str) -> Path:
+        """Where the thumbnails of a copied video lie (`thumbnail_cache`)."""
+        return self.folder / f"{view}.arrow"
+
     def mask(self, view: str) -> np.ndarray:
         """bool (N, H, W)."""
         shape = self.description["masks"][view]
@@ -150,7 +178,10 @@ class Part:
         return (
             self["embodiment"],
             self["fps"],
-            tuple(tuple(item) for item in self["views"]),
+            tuple(
+                (*item, self["videos"][item[0]]["codec"], self["videos"][item[0]]["pixel_format"])
+                for item in self["views"]
+            ),
             self.arrays["state"].shape[1],
             None if names is None else tuple(names),
             self["state_kind"],
@@ -165,17 +196,9 @@ def read_parts(folder: Path) -> list[Part]:
     return sorted(found, key=lambda part: part["episode_id"])
 
 
-def check_frames(
-    episode: Episode,
-    frames: Mapping[str, np.ndarray],
-    robot_masks: Mapping[str, np.ndarray] | None,
-    image_size: tuple[int, int] | None,
-) -> None:
-    """Raises: DataError when images, masks and states of an episode do not belong together."""
+def check_images(episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
+    """Raises: DataError when images in memory are none; RejectedInputError when they and the states differ in number."""
     where = f"episode {episode.episode_id}"
-    if not frames:
-        raise DataError("Episode has no images", where=where, expected="at least one view", got="none")
-    expected = episode.num_video_frames
     for view, images in frames.items():
         if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
             raise DataError(
@@ -184,35 +207,38 @@ def check_frames(
                 expected="uint8 (N, H, W, 3)",
                 got=f"{images.dtype} {images.shape}",
             )
-        if len(images) != expected:
+        if len(images) != episode.num_video_frames:
             raise RejectedInputError(
                 "length_mismatch",
                 "Images and states differ in number",
                 where=f"{where}, view {view}",
-                expected=f"{expected} frames",
+                expected=f"{episode.num_video_frames} frames",
                 got=f"{len(images)} frames",
             )
-        if image_size is not None and tuple(images.shape[1:3]) != tuple(image_size):
-            raise DataError(
-                "Images have a wrong size",
-                where=f"{where}, view {view}",
-                expected=str(image_size),
-                got=str(images.shape[1:3]),
-            )
+
+
+def _check_sizes(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> None:
+    where = f"episode {episode.episode_id}"
+    for view, kept in stored.items():
         camera = episode.cameras.get(view)
-        if camera is not None and (camera.height, camera.width) != images.shape[1:3]:
-            raise DataError(
+        if camera is not None and (camera.height, camera.width) != kept.size:
+            raise RejectedInputError(
+                "missing_calibration",
                 "Camera is calibrated for another image size",
                 where=f"{where}, view {view}",
-                expected=f"{images.shape[1]}x{images.shape[2]}",
+                expected=f"{kept.size[0]}x{kept.size[1]}",
                 got=f"{camera.height}x{camera.width}",
                 next_step="use CameraTrack.resized so that K follows the resize",
+                evidence={"view": view, "images": list(kept.size), "calibrated": [camera.height, camera.width]},
             )
     for view, mask in (robot_masks or {}).items():
-        if view not in frames or mask.shape != frames[view].shape[:3]:
+        expected = (episode.num_video_frames, *stored[view].size) if view in stored else None
+        if mask.shape != expected:
             raise DataError(
                 "Robot masks do not match the images",
                 where=f"{where}, view {view}",
-                expected=str(frames[view].shape[:3]) if view in frames else "a view with images",
-                got=str(mask.shape),
+                expected=expected or "a view with images",
+                got=mask.shape,
             )

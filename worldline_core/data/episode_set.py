@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,13 @@ import numpy as np
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.json_file import parse_json
 from worldline_core.data.lerobot_v3 import IMAGE_PREFIX, LeRobotV3Dataset
 from worldline_core.data.sidecar import Sidecar
-from worldline_core.data.source_paths import inside
+from worldline_core.data.source_paths import inside, is_remote
+from worldline_core.data.thumbnail_cache import cache_path, read_thumbnails
+from worldline_core.data.thumbnails import ThumbnailMaker, ViewThumbnails
+from worldline_core.data.video_clip import VideoClip, read_clip
 from worldline_core.errors import DataError
 
 __all__ = ["EpisodeRow", "EpisodeSet", "EpisodeSetWriter", "QuarantineRow"]
@@ -98,7 +102,9 @@ class EpisodeSet:
                 expected="a relative path",
                 got=relative,
             )
-        return Path(os.path.normpath(self.root / relative)) if self._allow_linked else inside(self.root, relative)
+        if not self._allow_linked or is_remote(self.root):  # a published set holds its datasets
+            return inside(self.root, relative)
+        return Path(os.path.normpath(self.root / relative))
 
     def _open(self, i: int) -> tuple[LeRobotV3Dataset, Sidecar]:
         key = self.rows[i].dataset
@@ -117,11 +123,13 @@ class EpisodeSet:
         stored = sidecar.trajectory(row.episode_index) or {}
         state = stored.get("state")
         action = stored.get("action")
-        if state is None or action is None:
+        length = int(dataset.row(row.episode_index)["length"])
+        if sidecar.contract["state_kind"] == "none":
+            state = action = np.zeros((length, 0), dtype=np.float32)
+        elif state is None or action is None:
             state = dataset.column(row.episode_index, "observation.state").astype(np.float32, copy=False)
             action = dataset.column(row.episode_index, "action").astype(np.float32, copy=False)
         names = sidecar.contract.get("state_names")
-        length = int(dataset.row(row.episode_index)["length"])
         whole = Episode(
             episode_id=row.episode_id,
             source=row.source,
@@ -144,7 +152,7 @@ class EpisodeSet:
             state_names=None if names is None else tuple(names),
             state_kind=sidecar.contract["state_kind"],
             video_frames=None if length == len(state) else length,
-            conventions=json.loads(row.conventions),
+            conventions=_conventions(row),
         )
         if not 0 <= row.start < row.stop <= whole.num_frames:
             raise DataError(
@@ -182,8 +190,52 @@ class EpisodeSet:
             )
         return dataset.frames(row.episode_index, IMAGE_PREFIX + view, [row.start + index for index in wanted])
 
+    def clip(self, i: int, view: str) -> VideoClip:
+        """Where the frames of a view of row i lie, cut to its segment, for those who decode themselves.
+
+        Raises: DataError when the view is missing.
+        """
+        row = self.rows[i]
+        if view not in row.views:
+            raise DataError(
+                "Episode has no such view",
+                where=f"episode {row.episode_id}",
+                expected=", ".join(row.views),
+                got=view,
+            )
+        dataset, _ = self._open(i)
+        place = dataset.video(row.episode_index, IMAGE_PREFIX + view)
+        return VideoClip(place.path, row.video_frames, dataset.fps, place.from_time, row.start)
+
+    def thumbnails(self, i: int, view: str) -> ViewThumbnails:
+        """Small grey images of a view of row i: those that curation left beside the set, else made from its video. They are
+        the same either way.
+
+        Raises: DataError when the view or the file is missing, or the video is truncated.
+        """
+        row = self.rows[i]
+        clip = self.clip(i, view)
+        whole = replace(clip, skip=0, num_frames=int(self._open(i)[0].row(row.episode_index)["length"]))
+        dataset = self.dataset_path(i)
+        stored = None
+        if isinstance(clip.path, Path) and clip.path.is_relative_to(dataset.parents[1]):
+            stored = read_thumbnails(cache_path(dataset.parents[1], clip.path), clip.path)
+        if stored is None or len(stored) != whole.num_frames:
+            maker = ThumbnailMaker(row.fps)
+            for picture in read_clip(whole):
+                maker.add(picture.luma, full_range=picture.full_range)
+            stored = maker.thumbnails()
+        return stored.cut(row.start, row.start + row.video_frames)
+
     def robot_masks(self, i: int, view: str) -> np.ndarray | None:
         """bool (N, H, W) masks of a view where the recording has them, else None."""
         row = self.rows[i]
         mask = self._open(i)[1].mask(row.episode_index, view)
         return None if mask is None else mask[row.start : row.start + row.video_frames]
+
+
+def _conventions(row: EpisodeRow) -> dict[str, str | float | int]:
+    found = parse_json(row.conventions, f"index, conventions of episode {row.episode_id}")
+    if not isinstance(found, dict):
+        raise DataError("Conventions are no mapping", where=f"episode {row.episode_id}", got=row.conventions[:200])
+    return found

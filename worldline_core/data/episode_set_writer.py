@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -27,8 +28,7 @@ from worldline_core.data.episode_index import (
 )
 from worldline_core.data.episode_parts import (
     Part,
-    VideoSettings,
-    check_frames,
+    check_images,
     part_name,
     read_parts,
     write_part,
@@ -36,9 +36,14 @@ from worldline_core.data.episode_parts import (
 from worldline_core.data.lerobot_v3_writer import write_dataset
 from worldline_core.data.sidecar import write_sidecar
 from worldline_core.data.source_paths import safe_name
+from worldline_core.data.thumbnails import ViewThumbnails
 from worldline_core.data.video import PixelFormat
+from worldline_core.data.view_recording import RecordedView, VideoMode, VideoSettings
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
+
+VIDEOS_FILE = "videos.json"
+"""How many of the set's videos were copied as they were recorded, how many encoded, and in which codecs they are."""
 
 
 class EpisodeSetWriter:
@@ -49,6 +54,7 @@ class EpisodeSetWriter:
         fps: frame rate every episode must have; None accepts several (each rate becomes a dataset of its own).
         image_size: (H, W) every image must have; None accepts several.
         video_crf: x264 quality; 18 is visually exact, 28 small.
+        video_mode: "auto" copies encoded videos in which nothing changes, "encode" encodes every picture.
 
     Raises: DataError when the folder already holds a finished set.
     """
@@ -62,6 +68,7 @@ class EpisodeSetWriter:
         video_preset: str = "slow",
         pixel_format: PixelFormat = "yuv420p",
         video_megabytes: int = 200,
+        video_mode: VideoMode = "auto",
     ) -> None:
         if self.finished(root):
             raise DataError(
@@ -72,7 +79,7 @@ class EpisodeSetWriter:
         self.root = root
         self.fps = fps
         self.image_size = image_size
-        self.video = VideoSettings(video_crf, video_preset, pixel_format)
+        self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode)
         self.video_megabytes = video_megabytes
         self._work = root / "run" / "episodes"
         self._parts = self._work / "parts"
@@ -102,18 +109,28 @@ class EpisodeSetWriter:
     def add(
         self,
         episode: Episode,
-        frames: Mapping[str, np.ndarray],
+        frames: Mapping[str, np.ndarray | RecordedView],
         robot_masks: Mapping[str, np.ndarray] | None = None,
+        described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
     ) -> None:
         """Add one episode.
 
         Args:
-            frames: by view, uint8 (N, H, W, 3) RGB; N = episode.num_video_frames.
+            frames: by view, uint8 (N, H, W, 3) RGB with N = episode.num_video_frames, or what is read, picture by
+                picture, while it is written.
             robot_masks: by view, bool (N, H, W).
+            described: gives the episode as it is stored, where its description depends on what its views show.
 
-        Raises: DataError when frames, masks, cameras and states do not belong together.
+        Raises: DataError when frames, masks, cameras and states do not belong together; RejectedInputError for
+            recordings that cannot be read.
         """
-        check_frames(episode, frames, robot_masks, self.image_size)
+        if not frames:
+            raise DataError(
+                "Episode has no images", where=f"episode {episode.episode_id}", expected="at least one view", got="none"
+            )
+        in_memory = {view: images for view, images in frames.items() if isinstance(images, np.ndarray)}
+        check_images(episode, in_memory)
+        self._check_image_size(episode, in_memory)
         safe_name(episode.embodiment, "Embodiment")
         for view in frames:
             safe_name(view, "View")
@@ -124,7 +141,18 @@ class EpisodeSetWriter:
                 expected=f"{self.fps} fps",
                 got=f"{episode.fps} fps",
             )
-        write_part(self._parts, episode, frames, robot_masks, self.video)
+        views = {view: RecordedView.of(v) if isinstance(v, np.ndarray) else v for view, v in frames.items()}
+        write_part(self._parts, episode, views, robot_masks, self.video, described)
+
+    def _check_image_size(self, episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
+        for view, images in frames.items():
+            if self.image_size is not None and tuple(images.shape[1:3]) != tuple(self.image_size):
+                raise DataError(
+                    "Images have a wrong size",
+                    where=f"episode {episode.episode_id}, view {view}",
+                    expected=str(self.image_size),
+                    got=str(images.shape[1:3]),
+                )
 
     def quarantine(
         self,
@@ -137,6 +165,14 @@ class EpisodeSetWriter:
         """Note an input that did not get through."""
         row = QuarantineRow(episode_id, source, reason, detail, json.dumps(dict(evidence or {}), sort_keys=True))
         write_json_atomic(self._rejected / f"{part_name(episode_id)}.json", asdict(row))
+
+    def recorded(self, episode_id: str) -> Part | QuarantineRow | None:
+        """What became of an episode so far; None when it was neither added nor quarantined."""
+        name = part_name(episode_id)
+        if (self._parts / name).is_dir():
+            return Part(self._parts / name)
+        rejected = self._rejected / f"{name}.json"
+        return QuarantineRow(**json.loads(rejected.read_text())) if rejected.is_file() else None
 
     def kept(self) -> list[Part]:
         """Episodes added so far, by id."""
@@ -178,6 +214,7 @@ class EpisodeSetWriter:
             write_dataset(dataset, members, video_megabytes=self.video_megabytes)
             write_sidecar(dataset, members)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
+        write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
         write_quarantine(self.root, rejected)
         write_index(self.root, sorted(rows, key=lambda row: row.episode_id))
         # Renamed first: a kill while deleting must not leave a folder that looks like unfinished work.
@@ -191,10 +228,19 @@ class EpisodeSetWriter:
         return {"kept": len(parts), "quarantined": len(rejected), "reasons": dict(sorted(reasons.items()))}
 
 
+def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
+    videos = [video for part in parts for video in part["videos"].values()]
+    copied = sum(video["copied"] for video in videos)
+    codecs = Counter(f"{video['codec']} {video['pixel_format']}" for video in videos)
+    return {"copied": copied, "encoded": len(videos) - copied, "codecs": dict(sorted(codecs.items()))}
+
+
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
     views = tuple(part.views)
     uncalibrated = any(view not in part["cameras"] for view in views)
     stage2_reason = "missing_view" if len(views) < 2 else "missing_calibration" if uncalibrated else None
+    if part["state_kind"] == "none":
+        stage2_reason = "missing_actions"
     return EpisodeRow(
         episode_id=part["episode_id"],
         dataset=dataset,

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_MAX_IMAGES = 64
+_MAX_IMAGES = 32
+_LARGE_SIDE = 300
+_SAMPLED_SIDE = 150
 
 
 def vector_statistics(values: np.ndarray) -> dict[str, np.ndarray]:
@@ -32,11 +35,32 @@ def vector_statistics(values: np.ndarray) -> dict[str, np.ndarray]:
     return result | dict(zip(QUANTILES, levels, strict=True))
 
 
-def image_histogram(frames: np.ndarray) -> np.ndarray:
-    """Counts (3, 256) of the 8-bit values of each channel over at most 64 evenly spread frames (N, H, W, 3)."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_IMAGES)).round().astype(int))
-    sample = frames[chosen]
-    return np.stack([np.bincount(sample[..., channel].reshape(-1), minlength=256) for channel in range(3)])
+class ImageSampler:
+    """Counts the values of some pixels of some pictures, as LeRobot does (datasets/compute_stats.py): at most 32 pictures
+    evenly spread, and of images above 300 pixels every k-th pixel of both sides, k such that about 150 remain.
+
+    Args:
+        num_frames: of the video.
+    """
+
+    def __init__(self, num_frames: int) -> None:
+        spread = np.linspace(0, num_frames - 1, min(num_frames, _MAX_IMAGES))
+        self._chosen = frozenset(np.unique(spread.round().astype(int)).tolist())
+        self.histogram = np.zeros((3, 256), dtype=np.int64)
+        """Counts (3, 256) of the 8-bit values of each channel."""
+
+    def wants(self, number: int) -> bool:
+        """Whether a picture is one of those to be added."""
+        return number in self._chosen
+
+    def add(self, image: np.ndarray) -> None:
+        """One of the wanted pictures, uint8 (H, W, 3)."""
+        longest = max(image.shape[:2])
+        every = longest // _SAMPLED_SIDE if longest >= _LARGE_SIDE else 1
+        sample = np.ascontiguousarray(image[::every, ::every])
+        for channel in range(3):
+            counts = cv2.calcHist([sample], [channel], None, [256], [0, 256])
+            self.histogram[channel] += counts.reshape(-1).astype(np.int64)
 
 
 def image_statistics(histograms: Sequence[np.ndarray], num_frames: int) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -64,6 +64,14 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
         _check_size(images, lenses[view].image_size, where, view)
         return lenses[view].frames(images)
 
+    def images(view: str) -> Iterator[np.ndarray]:
+        for image in loaded.each_image(view):
+            if view in lenses:
+                _check_size(image[None], lenses[view].image_size, where, view)
+                yield lenses[view].frames(image[None])[0]
+            else:
+                yield image
+
     def robot_masks(view: str) -> np.ndarray | None:
         masks = loaded.robot_masks(view)
         if masks is None or view not in lenses:
@@ -73,7 +81,15 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
 
     noted = {**loaded.episode.conventions, "undistorted": _described(loaded.distortions)}
     episode = replace(loaded.episode, cameras=cameras, conventions=noted)
-    return replace(loaded, episode=episode, frames=frames, robot_masks=robot_masks, distortions={})
+    return replace(
+        loaded,
+        episode=episode,
+        frames=frames,
+        robot_masks=robot_masks,
+        distortions={},
+        clips={view: clip for view, clip in loaded.clips.items() if view not in lenses},
+        images=images,
+    )
 
 
 def _described(distortions: Mapping[str, Distortion]) -> str:

@@ -10,19 +10,21 @@ presentation order equals file order: clips can be joined without encoding again
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from types import TracebackType
+from typing import Literal, Self
 
 import av
-import av.error
 import cv2
 import numpy as np
 from av.bitstream import BitStreamFilterContext
 from av.codec.context import Flags
 
+from worldline_core.data.nal_units import length_prefixed
 from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.source_paths import AnyPath
+from worldline_core.data.video_clip import FRAME_TOLERANCE, open_video, seek_before, wrong_count
 from worldline_core.errors import DataError
 
 PixelFormat = Literal["yuv420p", "yuv444p"]
@@ -34,6 +36,8 @@ _RGB_TO_YUV = np.array(
 ) / np.float32(255.0)
 _YUV_OFFSET = (16.0, 128.0, 128.0)
 _KEY_FRAME_INTERVAL = 250
+BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
+"""How an mp4 is opened for writing, so that its bytes hold no times and no versions."""
 X264_PARAMETERS = "cpu-independent=1"
 """Without this x264 chooses other algorithms on other processors, and with AVX-512 about one clip in a hundred came out
 differently from run to run."""
@@ -65,6 +69,92 @@ def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
     return flat.reshape(height * 3 // 2, width)
 
 
+class VideoEncoder:
+    """Writes an H.264 mp4 picture by picture; use as a context manager. Its bytes depend on the arguments alone.
+
+    Args:
+        size: (height, width); both even for yuv420p.
+        crf: quality, 0 (exact up to the colour conversion) .. 51.
+
+    Raises: DataError for a size or rate that cannot be encoded.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        size: tuple[int, int],
+        fps: float,
+        *,
+        crf: int = 18,
+        preset: str = "slow",
+        pixel_format: PixelFormat = "yuv420p",
+    ) -> None:
+        height, width = size
+        if pixel_format == "yuv420p" and (height % 2 or width % 2):
+            raise DataError(
+                "yuv420p needs even image sides",
+                where=str(path),
+                expected="even height and width",
+                got=f"{height}x{width}",
+                next_step="choose another image size, or pixel_format yuv444p",
+            )
+        self.path = path
+        self.size = size
+        self.count = 0
+        self._rate = frame_rate(fps)
+        self._pixel_format: PixelFormat = pixel_format
+        self._out = av.open(str(path), "w", format="mp4", options=BITEXACT)
+        stream = self._out.add_stream("libx264", rate=self._rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
+        context = stream.codec_context
+        context.thread_count = 1
+        context.time_base = 1 / self._rate
+        context.flags |= int(Flags.bitexact)
+        stream.options = {
+            "crf": str(crf),
+            "preset": preset,
+            "bf": "0",
+            "g": str(_KEY_FRAME_INTERVAL),
+            "threads": "1",
+            "x264-params": X264_PARAMETERS,
+            "colorspace": "smpte170m",
+            "color_range": "tv",
+        }
+        self._stream = stream
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write what the encoder still holds. Of a picture that was refused nothing is in the file."""
+        if self.count:
+            self._out.mux(self._stream.encode(None))
+        self._out.close()
+
+    def add(self, image: np.ndarray) -> None:
+        """The next picture, uint8 (H, W, 3) RGB.
+
+        Raises: DataError when it has another size or type.
+        """
+        if image.dtype != np.uint8 or image.shape != (*self.size, 3):
+            raise DataError(
+                "Pictures of a video differ",
+                where=f"{self.path}, frame {self.count}",
+                expected=f"uint8 {(*self.size, 3)}",
+                got=f"{image.dtype} {image.shape}",
+            )
+        picture = av.VideoFrame.from_ndarray(_planar(image, self._pixel_format), format=self._pixel_format)
+        picture.pts = self.count
+        picture.time_base = 1 / self._rate
+        self._out.mux(self._stream.encode(picture))
+        self.count += 1
+
+
 def encode_video(
     path: Path,
     frames: np.ndarray,
@@ -89,39 +179,10 @@ def encode_video(
             expected="uint8 (N > 0, H, W, 3)",
             got=f"{frames.dtype} {frames.shape}",
         )
-    height, width = frames.shape[1:3]
-    if pixel_format == "yuv420p" and (height % 2 or width % 2):
-        raise DataError(
-            "yuv420p needs even image sides",
-            where=str(path),
-            expected="even height and width",
-            got=f"{height}x{width}",
-            next_step="choose another image size, or pixel_format yuv444p",
-        )
-    rate = frame_rate(fps)
-    with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact", "movflags": "+faststart"}) as out:
-        stream = out.add_stream("libx264", rate=rate)
-        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
-        context = stream.codec_context
-        context.thread_count = 1
-        context.time_base = 1 / rate
-        context.flags |= int(Flags.bitexact)
-        stream.options = {
-            "crf": str(crf),
-            "preset": preset,
-            "bf": "0",
-            "g": str(_KEY_FRAME_INTERVAL),
-            "threads": "1",
-            "x264-params": X264_PARAMETERS,
-            "colorspace": "smpte170m",
-            "color_range": "tv",
-        }
-        for index, frame in enumerate(frames):
-            picture = av.VideoFrame.from_ndarray(_planar(frame, pixel_format), format=pixel_format)
-            picture.pts = index
-            picture.time_base = 1 / rate
-            out.mux(stream.encode(picture))
-        out.mux(stream.encode(None))
+    size = frames.shape[1], frames.shape[2]
+    with VideoEncoder(path, size, fps, crf=crf, preset=preset, pixel_format=pixel_format) as encoder:
+        for frame in frames:
+            encoder.add(frame)
 
 
 def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float) -> None:
@@ -133,7 +194,7 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
     Raises: DataError when a part holds another number of frames than stated.
     """
     rate = frame_rate(fps)
-    with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact", "movflags": "+faststart"}) as out:
+    with av.open(str(path), "w", format="mp4", options=BITEXACT) as out:
         stream = None
         first_frame = 0
         for part, expected in parts:
@@ -146,7 +207,8 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
                 ticks = 1 / (rate * (template.time_base or 1 / rate))
                 # The encoder's own message (a kilobyte of settings) would otherwise repeat for each clip.
                 without_message = BitStreamFilterContext("filter_units=remove_types=6", template)
-                for packet in _filtered(source.demux(template), without_message):
+                for filtered in _filtered(source.demux(template), without_message):
+                    packet = length_prefixed(filtered, template)
                     packet.pts = packet.dts = round((first_frame + count) * ticks)
                     packet.stream = stream
                     out.mux(packet)
@@ -168,56 +230,19 @@ def _filtered(packets: Iterator[av.Packet], context: BitStreamFilterContext) -> 
     yield from context.filter(None)
 
 
-def iterate_frames(path: Path, start_time: float = 0.0) -> Iterator[tuple[float, np.ndarray]]:
+def iterate_frames(path: AnyPath, start_time: float = 0.0) -> Iterator[tuple[float, np.ndarray]]:
     """Yield (presentation time in seconds, uint8 (H, W, 3) RGB) from the key frame at or before start_time.
 
-    Raises: DataError when the file is missing or has no readable video; a stream that breaks in the middle ends early.
+    Raises: RejectedInputError when the file is missing, has no readable video or breaks off.
     """
-    if not path.is_file():
-        raise RejectedInputError(
-            "missing_file",
-            "Video file is missing",
-            where=str(path),
-            next_step="restore the file or drop the episode",
-        )
-    try:
-        container = av.open(str(path))
-    except av.error.FFmpegError as error:
-        raise _undecodable(path, error) from error
-    with container:
-        if not container.streams.video:
-            raise RejectedInputError(
-                "unreadable",
-                "File holds no video stream",
-                where=str(path),
-                expected="one video stream",
-                got="none",
-            )
-        stream = container.streams.video[0]
+    with open_video(path) as (container, stream):
         time_base = stream.time_base or Fraction(1, 1000)
-        stream.thread_type = "NONE"  # small pictures decode faster than threads start
-        try:
-            if start_time > 0:
-                container.seek(max(round(start_time / time_base), 0), stream=stream, backward=True, any_frame=False)
-            for frame in container.decode(stream):
-                if frame.pts is not None:
-                    yield float(frame.pts * time_base), frame.to_ndarray(format="rgb24")
-        except av.error.FFmpegError as error:
-            raise _undecodable(path, error) from error
+        for frame in seek_before(container, stream, start_time):
+            if frame.pts is not None:
+                yield float(frame.pts * time_base), frame.to_ndarray(format="rgb24")
 
 
-def _undecodable(path: Path, error: Exception) -> RejectedInputError:
-    return RejectedInputError(
-        "truncated_video",
-        "Video cannot be decoded",
-        where=str(path),
-        expected="a complete video file",
-        got=str(error),
-        next_step="copy the file again; it may be truncated",
-    )
-
-
-def decode_video(path: Path, expected_frames: int | None = None) -> np.ndarray:
+def decode_video(path: AnyPath, expected_frames: int | None = None) -> np.ndarray:
     """All frames of a video, uint8 (N, H, W, 3).
 
     Raises: DataError naming the file and the frame counts when it is truncated, undecodable or of another length.
@@ -226,16 +251,16 @@ def decode_video(path: Path, expected_frames: int | None = None) -> np.ndarray:
     try:
         frames.extend(image for _, image in iterate_frames(path))
     except RejectedInputError as error:
-        if error.reason == "missing_file":
+        if error.reason != "truncated_video":
             raise
-        raise _wrong_count(path, expected_frames, len(frames), str(error.got)) from error
+        raise wrong_count(path, expected_frames, len(frames), str(error.got)) from error
     if not frames or (expected_frames is not None and len(frames) != expected_frames):
-        raise _wrong_count(path, expected_frames, len(frames), None)
+        raise wrong_count(path, expected_frames, len(frames))
     return np.stack(frames)
 
 
 def decode_segment(
-    path: Path, from_time: float, count: int, fps: float, indices: Sequence[int] | None = None
+    path: AnyPath, from_time: float, count: int, fps: float, indices: Sequence[int] | None = None
 ) -> np.ndarray:
     """Exact frames of one clip inside a joined video, uint8 (len, H, W, 3).
 
@@ -260,59 +285,31 @@ def decode_segment(
     found: dict[int, np.ndarray] = {}
     broken: str | None = None
     try:
-        for time, image in iterate_frames(path, start_time=from_time + min(wanted) / fps):
-            number = (time - from_time) * fps
-            index = round(number)
-            if index in needed and abs(number - index) < 0.25:
-                found[index] = image
-            if index >= last:
-                break
+        with open_video(path) as (container, stream):
+            time_base = stream.time_base or Fraction(1, 1000)
+            for frame in seek_before(container, stream, from_time + min(wanted) / fps):
+                if frame.pts is None:
+                    continue
+                number = (float(frame.pts * time_base) - from_time) * fps
+                index = round(number)
+                if index in needed and abs(number - index) < FRAME_TOLERANCE:
+                    found[index] = frame.to_ndarray(format="rgb24")
+                if index >= last:
+                    break
     except RejectedInputError as error:
-        if error.reason == "missing_file":
+        if error.reason != "truncated_video":
             raise
         broken = str(error.got)
     if len(found) != len(needed):
-        raise _wrong_count(path, len(needed), len(found), broken)
+        raise wrong_count(path, len(needed), len(found), broken)
     return np.stack([found[i] for i in wanted])
 
 
-def video_size(path: Path) -> tuple[int, int, float]:
+def video_size(path: AnyPath) -> tuple[int, int, float]:
     """(height, width, frames per second) from the container, without decoding.
 
     Raises: DataError when the file is missing or not a video.
     """
-    if not path.is_file():
-        raise RejectedInputError(
-            "missing_file",
-            "Video file is missing",
-            where=str(path),
-            next_step="restore the file or drop the episode",
-        )
-    try:
-        with closing(av.open(str(path))) as container:
-            if not container.streams.video:
-                raise RejectedInputError(
-                    "unreadable",
-                    "File holds no video stream",
-                    where=str(path),
-                    expected="one video stream",
-                    got="none",
-                )
-            stream = container.streams.video[0]
-            rate = stream.average_rate or stream.base_rate or Fraction(0)
-            return stream.height, stream.width, float(rate)
-    except av.error.FFmpegError as error:
-        raise _undecodable(path, error) from error
-
-
-def _wrong_count(path: Path, expected: int | None, got: int, cause: str | None) -> RejectedInputError:
-    too_few = cause is not None or (expected or 1) > got
-    return RejectedInputError(
-        "truncated_video" if too_few else "length_mismatch",
-        "Video is truncated or undecodable" if too_few else "Video has too many frames",
-        where=str(path),
-        expected="at least 1 frame" if expected is None else f"{expected} frames",
-        got=f"{got} frames" + (f" ({cause})" if cause else ""),
-        next_step="copy the file again, or leave the episode in quarantine",
-        evidence={"expected_frames": expected, "decoded_frames": got},
-    )
+    with open_video(path) as (_, stream):
+        rate = stream.average_rate or stream.base_rate or Fraction(0)
+        return stream.height, stream.width, float(rate)
