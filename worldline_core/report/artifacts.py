@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,8 +81,8 @@ def read_json_lines(path: Path) -> list[JsonObject]:
     return rows
 
 
-def read_table(path: Path) -> pa.Table | None:
-    """A Parquet table, or None where there is no file.
+def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | None:
+    """A Parquet table, or some of its columns; None where there is no file.
 
     Raises:
         ArtifactError: the file cannot be read.
@@ -90,7 +90,7 @@ def read_table(path: Path) -> pa.Table | None:
     if not path.is_file():
         return None
     try:
-        return pq.read_table(path)
+        return pq.read_table(path, columns=None if columns is None else list(columns))
     except (pa.ArrowInvalid, OSError) as error:
         raise ArtifactError(
             "A Parquet file is damaged", where=path, got=str(error), next_step="rebuild the artifact"

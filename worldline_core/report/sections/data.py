@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.artifacts import JsonObject, read_rows
+from worldline_core.report.card_blocks import Heading, duplicate_blocks, source_blocks
 from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.dataset_card import block_html
+from worldline_core.report.dataset_facts import DatasetFacts
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, table
 
 TITLE = "Data"
@@ -35,6 +39,7 @@ def data_section(context: ReportContext) -> Section:
         embodiment_table(rows),
         element("div", count_table(rows, "task_family", "Task"), count_table(rows, "split", "Split"), class_="grid2"),
         scene_table(rows),
+        sources(folder),
         sheet(context, rows),
     )
     return Section("data", TITLE, lead, body)
@@ -104,6 +109,15 @@ def scene_table(rows: Sequence[JsonObject]) -> Html:
         splits = ", ".join(sorted({row["split"].replace("_", " ") for row in own}))
         body.append([scene, names, splits, len(own), *outcome_counts(own)])
     return element("details", element("summary", f"All {len(body)} scenes"), table(columns, body))
+
+
+def sources(folder: Path) -> Html:
+    """Sources with their licences, and copies and leaks, as the dataset card has them; nothing for a set without."""
+    facts = DatasetFacts.read(folder)
+    if not facts.sources:
+        return Html("")
+    blocks = [*source_blocks(facts), Heading("Duplicates and leakage"), *duplicate_blocks(facts)]
+    return join([block_html(block) for block in blocks])
 
 
 def sheet(context: ReportContext, rows: Sequence[JsonObject]) -> Html:

@@ -1,0 +1,282 @@
+"""The rules over a whole set, and the options of single sources, through `curate` itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from worldline_core.config import validate
+from worldline_core.data.curate import curate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.curate_description import described
+from worldline_core.data.curation_rules import curation_findings
+from worldline_core.data.episode import Episode
+from worldline_core.data.episode_index import EpisodeRow, read_index
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.primary_view import PRIMARY_VIEW_REASON, with_primary_view
+from worldline_core.data.source_table import read_source_table
+from worldline_core.data.source_weights import (
+    SourceSampling,
+    read_source_weights,
+    source_weights,
+    write_source_weights,
+)
+from worldline_core.data.thumbnails import view_thumbnails
+from worldline_core.errors import ConfigError, DataError
+
+Make = Callable[..., tuple]
+SIZE = (64, 96)
+
+
+def room(number: int, name: str, *, num_frames: int = 40, scene_seed: int = 0, **changes: Any) -> tuple:
+    """An episode of two dots that follow its joints before a textured wall of its scene: (episode, frames)."""
+    rng, time = np.random.default_rng(number), np.arange(num_frames) / 8
+    state = np.stack([0.9 * np.sin(rng.uniform(0.5, 1.5) * time + rng.uniform(0, 6)) for _ in range(14)], 1)
+    state[:, [6, 13]] = np.abs(state[:, [6, 13]])
+    wall = np.random.default_rng(1000 + scene_seed).uniform(30, 170, (8, 12, 3)).astype(np.float32)
+    pictures: list[np.ndarray] = []
+    for row in state:
+        picture = cv2.resize(wall, SIZE[::-1], interpolation=cv2.INTER_NEAREST)
+        for x, y, colour in ((row[0], row[1], (250, 220, 220)), (row[7], row[8], (220, 220, 250))):
+            cv2.circle(picture, (int(48 + 45 * x), int(32 + 30 * y)), 9, colour, -1)
+        pictures.append(picture.astype(np.uint8))
+    values: dict[str, Any] = {
+        "episode_id": name, "source": "made", "embodiment": "ur5e_pair", "scene": f"room {scene_seed}",
+        "task_family": "lift", "instruction": "lift the block", "outcome": "success", "split": "train", "fps": 8.0,
+        "state": state.astype(np.float32), "action": state.astype(np.float32), "timestamps": time,
+        "state_names": tuple(f"{a}/{n}" for a in ("left", "right") for n in (*(f"j{i}" for i in range(6)), "gripper")),
+    }  # fmt: skip
+    return Episode(**(values | changes)), {"head": np.stack(pictures)}
+
+
+def record(root: Path, samples: list[tuple], crf: int = 8) -> Path:
+    with EpisodeSetWriter(root, video_crf=crf) as writer:
+        for episode, frames in samples:
+            writer.add(episode, frames)
+    return root
+
+
+def config(*sources: Path | dict[str, Any], **changes: Any) -> CurateConfig:
+    listed = [
+        source if isinstance(source, dict) else {"kind": "episode_set", "path": str(source)} for source in sources
+    ]
+    return validate(CurateConfig, {"sources": listed, **changes}, where="test")
+
+
+def refused(root: Path) -> dict[str, tuple[str, dict[str, Any]]]:
+    return {row.episode_id: (row.reason, row.numbers) for row in EpisodeSet.open(root).quarantine()}
+
+
+def test_a_copy_that_was_encoded_resized_and_cut_is_taken_out(tmp_path: Path) -> None:
+    samples = [room(number, f"e{number}") for number in range(6)]
+    episode, frames = room(2, "z-copy", split="train")
+    small = np.stack([cv2.resize(f, (72, 48), interpolation=cv2.INTER_AREA) for f in frames["head"][2:-2]])
+    bright = np.clip(small * 1.05 + 4, 0, 255).astype(np.uint8)
+    copy = (replace(episode.cut(2, 38), episode_id="z-copy"), {"head": bright})
+    raw = record(tmp_path / "raw", samples)
+    other = record(tmp_path / "other", [copy, room(9, "z-new")], crf=26)
+    counts = curate(config(raw, other), {}, tmp_path / "out")
+    assert (counts["found"], counts["kept"], counts["reasons"]) == (8, 7, {"near_duplicate": 1})
+    reason, numbers = refused(tmp_path / "out")["z-copy"]
+    assert reason == "near_duplicate"
+    assert numbers["duplicate_of"] == "e2"
+    assert numbers["motion_overlap"] >= 0.5
+    assert numbers["frame_distance_bits"] <= 12
+    kept_all = config(raw, other, near_duplicates={"enabled": False})
+    assert curate(kept_all, {}, tmp_path / "all")["kept"] == 8
+
+
+def test_the_first_listed_is_kept_and_a_copy_across_the_split_says_so(tmp_path: Path) -> None:
+    episode, frames = room(0, "b", scene="hall", split="test")
+    raw = record(tmp_path / "raw", [room(0, "c", scene="kitchen"), room(1, "d")])
+    first = record(tmp_path / "first", [(replace(episode, action=episode.action + 0.5), frames)])
+    curate(config(first, raw, leakage={"action": "off"}), {}, tmp_path / "out")
+    reason, numbers = refused(tmp_path / "out")["c"]
+    assert (reason, numbers["duplicate_of"]) == ("near_duplicate", "b")
+    assert (numbers["split"], numbers["split_of_original"]) == ("train", "test")
+
+
+@pytest.mark.parametrize("action", ["report", "quarantine", "refuse"])
+def test_a_scene_that_leaks_under_another_name(tmp_path: Path, action: str) -> None:
+    samples = [room(n, f"train-{n}", scene_seed=n % 3, scene=f"room {n % 3}") for n in range(6)]
+    # The same wall and the same start as episode train-1, another motion from there on.
+    episode, frames = room(70, "test-1", scene_seed=1, scene="lab", split="test")
+    start = room(1, "x", scene_seed=1)[1]["head"][:1]
+    samples.append((episode, {"head": np.concatenate([start, frames["head"][1:]])}))
+    raw, out = record(tmp_path / "raw", samples), tmp_path / "out"
+    curated = config(raw, leakage={"action": action})
+    if action == "refuse":
+        with pytest.raises(DataError, match=r"(?s)look like scenes that are tested on.*room 1 ~ lab"):
+            curate(curated, {}, out)
+        return
+    counts = curate(curated, {}, out)
+    (leak,) = json.loads((out / "curation.json").read_text())["scene_leaks"]
+    assert (leak["learning_scene"], leak["testing_scene"], leak["learning_episode"]) == ("room 1", "lab", "train-1")
+    gone = {name: reason for name, (reason, _) in refused(out).items()}
+    assert gone == ({} if action == "report" else {"train-1": "scene_leak", "train-4": "scene_leak"})
+    assert counts["kept"] + counts["quarantined"] == counts["found"] == 7
+
+
+def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) -> None:
+    from worldline_core.data.curation_rules import decided_findings
+
+    parts = described_parts([room(0, "a"), room(0, "b"), room(1, "c")])
+    first = decided_findings(config(tmp_path), parts, tmp_path)
+    assert [row.episode_id for row in first.rows] == ["b"]
+    # After the kill the duplicate is gone already: the decision must not change with it.
+    assert decided_findings(config(tmp_path), parts[:1] + parts[2:], tmp_path) == first
+    assert json.loads((tmp_path / "curation.json").read_text())["reasons"] == {"duplicate": 1}
+
+
+def described_parts(samples: list[tuple]) -> list[dict[str, Any]]:
+    from worldline_core.data.fingerprint import fingerprint
+
+    return [
+        {
+            "episode_id": episode.episode_id, "source": "made", "scene": episode.scene, "split": episode.split,
+            "primary_view": "head",
+            "fingerprint": fingerprint(episode, {v: view_thumbnails(f, 8.0) for v, f in frames.items()}),
+        }
+        for episode, frames in samples
+    ]  # fmt: skip
+
+
+def test_parts_without_a_fingerprint_are_refused(tmp_path: Path) -> None:
+    parts = described_parts([room(0, "a")])
+    with pytest.raises(DataError, match="Episode has no fingerprint"):
+        curation_findings(config(tmp_path), [{**parts[0], "fingerprint": None}])
+
+
+def test_each_source_has_its_size_rate_and_licence(tmp_path: Path) -> None:
+    first = record(tmp_path / "first", [room(0, "a"), room(1, "b")])
+    second = record(tmp_path / "second", [room(2, "c", scene_seed=2)])
+    third = record(tmp_path / "third", [room(3, "d", scene_seed=3)])
+    sources = [
+        {"kind": "episode_set", "path": str(first), "name": "one", "license": "CC-BY-4.0", "redistribution": "yes"},
+        {"kind": "episode_set", "path": str(second), "name": "two", "image_size": [32, 48], "target_fps": 4},
+        {"kind": "episode_set", "path": str(third), "name": "three", "stride": 4, "primary_view": "head"},
+    ]
+    curate(config(*sources, fps=8, image_size=(48, 72)), {}, tmp_path / "out")
+    episodes = EpisodeSet.open(tmp_path / "out")
+    shapes = {row.source: episodes.frames(i, "head").shape for i, row in enumerate(episodes.rows)}
+    assert shapes == {"one": (40, 48, 72, 3), "two": (20, 32, 48, 3), "three": (10, 48, 72, 3)}
+    assert {row.source: row.fps for row in episodes.rows} == {"one": 8.0, "two": 4.0, "three": 2.0}
+    original = room(3, "d")[0].state[::4]
+    assert np.array_equal(episodes.episode(episodes.position("d")).state, original)
+    table = {facts.label: facts for facts in read_source_table(tmp_path / "out")}
+    assert (table["one"].license, table["one"].redistribution) == ("CC-BY-4.0", "yes")
+    assert (table["two"].license, table["two"].redistribution) == ("unknown", "unknown")
+    assert [(t.found, t.kept, t.image_size, t.fps, t.stride) for t in table.values()] == [
+        (2, 2, (48, 72), 8.0, None),
+        (1, 1, (32, 48), 4.0, None),
+        (1, 1, (48, 72), None, 4),
+    ]
+    weights = json.loads((tmp_path / "out/source_weights.json").read_text())
+    assert sum(entry["share"] for entry in weights.values()) == pytest.approx(1)
+
+
+def test_two_rules_for_one_rate_are_refused() -> None:
+    with pytest.raises(ConfigError, match="fps and stride both"):
+        config(Path("x"), fps=8, stride=2)
+    with pytest.raises(ConfigError, match="target_fps and stride both"):
+        config({"kind": "episode_set", "path": "x", "target_fps": 8, "stride": 2})
+
+
+def test_the_primary_view_and_why() -> None:
+    episode, frames = room(0, "a")
+    still = np.repeat(frames["head"][:1], 40, axis=0)
+    thumbnails = {"side": view_thumbnails(still, 8.0), "wrist": view_thumbnails(frames["head"], 8.0)}
+    views = ("side", "wrist")
+    chosen = with_primary_view(episode, None, views, thumbnails)
+    assert (chosen.primary_view, chosen.conventions[PRIMARY_VIEW_REASON]) == ("wrist", "most_motion")
+    chosen = with_primary_view(episode, "side", views, thumbnails)
+    assert (chosen.primary_view, chosen.conventions[PRIMARY_VIEW_REASON]) == ("side", "configured")
+    side = replace(episode, primary_view="side")
+    assert with_primary_view(side, None, views, thumbnails) is side
+    chosen = with_primary_view(side, None, ("wrist", "head"), thumbnails)
+    assert (chosen.primary_view, chosen.conventions[PRIMARY_VIEW_REASON]) == ("head", "head")
+
+
+def test_the_view_with_most_motion_is_chosen_while_curating(tmp_path: Path) -> None:
+    episode, frames = room(0, "a")
+    still = np.repeat(frames["head"][:1], 40, axis=0)
+    raw = record(tmp_path / "raw", [(replace(episode, primary_view="head"), {"side": still, "wrist": frames["head"]})])
+    curate(config(raw), {}, tmp_path / "out")
+    (row,) = read_index(tmp_path / "out")
+    assert row.primary_view == "wrist"
+    assert row.stage1_ok
+    assert json.loads(row.conventions)[PRIMARY_VIEW_REASON] == "most_motion"
+
+
+def test_what_describes_an_episode_does_not_depend_on_its_outcome() -> None:
+    episode, frames = room(0, "a", instruction="Lift the Block.")
+    curated = config(Path("x"), splits={"by": "scene"})
+    thumbnails = {view: view_thumbnails(images, 8.0) for view, images in frames.items()}
+    told = [
+        described(curated, replace(episode, outcome=outcome), ("head",), thumbnails)
+        for outcome in ("success", "failure", "unknown")
+    ]
+    assert len({(e.instruction, e.split, e.primary_view, str(e.conventions)) for e in told}) == 1
+
+
+def row(source: str, frames: int, split: str = "train") -> EpisodeRow:
+    return EpisodeRow(
+        episode_id=f"{source}-{frames}-{split}", dataset="d", episode_index=0, start=0, stop=frames, num_frames=frames,
+        video_frames=frames, fps=10.0, source=source, embodiment="e", scene="s", task_family="lift", instruction="",
+        outcome="unknown", split=split, views=("head",), bank=None, candidate=None, primary_view="head",
+    )  # fmt: skip
+
+
+def test_weights_give_each_source_its_share() -> None:
+    rows = [row("large", 900), row("large", 800), row("small", 100), row("small", 999, "test")]
+    for alpha, large in ((1.0, 17.0), (0.0, 1.0), (0.5, 17.0**0.5)):
+        weights = source_weights(rows, SourceSampling(alpha=alpha))
+        assert 2 * weights["large"] / weights["small"] == pytest.approx(large)
+        assert (2 * weights["large"] + weights["small"]) / 3 == pytest.approx(1)
+    weights = source_weights(rows, SourceSampling(shares={"large": 1, "small": 3}))
+    assert 2 * weights["large"] / weights["small"] == pytest.approx(1 / 3)
+    with pytest.raises(ConfigError, match="Shares do not fit the sources that train"):
+        source_weights(rows, SourceSampling(shares={"large": 1}))
+    assert source_weights([row("small", 9, "test")], SourceSampling()) == {}
+
+
+def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
+    rows = [row("large", 900), row("large", 800), row("small", 100)]
+    write_source_weights(tmp_path, rows, SourceSampling(alpha=0.5))
+    assert read_source_weights(tmp_path) == pytest.approx(source_weights(rows, SourceSampling(alpha=0.5)))
+    (tmp_path / "source_weights.json").write_text('{"large": 3}')
+    with pytest.raises(DataError, match="Table of sampling weights is damaged"):
+        read_source_weights(tmp_path)
+    with pytest.raises(DataError, match="Set has no sampling weights"):
+        read_source_weights(tmp_path / "elsewhere")
+
+
+def test_the_clip_sampler_follows_these_weights() -> None:
+    """Drawn clips against the shares that the weights were made for."""
+    from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+    from worldline_core.training.latent_store import LatentRow
+
+    rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
+    sampling = SourceSampling(shares={"large": 0.4, "small": 0.6})
+
+    stored = [LatentRow(r.episode_id, "x", r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
+
+    class Store:
+        start_step = 1
+        rows = stored
+
+        def max_frames(self, row: LatentRow, start: int, stride: int) -> int:
+            return (row.num_frames - 1 - start) // stride + 1
+
+    config = ClipSampling(lengths=(33,), source_weights=source_weights(rows, sampling))
+    sampler = ClipSampler(Store(), config, splits=["train"], batch_size=50, seed=0)  # type: ignore[arg-type]
+    drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
+    share = sum(name.startswith("small") for name in drawn) / len(drawn)
+    assert share == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / len(drawn)))

@@ -1,0 +1,78 @@
+"""Task texts that mean the same become the same, and nothing is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from worldline_core.data.instructions import (
+    RAW_INSTRUCTION,
+    InstructionConfig,
+    mentions_outcome,
+    normalised_text,
+    one_annotation,
+    with_instruction,
+)
+
+CONFIG = InstructionConfig()
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"),
+    [
+        ("Pick up the  Red\tblock.\n", "pick up the red block"),
+        ("“Open the drawer”", "open the drawer"),
+        ("[fold the towel]", "fold the towel"),
+        ("Ｐｉｃｋ the ｃｕｐ", "pick the cup"),  # noqa: RUF001
+        ("cafe\u0301 cup", "caf\u00e9 cup"),
+        ("put\u200b it\u00a0down", "put it down"),
+        ("Don\u2019t stop!!", "don't stop"),
+        ("PICK UP THE CUP", "pick up the cup"),
+        ("Plug the USB cable into the PC", "plug the USB cable into the PC"),
+        ("把杯子放到桌子上", "把杯子放到桌子上"),
+        ("Put the cup (red) on the tray", "put the cup (red) on the tray"),
+        ("pour 1.5 l", "pour 1.5 l"),
+        ("N/A", ""),
+        (" None. ", ""),
+        ('"unknown"', ""),
+        ("---", ""),
+        ("", ""),
+    ],
+)
+def test_one_spelling(raw: str, expected: str) -> None:
+    assert normalised_text(raw, CONFIG) == expected
+    assert normalised_text(expected, CONFIG) == expected
+
+
+def test_case_and_punctuation_are_configured() -> None:
+    config = InstructionConfig(case="keep", strip_trailing="", placeholders=("tbd",))
+    assert normalised_text("Lift  the Cup.", config) == "Lift the Cup."
+    assert normalised_text("TBD", config) == ""
+    assert normalised_text("n/a", config) == "n/a"
+
+
+def test_of_several_annotations_the_majority_counts() -> None:
+    texts = ["n/a", "Lift the cup.", "raise the mug", "lift the cup", ""]
+    assert one_annotation(texts) == "Lift the cup."
+    assert one_annotation(["Raise it", "lift it"]) == "Raise it"
+    assert one_annotation(["n/a", " "]) == ""
+    assert one_annotation([]) == ""
+    assert one_annotation(["n/a"], InstructionConfig(placeholders=())) == "n/a"
+
+
+def test_the_raw_text_is_kept_where_it_differs(sample: Callable[..., tuple]) -> None:
+    episode = replace(sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"})
+    changed = with_instruction(episode, CONFIG)
+    assert changed.instruction == "lift the block"
+    assert changed.conventions == {"layout": "x", RAW_INSTRUCTION: "Lift the block."}
+    assert with_instruction(changed, CONFIG) is changed
+    assert with_instruction(episode, InstructionConfig(normalise=False)) is episode
+
+
+def test_texts_that_tell_the_outcome_are_noticed() -> None:
+    for text in ("pick the cup (failed)", "successful grasp", "Failure: lift", "it succeeds", "unsuccessful lift"):
+        assert mentions_outcome(text), text
+    for text in ("lift the successor", "failsafe switch on", "pick the cup"):
+        assert not mentions_outcome(text), text

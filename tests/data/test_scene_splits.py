@@ -1,0 +1,97 @@
+"""Splits are drawn by scene, once and for all; scenes under two names are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from worldline_core.config import validate
+from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.scene_leaks import LeakageConfig, SceneView, find_scene_leaks
+from worldline_core.data.scene_splits import SceneSplits, drawn_split, with_split
+from worldline_core.errors import ConfigError
+
+Make = Callable[..., tuple]
+SOURCE = {"kind": "episode_set", "path": "recordings"}
+
+
+def config(**values: object) -> CurateConfig:
+    return validate(CurateConfig, {"sources": [SOURCE], **values}, where="test")
+
+
+def test_shares_are_met_and_new_scenes_move_no_old_one() -> None:
+    splits = SceneSplits(by="scene", test=0.2, validation=0.1, seed=3)
+    scenes = [f"kitchen {i}" for i in range(5000)]
+    drawn = {scene: drawn_split(scene, splits) for scene in scenes}
+    shares = {name: sum(split == name for split in drawn.values()) / 5000 for name in ("test", "validation", "train")}
+    assert shares["test"] == pytest.approx(0.2, abs=0.02)
+    assert shares["validation"] == pytest.approx(0.1, abs=0.02)
+    assert {scene: drawn_split(scene, splits) for scene in reversed(scenes)} == drawn
+    other = SceneSplits(by="scene", test=0.2, validation=0.1, seed=4)
+    assert sum(drawn_split(scene, other) != drawn[scene] for scene in scenes) > 1000
+
+
+def test_patterns_come_first_and_declared_splits_stay(sample: Make) -> None:
+    episode = sample(0)[0]
+    splits = SceneSplits(by="scene", test=0, validation=0, patterns={"lab*": "test"})
+    assert with_split(replace(episode, scene="laboratory", split="train"), splits).split == "test"
+    assert with_split(replace(episode, split="test"), splits).split == "train"
+    for kept in ("bank", "ood_test"):
+        assert with_split(replace(episode, split=kept), splits).split == kept
+    evaluation = replace(episode, split="test", conventions={"layout": "robotwin"})
+    assert with_split(evaluation, splits).split == "test"
+    others = SceneSplits(by="scene", test=0, validation=0, sources=("another",))
+    assert with_split(replace(episode, split="test"), others).split == "test"
+    assert with_split(replace(episode, scene="kit"), {"k*": "test", "*": "train"}).split == "test"
+
+
+def test_configurations_are_strict() -> None:
+    assert config(splits={"kitchen*": "test"}).splits == {"kitchen*": "test"}
+    assert isinstance(config(splits={"by": "scene", "test": 0.2}).splits, SceneSplits)
+    with pytest.raises(ConfigError, match=r"splits\.scene\.validaton: unknown key"):
+        config(splits={"by": "scene", "validaton": 0.2})
+    with pytest.raises(ConfigError, match="leave nothing to train on"):
+        config(splits={"by": "scene", "test": 0.6, "validation": 0.5})
+    with pytest.raises(ConfigError, match="'train', 'validation', 'test', 'ood_test' or 'bank'"):
+        config(splits={"kitchen*": "tset"})
+    with pytest.raises(ConfigError, match="Input should be 'scene'"):
+        config(splits={"by": "episode"})
+    with pytest.raises(ValidationError, match="frozen"):
+        SceneSplits(by="scene").test = 0.5  # type: ignore[misc]
+
+
+def seen(name: str, split: str, scene: str, first: np.ndarray) -> SceneView:
+    return SceneView(name, scene, split, first)
+
+
+def flipped(words: np.ndarray, bits: int, rng: np.random.Generator) -> np.ndarray:
+    result = words.copy()
+    for bit in rng.choice(256, bits, replace=False):
+        result[bit // 64] ^= np.uint64(1) << np.uint64(bit % 64)
+    return result
+
+
+def test_one_scene_under_two_names_is_found() -> None:
+    rng = np.random.default_rng(0)
+    rooms = rng.integers(0, 2**63, (40, 4), dtype=np.uint64)
+    views = [seen(f"train-{i}-{k}", "train", f"room {i}", rooms[i]) for i in range(40) for k in range(3)]
+    # Up to 31 flipped bits leave one of 32 bands whole: found for certain.
+    views += [seen(f"test-{i}", "test", f"lab {i}", flipped(rooms[i], 31, rng)) for i in range(10)]
+    views.append(seen("same name", "validation", "lab 3", rooms[39]))
+    leaks = find_scene_leaks(views, LeakageConfig())
+    assert [(leak.learning_scene, leak.testing_scene, leak.distance) for leak in leaks] == [
+        (f"room {i}", f"lab {i}", 31) for i in range(10)
+    ]
+    assert find_scene_leaks(views, LeakageConfig(max_distance=30)) == []
+    assert find_scene_leaks(views, LeakageConfig(action="off")) == []
+
+
+def test_scenes_of_one_side_and_of_one_name_are_no_leak() -> None:
+    first = np.arange(4, dtype=np.uint64)
+    same = [seen("a", "train", "room", first), seen("b", "validation", "lab", first), seen("c", "bank", "hall", first)]
+    assert find_scene_leaks(same, LeakageConfig()) == []
+    assert find_scene_leaks([*same, seen("d", "test", "room", first)], LeakageConfig())[0].learning_scene == "lab"

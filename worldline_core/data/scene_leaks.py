@@ -1,0 +1,92 @@
+"""One scene under two names, on both sides of the split: found by the first image of the primary view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from worldline_core.config.base import StrictModel
+
+LEARNING = ("train", "validation")
+TESTING = ("test", "ood_test")
+_BANDS = 32
+
+
+class LeakageConfig(StrictModel):
+    """What to do when a scene that is learnt from looks like a scene that is tested on."""
+
+    action: Literal["report", "quarantine", "refuse", "off"] = Field(
+        default="report",
+        description="report: write it down; quarantine: take the learning scene out (scene_leak); refuse: stop",
+    )
+    max_distance: int = Field(
+        default=52, ge=0, le=256, description="most differing bits of 256 between first images of one scene"
+    )
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """What the search sees of an episode. `first` is (4,) uint64, 256 bits of the primary view's first image."""
+
+    episode_id: str
+    scene: str
+    split: str
+    first: np.ndarray
+
+
+@dataclass(frozen=True)
+class SceneLeak:
+    """A pair of scenes that look like one; the episodes are those that look most alike."""
+
+    learning_scene: str
+    testing_scene: str
+    learning_episode: str
+    testing_episode: str
+    distance: int
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def find_scene_leaks(seen: Sequence[SceneView], config: LeakageConfig) -> list[SceneLeak]:
+    """Pairs of differently named scenes across the split whose first images differ in at most `max_distance` bits.
+
+    Candidates share one of 32 bands of 8 bits: every pair within 31 bits is found for certain, one of 52 bits with
+    a probability of 0.997 (where flips are spread evenly).
+    """
+    learning = [view for view in seen if view.split in LEARNING]
+    testing = [view for view in seen if view.split in TESTING]
+    if config.action == "off" or not learning or not testing:
+        return []
+    learnt, tested = (np.stack([view.first for view in side]) for side in (learning, testing))
+    best: dict[tuple[str, str], SceneLeak] = {}
+    for band in range(_BANDS):
+        buckets: dict[int, list[int]] = {}
+        for place, key in enumerate(_band(tested, band).tolist()):
+            buckets.setdefault(key, []).append(place)
+        keys = _band(learnt, band)
+        for key in np.intersect1d(keys, np.fromiter(buckets, keys.dtype)).tolist():
+            places = np.flatnonzero(keys == key)
+            for other in buckets[key]:
+                distances = np.bitwise_count(learnt[places] ^ tested[other]).sum(axis=1)
+                for index in np.flatnonzero(distances <= config.max_distance):
+                    _note(best, learning[int(places[index])], testing[other], int(distances[index]))
+    return sorted(best.values(), key=lambda leak: (leak.testing_scene, leak.learning_scene))
+
+
+def _band(words: np.ndarray, band: int) -> np.ndarray:
+    return (words[:, band // 8] >> np.uint64(8 * (band % 8))) & np.uint64(0xFF)
+
+
+def _note(best: dict[tuple[str, str], SceneLeak], learning: SceneView, testing: SceneView, distance: int) -> None:
+    if learning.scene == testing.scene:
+        return
+    leak = SceneLeak(learning.scene, testing.scene, learning.episode_id, testing.episode_id, distance)
+    known = best.get((learning.scene, testing.scene))
+    order = (leak.distance, leak.learning_episode, leak.testing_episode)
+    if known is None or order < (known.distance, known.learning_episode, known.testing_episode):
+        best[learning.scene, testing.scene] = leak
