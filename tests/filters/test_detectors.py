@@ -1,30 +1,36 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.filters.base_motion import BaseMotionConfig, background_flow, detect_base_motion
+from worldline_core.filters.base_motion import BaseMotionConfig, changed_area, detect_base_motion
+from worldline_core.filters.blur import BlurConfig, detect_blur
 from worldline_core.filters.calibration import (
     CalibrationConfig,
     detect_camera,
     detect_fixed_camera,
     detect_hand_eye,
 )
-from worldline_core.filters.corrupted import CorruptedConfig, detect_corrupted, neighbour_correlation
+from worldline_core.filters.corrupted import CorruptedConfig, detect_corrupted
+from worldline_core.filters.exposure import ExposureConfig, detect_dark, detect_overexposed
+from worldline_core.filters.joint_motion import JointMotionConfig, detect_joint_jump, detect_joint_speed
+from worldline_core.filters.picture_statistics import picture_statistics
 from worldline_core.filters.projection import (
     ProjectionConfig,
     detect_projection,
 )
 from worldline_core.filters.reset import ResetConfig, detect_reset
-from worldline_core.filters.static import StaticConfig, detect_static
+from worldline_core.filters.static import StaticConfig, detect_static, range_speed
 from worldline_core.filters.time_alignment import (
     TimeAlignmentConfig,
     detect_image_lag,
     detect_pose_lag,
     lag_by_correlation,
 )
-from worldline_core.filters.verdict import runs
+from worldline_core.filters.verdict import long_runs, runs
 from worldline_core.geometry.rigid import hand_eye_residual, inside_image, mean_pose, project_points, rigid_inverse
 
 FPS = 8.0
@@ -71,98 +77,210 @@ def scene(
     return np.stack(frames).astype(np.uint8)
 
 
-def change_of(gray: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0.0], np.abs(np.diff(gray.astype(float), axis=0)).mean(axis=(1, 2))])
+NOTHING_LOST = np.zeros(33, bool)
 
 
 def test_runs() -> None:
     assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
     assert runs(np.zeros(3, bool)) == []
+    assert runs(long_runs(np.array([1, 1, 0, 1, 0, 0, 1], bool), 3, gap=1)) == [(0, 4)]
+    assert not long_runs(np.array([0, 1, 1, 0], bool), 3, gap=1).any()  # an edge is no gap
+
+
+def static_frames(joint_speed: np.ndarray, gripper: np.ndarray, change: np.ndarray) -> list[int]:
+    verdict = detect_static(joint_speed, gripper, change, FPS, StaticConfig())
+    assert verdict.bad_frames is not None
+    return np.flatnonzero(verdict.bad_frames).tolist()
 
 
 def test_static_stretches_are_found_and_short_pauses_left() -> None:
-    config = StaticConfig()
-    joint_speed = np.full(40, 0.5)
-    change = np.full(40, 3.0)
-    gripper = np.zeros(40)
-    assert not detect_static(joint_speed, gripper, change, FPS, config).bad_frames.any()  # type: ignore[union-attr]
-    joint_speed[:16] = change[:16] = 0
-    joint_speed[30:34] = change[30:34] = 0
-    verdict = detect_static(joint_speed, gripper, change, FPS, config)
-    assert verdict.bad_frames is not None
-    assert np.flatnonzero(verdict.bad_frames).tolist() == list(range(16))
-    assert verdict.passed
-    gripper[:16] = 1.0  # a closing gripper is no rest
-    assert not detect_static(joint_speed, gripper, change, FPS, config).bad_frames.any()  # type: ignore[union-attr]
-    still = detect_static(np.zeros(40), np.zeros(40), np.zeros(40), FPS, config)
+    noise = np.random.default_rng(0).normal(0, 0.0015, (56, 3))
+    joints = np.concatenate([np.repeat(swing()[:1], 16, 0), swing(), np.repeat(swing()[-1:], 7, 0)])
+    speed = range_speed(joints + noise, FPS)
+    assert np.abs(np.diff(joints + noise, axis=0)).max(axis=1)[:15].max() * FPS > 0.03  # neighbours would say: moving
+    change = np.where(speed < 0.03, 0.0, 3.0)
+    change[:16] = 0.0
+    zeros = np.zeros(56)
+    found = static_frames(speed, zeros, change)
+    assert found[0] == 0
+    assert 14 <= found[-1] <= 17  # the pause of 7 frames at the end is shorter than 1.5 s
+    assert len(found) == found[-1] + 1
+    assert static_frames(speed, np.full(56, 1.0), change) == []  # a closing gripper is no rest
+    assert static_frames(speed, zeros, np.full(56, 2.0)) == []  # nor are things that move
+    still = detect_static(zeros, zeros, zeros, FPS, StaticConfig())
     assert not still.passed
     assert still.numbers["static_share"] == 1.0
-    moving_object = detect_static(np.zeros(40), np.zeros(40), np.full(40, 2.0), FPS, config)
-    assert not moving_object.bad_frames.any()  # type: ignore[union-attr]
 
 
-def test_a_jump_home_is_a_reset_and_a_quick_motion_is_not() -> None:
+def test_range_speed_is_that_of_the_fastest_column() -> None:
+    time = np.arange(30)[:, None] / 10.0
+    speed = range_speed(np.concatenate([0.2 * time, -0.5 * time], axis=1), 10.0)
+    assert np.allclose(speed[3:-3], 0.5)
+    assert range_speed(np.zeros((5, 0)), 10.0).tolist() == [0.0] * 5
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5])
+def test_a_quick_way_home_is_a_reset_and_motion_is_not(steps: int) -> None:
     config = ResetConfig()
     joints = swing()
-    assert not detect_reset(joints, config).bad_frames.any()  # type: ignore[union-attr]
-    doubled = np.concatenate([joints, joints[:16]])
-    verdict = detect_reset(doubled, config)
+    assert not detect_reset(joints, FPS, config).bad_frames.any()  # type: ignore[union-attr]
+    back = np.linspace(joints[-1], joints[0], steps + 1)[1:-1]
+    verdict = detect_reset(np.concatenate([joints, back, joints[:16]]), FPS, config)
     assert verdict.bad_frames is not None
     assert np.flatnonzero(verdict.bad_frames)[0] == 33
     assert verdict.numbers["reset_frame"] == 33
     there_and_back = np.concatenate([joints, joints[::-1]])
-    assert not detect_reset(there_and_back, config).bad_frames.any()  # type: ignore[union-attr]
+    assert not detect_reset(there_and_back, FPS, config).bad_frames.any()  # type: ignore[union-attr]
     away = np.concatenate([joints, joints + 1.5])  # a jump, but not home
-    assert not detect_reset(away, config).bad_frames.any()  # type: ignore[union-attr]
+    assert not detect_reset(away, FPS, config).bad_frames.any()  # type: ignore[union-attr]
+    assert detect_reset(joints[:1], FPS, config).numbers["reset_frame"] is None
 
 
-@pytest.mark.parametrize("defect", ["blank", "noise", "frozen"])
+def test_joint_readings_that_jump_or_run_away() -> None:
+    config = JointMotionConfig()
+    joints = 1.5 * swing()
+    assert not detect_joint_jump(joints, config).bad_frames.any()  # type: ignore[union-attr]
+    assert not detect_joint_speed(joints, FPS, config).bad_frames.any()  # type: ignore[union-attr]
+    spike = joints.copy()
+    spike[10:12, 1] += 0.7
+    assert np.flatnonzero(detect_joint_jump(spike, config).bad_frames).tolist() == [10, 11, 12]  # type: ignore[arg-type]
+    slipped = joints.copy()
+    slipped[20:, 0] -= 0.5
+    assert np.flatnonzero(detect_joint_jump(slipped, config).bad_frames).tolist() == [20]  # type: ignore[arg-type]
+    fast = joints.copy()
+    fast[:, 2] += np.clip(np.arange(33) - 8, 0, 6) * 1.2
+    assert np.flatnonzero(detect_joint_speed(fast, FPS, config).bad_frames).tolist() == list(range(9, 15))  # type: ignore[arg-type]
+    assert not detect_joint_jump(fast, config).bad_frames.any()  # type: ignore[union-attr]
+    assert not detect_joint_speed(spike, FPS, config).bad_frames.any()  # type: ignore[union-attr]
+
+
+def test_picture_statistics_are_what_numpy_says() -> None:
+    gray = scene(centres=np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1))
+    found = picture_statistics(gray)
+    value = gray.astype(np.float64)
+    assert np.allclose(found.mean, value.mean(axis=(1, 2)))
+    assert np.allclose(found.contrast, value.std(axis=(1, 2)))
+    assert np.abs(found.bright_level - np.percentile(value.reshape(33, -1), 95, axis=1)).max() <= 1
+    across = (np.diff(value, axis=2) ** 2).mean(axis=(1, 2))
+    down = (np.diff(value, axis=1) ** 2).mean(axis=(1, 2))
+    assert np.allclose(found.detail, across + down)
+    assert np.allclose(found.roughness, np.maximum(across, down) / (2 * value.var(axis=(1, 2))))
+    change = np.abs(np.diff(value, axis=0)).mean(axis=(1, 2))
+    assert np.allclose(found.change, np.concatenate([[0.0], change]))
+    assert (found.flat_share == 0).all()
+    half = gray.copy()
+    half[:, 32:] = 128
+    assert np.allclose(picture_statistics(half).flat_share, 0.5)
+
+
+@pytest.mark.parametrize("defect", ["blank", "noise", "frozen", "blocks", "band"])
 def test_corrupted_frames(defect: str) -> None:
     config = CorruptedConfig()
-    centres = np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1)
-    gray = scene(centres=centres)
-    travel = np.full(33, 0.02)
-    healthy = detect_corrupted(gray, change_of(gray), travel, config)
+    gray = scene(centres=np.stack([20 + 1.5 * np.arange(33), np.full(33, 30.0)], axis=1))
+    tracks = 0.02 * np.arange(33.0)[:, None, None] * np.array([1.0, 0, 0])
+    healthy = detect_corrupted(picture_statistics(gray), tracks, NOTHING_LOST, NOTHING_LOST, FPS, config)
     assert healthy.passed
     assert not healthy.bad_frames.any()  # type: ignore[union-attr]
-    assert neighbour_correlation(gray).min() > 0.7
-    bad = gray.copy()
+    bad, random = gray.copy(), np.random.default_rng(1)
     if defect == "blank":
-        bad[10:14] = 7
+        bad[10:14] = 130
     elif defect == "noise":
-        bad[10:14] = np.random.default_rng(1).integers(0, 255, bad[10:14].shape)
-    else:
+        bad[10:14] = random.integers(0, 255, bad[10:14].shape)
+    elif defect == "frozen":
         bad[10:14] = bad[9]
-    verdict = detect_corrupted(bad, change_of(bad), travel, config)
+    elif defect == "band":
+        bad[10:14, 30:] = 128
+    else:
+        for i in range(10, 14):
+            for _ in range(30):
+                row, column = random.integers(0, 56), random.integers(0, 88)
+                bad[i, row : row + 8, column : column + 8] = 255 - bad[i, row : row + 8, column : column + 8]
+    pictures = picture_statistics(bad)
+    verdict = detect_corrupted(pictures, tracks, NOTHING_LOST, NOTHING_LOST, FPS, config)
     assert verdict.bad_frames is not None
     assert np.flatnonzero(verdict.bad_frames).tolist() == [10, 11, 12, 13]
     assert verdict.passed
+    counted = {"blocks": "garbled_frames", "band": "garbled_frames"}.get(defect, f"{defect}_frames")
+    assert verdict.numbers[counted] == 4
     if defect == "frozen":
-        resting = detect_corrupted(bad, change_of(bad), np.zeros(33), config)
+        noise = random.normal(0, 0.005, (33, 1, 3))
+        assert np.linalg.norm(np.diff(noise, axis=0), axis=-1)[9:14].sum() > config.min_frozen_motion_m * 0.8
+        resting = detect_corrupted(pictures, noise, NOTHING_LOST, NOTHING_LOST, FPS, config)
         assert not resting.bad_frames.any()  # type: ignore[union-attr]
-        wrist = detect_corrupted(bad, change_of(bad), travel, config, wrist=True)
+        wrong = detect_corrupted(pictures, tracks, NOTHING_LOST, np.arange(33) == 12, FPS, config)
+        assert not wrong.bad_frames.any()  # type: ignore[union-attr]
+        resting = detect_corrupted(pictures, np.zeros((33, 1, 3)), NOTHING_LOST, NOTHING_LOST, FPS, config)
+        assert not resting.bad_frames.any()  # type: ignore[union-attr]
+        wrist = detect_corrupted(pictures, tracks, NOTHING_LOST, NOTHING_LOST, FPS, config, wrist=True)
         assert not wrist.bad_frames.any()  # type: ignore[union-attr]
 
 
 def test_mostly_corrupted_condemns() -> None:
     gray = scene()
-    gray[8:] = 0
-    verdict = detect_corrupted(gray, change_of(gray), np.zeros(33), CorruptedConfig())
+    gray[8:] = 120
+    verdict = detect_corrupted(
+        picture_statistics(gray), np.zeros((33, 1, 3)), NOTHING_LOST, NOTHING_LOST, FPS, CorruptedConfig()
+    )
     assert not verdict.passed
     assert verdict.numbers["blank_frames"] == 25
 
 
-def test_a_driving_base_moves_every_edge_an_arm_does_not() -> None:
+def test_dark_and_overexposed_pictures_are_not_counted_twice() -> None:
+    config = ExposureConfig()
+    gray = scene()
+    assert not detect_dark(picture_statistics(gray), config).bad_frames.any()  # type: ignore[union-attr]
+    assert not detect_overexposed(picture_statistics(gray), config).bad_frames.any()  # type: ignore[union-attr]
+    gray[4:8] = gray[4:8] // 12
+    gray[20:23] = np.clip(gray[20:23].astype(int) * 3, 0, 255)
+    pictures = picture_statistics(gray)
+    dark, white = detect_dark(pictures, config), detect_overexposed(pictures, config)
+    assert np.flatnonzero(dark.bad_frames).tolist() == [4, 5, 6, 7]  # type: ignore[arg-type]
+    assert np.flatnonzero(white.bad_frames).tolist() == [20, 21, 22]  # type: ignore[arg-type]
+    lost = dark.bad_frames | white.bad_frames  # type: ignore[operator]
+    assert not detect_corrupted(
+        pictures, np.zeros((33, 1, 3)), lost, NOTHING_LOST, FPS, CorruptedConfig()
+    ).bad_frames.any()  # type: ignore[union-attr]
+    gray[:30] = 0
+    assert not detect_dark(picture_statistics(gray), config).passed
+    # A thing in the gripper may cover a wrist camera.
+    assert detect_dark(picture_statistics(np.full((9, 64, 96), 20, np.uint8)), config, wrist=True).clean
+
+
+def test_blurred_stretches_are_found_whatever_is_seen() -> None:
+    config = BlurConfig()
+    random = np.random.default_rng(0)
+    gray = scene()
+    sharpness = np.repeat(random.uniform(300, 900, 17), 2)[:33]  # what is seen changes
+    detail = sharpness / 100
+    pictures = replace(picture_statistics(gray), detail=detail)
+    assert detect_blur(sharpness, pictures, NOTHING_LOST, FPS, config).clean
+    blurred = sharpness.copy()
+    blurred[10:16] *= 0.1
+    verdict = detect_blur(blurred, pictures, NOTHING_LOST, FPS, config)
+    assert np.flatnonzero(verdict.bad_frames).tolist() == list(range(10, 16))  # type: ignore[arg-type]
+    assert detect_blur(blurred, pictures, np.arange(33) < 16, FPS, config).clean
+    assert not detect_blur(np.full(33, 5.0), pictures, NOTHING_LOST, FPS, config).passed  # never in focus
+
+
+def test_a_driving_base_moves_the_whole_picture_an_arm_does_not() -> None:
     config = BaseMotionConfig()
     centres = np.stack([10 + 2.0 * np.arange(33), 30 + 8 * np.sin(np.arange(33))], axis=1)
-    arm = background_flow(scene(centres=centres), config.quantile, config.min_gradient)
-    assert detect_base_motion(arm, config).passed
+    usable = np.ones(33, bool)
+    arm = changed_area(scene(centres=centres), usable, FPS, config)
+    assert detect_base_motion(arm, FPS, config).clean
     for drift in (1.0, 2.5):
-        driving = background_flow(scene(drift=drift, centres=centres), config.quantile, config.min_gradient)
-        verdict = detect_base_motion(driving, config)
+        driving = changed_area(scene(drift=drift, centres=centres), usable, FPS, config)
+        verdict = detect_base_motion(driving, FPS, config)
         assert not verdict.passed
         assert verdict.numbers["moving_share"] > 0.9  # type: ignore[operator]
-    assert detect_base_motion(background_flow(np.full((5, 8, 8), 9, np.uint8), 0.2, 8.0), config).passed
+        assert detect_base_motion(changed_area(scene(drift=drift), ~usable, FPS, config), FPS, config).clean
+    partly = np.concatenate([scene()[:1].repeat(17, 0), scene(drift=2.5)])
+    verdict = detect_base_motion(changed_area(partly, np.ones(50, bool), FPS, config), FPS, config)
+    assert verdict.passed
+    assert np.flatnonzero(verdict.bad_frames)[0] in range(13, 19)  # type: ignore[arg-type]
+    lamp = np.concatenate([scene()[:16], (scene()[:17] * 1.3).clip(0, 255).astype(np.uint8)])
+    assert detect_base_motion(changed_area(lamp, usable, FPS, config), FPS, config).clean
+    assert detect_base_motion(changed_area(np.full((3, 8, 8), 9, np.uint8), usable[:3], FPS, config), FPS, config).clean
 
 
 def test_wrist_cameras_are_rigidly_mounted_or_condemned() -> None:

@@ -11,6 +11,7 @@ import pytest
 from worldline_core.data.conventions import RecordedConventions, corrupt
 from worldline_core.data.episode import Episode
 from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.thumbnails import ViewThumbnails
 from worldline_core.filters.doctor import FilterDoctorConfig, detect_mistake, kinematics_of
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.inspect_episode import inspect
@@ -20,14 +21,16 @@ CONFIG = FilterDoctorConfig()
 
 
 @pytest.fixture(scope="module")
-def recording(project_root: Path) -> tuple[Episode, dict[str, np.ndarray], Signals]:
+def recording(project_root: Path) -> tuple[Episode, dict[str, ViewThumbnails], Signals]:
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
     i = episodes.position("ur5e_pair-test-s1-00002")
-    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
-    return episodes.episode(i), frames, measure(episodes.episode(i), frames)
+    thumbnails = {view: episodes.thumbnails(i, view) for view in episodes.rows[i].views}
+    return episodes.episode(i), thumbnails, measure(episodes.episode(i), thumbnails)
 
 
-def test_frames_that_are_dropped_anyway_do_not_count(recording: tuple[Episode, dict[str, np.ndarray], Signals]) -> None:
+def test_frames_that_are_dropped_anyway_do_not_count(
+    recording: tuple[Episode, dict[str, ViewThumbnails], Signals],
+) -> None:
     episode, _, signals = recording
     none_bad = np.zeros(episode.num_frames, dtype=bool)
     assert detect_mistake(episode, signals.gray, none_bad, CONFIG).passed
@@ -47,23 +50,23 @@ def test_frames_that_are_dropped_anyway_do_not_count(recording: tuple[Episode, d
 
 
 def test_an_explanation_comes_before_what_it_explains(
-    recording: tuple[Episode, dict[str, np.ndarray], Signals],
+    recording: tuple[Episode, dict[str, ViewThumbnails], Signals],
 ) -> None:
-    episode, frames, _ = recording
+    episode, thumbnails, _ = recording
     findings = inspect(
-        FilterConfig(), measure(corrupt(episode, RecordedConventions(extrinsics="base_to_camera")), frames)
+        FilterConfig(), measure(corrupt(episode, RecordedConventions(extrinsics="base_to_camera")), thumbnails)
     )
     failed = [finding for finding in findings if not finding.verdict.passed]
     assert failed[0].detector == "doctor"
     assert failed[0].verdict.reason == "calibration"
     assert failed[0].verdict.numbers["config"] == "curate.sources[].conventions.extrinsics: base_to_camera"
     assert {"hand_eye", "projection"} & {finding.detector for finding in failed}
-    clean = inspect(FilterConfig(), measure(episode, frames))
+    clean = inspect(FilterConfig(), measure(episode, thumbnails))
     assert all(finding.verdict.passed for finding in clean)
     assert clean[-1].detector == "doctor"
 
 
-def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[str, np.ndarray], Signals]) -> None:
+def test_kinematics_that_do_not_fit_are_not_used(recording: tuple[Episode, dict[str, ViewThumbnails], Signals]) -> None:
     episode = recording[0]
     assert kinematics_of(episode) is kinematics_of(episode)
     assert kinematics_of(replace(episode, embodiment="no_such_robot")) is None

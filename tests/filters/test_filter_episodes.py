@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import tool_poses
@@ -65,7 +65,7 @@ def wrist_images(poses: np.ndarray, arm: int) -> np.ndarray:
     """A texture that shifts with the arm."""
     rng = np.random.default_rng(2)
     table = cv2.resize(
-        rng.uniform(40, 200, (16, 24, 3)).astype(np.float32), (3 * WIDTH, 3 * HEIGHT), interpolation=cv2.INTER_LINEAR
+        rng.uniform(40, 200, (16, 24, 3)).astype(np.float32), (3 * WIDTH, 3 * HEIGHT), interpolation=cv2.INTER_NEAREST
     )
     frames = []
     for pose in poses:
@@ -193,7 +193,10 @@ def test_kept_rows_point_into_the_curated_set(filtered: tuple[Path, Path, dict[s
     assert not list(output.rglob("*.mp4"))
     findings = pq.read_table(output / "findings.parquet").to_pylist()
     cut = {(f["episode_id"], f["detector"]): f["cut_frames"] for f in findings if f["cut_frames"]}
-    assert cut[("e02", "corrupted")] == 3
+    assert cut[("e02", "too_dark")] == 3
+    dark = next(f["numbers"] for f in findings if f["episode_id"] == "e02" and f["detector"] == "too_dark")
+    assert json.loads(dark)["cut"] == [[28, 31]]
+    assert json.loads(dark)["thresholds"] == "default"
     numbers = json.loads(
         next(f["numbers"] for f in findings if f["episode_id"] == "e04" and f["detector"] == "pose_lag")
     )
@@ -216,6 +219,34 @@ def test_nothing_left_is_an_error(filtered: tuple[Path, Path, dict[str, Any]], t
     curated, _, _ = filtered
     with pytest.raises(DataError, match=r"(?s)No episode passed.*too_short"):
         filter_episodes(FilterConfig(min_segment_frames=200), {"episodes": curated}, tmp_path / "out")
+
+
+def test_a_source_has_its_own_thresholds(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:
+    curated, _, _ = filtered
+    overrides = {"synthetic": {"static": {"min_run_s": 60}}, "elsewhere": {"min_segment_frames": 200}}
+    config = FilterConfig.model_validate({"sources": overrides})
+    assert config.for_source("synthetic").static.min_run_s == 60
+    assert config.for_source("synthetic").static.max_image_change == config.static.max_image_change
+    assert config.for_source("other") == config
+    counts = filter_episodes(config, {"episodes": curated}, tmp_path / "out")
+    assert "static" not in counts["reasons"]  # the still episode is shorter than a minute
+    findings = pq.read_table(tmp_path / "out" / "findings.parquet").to_pylist()
+    assert {json.loads(finding["numbers"])["thresholds"] for finding in findings} == {"synthetic"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"static": {"min_run": 2}}, r"(?s)filter\.sources\.agibot_world.*static\.min_run: unknown key.*min_run_s"),
+        ({"blurr": {}}, r"(?s)filter\.sources\.agibot_world.*blurr: unknown key.*'blur'"),
+        ({"static": {"min_run_s": -1}}, r"(?s)filter\.sources\.agibot_world.*static\.min_run_s"),
+        ({"static": 3}, r"(?s)filter\.sources\.agibot_world.*static"),
+        ({"sources": {}}, r"cannot be nested"),
+    ],
+)
+def test_a_wrong_override_is_named(overrides: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        FilterConfig.model_validate({"sources": {"agibot_world": overrides}})
 
 
 def test_views_that_have_no_frames_are_known(filtered: tuple[Path, Path, dict[str, Any]]) -> None:

@@ -21,24 +21,27 @@ def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any
     row = episodes.rows[i]
     try:
         episode = episodes.episode(i)
-        frames = {view: episodes.frames(i, view) for view in row.views}
+        thumbnails = {view: episodes.thumbnails(i, view) for view in row.views}
     except DataError as error:
         return _rejected("unreadable", str(error).replace(str(episodes.root), ""), {}, [])
-    if row.video_frames < config.min_segment_frames:
-        evidence = {"video_frames": row.video_frames, "threshold_frames": config.min_segment_frames}
+    thresholds = config.for_source(row.source)
+    if row.video_frames < thresholds.min_segment_frames:
+        evidence = {"video_frames": row.video_frames, "threshold_frames": thresholds.min_segment_frames}
         return _rejected("too_short", "Fewer images than the shortest clip", evidence, [])
-    findings = inspect(config, measure(episode, frames))
-    listed = [_finding_row(row.episode_id, finding) for finding in findings]
+    findings = inspect(thresholds, measure(episode, thumbnails))
+    origin = row.source if row.source in config.sources else "default"
+    listed = [_finding_row(row.episode_id, finding, origin) for finding in findings]
     whole = [f for f in findings if f.stage == 1 and not f.verdict.passed]
     if whole:
         return _rejected(whole[0].verdict.reason, _detail(whole[0]), dict(whole[0].verdict.numbers), listed)
-    bad = np.zeros(row.video_frames, dtype=bool)
-    for finding in findings:
-        if finding.verdict.bad_frames is not None:
-            bad |= finding.verdict.bad_frames
-    segments = [(a, b) for a, b in runs(~bad) if b - a >= config.min_segment_frames]
+    cuts = _cuts(findings)
+    bad = np.logical_or.reduce([flags for _, flags in cuts]) if cuts else np.zeros(row.video_frames, dtype=bool)
+    segments = [(a, b) for a, b in runs(~bad) if b - a >= thresholds.min_segment_frames]
     if not segments:
-        blame = max(findings, key=lambda f: 0 if f.verdict.bad_frames is None else int(f.verdict.bad_frames.sum()))
+        if not cuts:
+            evidence = {"usable_frames": len(bad), "threshold_frames": thresholds.min_segment_frames}
+            return _rejected("too_short", "Fewer usable images than the shortest clip", evidence, listed)
+        blame = max(cuts, key=lambda cut: int(cut[1].sum()))[0]
         return _rejected(blame.verdict.reason, _detail(blame), dict(blame.verdict.numbers), listed)
     stage2 = next((f.verdict.reason for f in findings if f.stage == 2 and not f.verdict.passed), None)
     return {
@@ -50,6 +53,18 @@ def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any
     }
 
 
+def _cuts(findings: list[Finding]) -> list[tuple[Finding, np.ndarray]]:
+    """The findings that cut frames out, with those frames.
+
+    A view that is bad for most of the time bars the episode from Stage II, and Stage I does not look at it: no cut.
+    """
+    return [
+        (finding, finding.verdict.bad_frames)
+        for finding in findings
+        if finding.verdict.bad_frames is not None and (finding.stage == 1 or finding.verdict.passed)
+    ]
+
+
 def _rejected(reason: str, detail: str, evidence: dict[str, Any], findings: list[dict[str, Any]]) -> dict[str, Any]:
     return {"reason": reason, "detail": detail, "evidence": evidence, "findings": findings}
 
@@ -59,14 +74,19 @@ def _detail(finding: Finding) -> str:
     return f"Detector {finding.detector}{where}"
 
 
-def _finding_row(episode_id: str, finding: Finding) -> dict[str, Any]:
+def _finding_row(episode_id: str, finding: Finding, thresholds: str) -> dict[str, Any]:
+    """`thresholds`: the source whose own thresholds were used, or "default"; "cut" lists (start, stop) of cut frames."""
     verdict = finding.verdict
+    numbers: dict[str, Any] = {**verdict.numbers, "thresholds": thresholds}
+    cut = verdict.bad_frames if finding.stage == 1 or verdict.passed else None
+    if cut is not None and cut.any():
+        numbers["cut"] = runs(cut)
     return {
         "episode_id": episode_id,
         "detector": finding.detector,
         "view": finding.view,
         "stage": finding.stage,
         "passed": bool(verdict.passed),
-        "cut_frames": 0 if verdict.bad_frames is None else int(verdict.bad_frames.sum()),
-        "numbers": json.dumps(dict(verdict.numbers), sort_keys=True),
+        "cut_frames": 0 if cut is None else int(cut.sum()),
+        "numbers": json.dumps(numbers, sort_keys=True),
     }

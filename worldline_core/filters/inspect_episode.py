@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldline_core.data.episode import CameraTrack
-from worldline_core.filters.base_motion import background_flow, detect_base_motion
+from worldline_core.filters.base_motion import changed_area, detect_base_motion
+from worldline_core.filters.blur import detect_blur
 from worldline_core.filters.calibration import (
     detect_camera,
     detect_fixed_camera,
     detect_hand_eye,
 )
-from worldline_core.filters.corrupted import detect_corrupted
+from worldline_core.filters.corrupted import detect_corrupted, without_signal
 from worldline_core.filters.doctor import detect_mistake
+from worldline_core.filters.exposure import detect_dark, detect_overexposed
+from worldline_core.filters.joint_motion import detect_joint_jump, detect_joint_speed
 from worldline_core.filters.projection import detect_projection
 from worldline_core.filters.reset import detect_reset
 from worldline_core.filters.signals import Signals
@@ -44,6 +47,8 @@ class Finding:
 def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
     """All findings about an episode, Stage I detectors first."""
     findings = _stage1(config, signals)
+    if signals.episode.state_kind == "none":
+        return [*findings, Finding("required_views", None, 2, Verdict("missing_actions", False))]
     findings += _required(config, signals)
     if signals.T_base_tool is not None and signals.episode.cameras:
         # Clocks first: a lag also disturbs the hand-eye check, and is the better explanation.
@@ -80,30 +85,70 @@ def _arms_of(signals: Signals, view: str) -> tuple[int, ...]:
 def _stage1(config: FilterConfig, signals: Signals) -> list[Finding]:
     episode = signals.episode
     primary = episode.primary_view if episode.primary_view in signals.gray else next(iter(signals.gray))
-    findings = []
-    if signals.joints is not None:
-        findings.append(Finding("reset", None, 1, detect_reset(signals.joints, config.reset)))
+    findings: list[Finding] = []
+    if signals.joints is not None and signals.joints.shape[1]:
+        findings += _joint_findings(config, signals.joints, episode.fps)
+    spoilt = np.zeros(len(signals.gray[primary]), dtype=bool)
+    unreliable = np.logical_or.reduce([spoilt, *(_bad(f) for f in findings if f.detector != "reset")])
     for view in [primary, *(v for v in signals.gray if v != primary)]:
-        verdict = detect_corrupted(
-            signals.gray[view],
-            signals.change[view],
-            signals.travel(_arms_of(signals, view)),
-            config.corrupted,
-            wrist=view.endswith("wrist"),
-        )
-        findings.append(Finding("corrupted", view, 1 if view == primary else 2, verdict))
+        found = _picture_findings(config, signals, view, 1 if view == primary else 2, unreliable)
+        findings += found
+        if view == primary:
+            for finding in found:
+                spoilt |= _bad(finding)
+    pictures = signals.pictures[primary]
     static = detect_static(
-        signals.joint_speed, signals.gripper_speed, signals.change[primary], episode.fps, config.static
+        signals.joint_speed, signals.gripper_speed, pictures.coarse_change, episode.fps, config.static
     )
     findings.append(Finding("static", primary, 1, static))
     camera = episode.cameras.get(primary)
     if camera is None or not camera.moving:
-        settings = config.base_motion
-        step = max(1, round(settings.step_s * episode.fps))
-        flow = background_flow(signals.gray[primary], settings.quantile, settings.min_gradient, step)
-        verdict = detect_base_motion(flow, config.base_motion)
-        findings.append(Finding("base_motion", primary, 1, verdict))
+        area = changed_area(signals.gray[primary], ~spoilt, episode.fps, config.base_motion)
+        findings.append(Finding("base_motion", primary, 1, detect_base_motion(area, episode.fps, config.base_motion)))
     return findings
+
+
+def _joint_findings(config: FilterConfig, joints: np.ndarray, fps: float) -> list[Finding]:
+    """Resets first: what follows one is dropped, so its jump is not counted again."""
+    reset = detect_reset(joints, fps, config.reset)
+    frame = reset.numbers["reset_frame"]
+    before = joints if frame is None else joints[: int(frame)]
+    findings = [Finding("reset", None, 1, reset)]
+    for name, verdict in (
+        ("joint_jump", detect_joint_jump(before, config.joint_motion)),
+        ("joint_speed", detect_joint_speed(before, fps, config.joint_motion)),
+    ):
+        missing = len(joints) - len(before)
+        bad = np.concatenate([verdict.bad_frames, np.zeros(missing, bool)]) if verdict.bad_frames is not None else None
+        findings.append(Finding(name, None, 1, replace(verdict, bad_frames=bad)))
+    return findings
+
+
+def _picture_findings(
+    config: FilterConfig, signals: Signals, view: str, stage: int, unreliable: np.ndarray
+) -> list[Finding]:
+    """What is wrong with the pictures of one view; a frame is counted for the first reason only.
+
+    `unreliable`: bool (n,) frames whose joint readings are wrong.
+    """
+    pictures, wrist = signals.pictures[view], view.endswith("wrist")
+    dark = detect_dark(pictures, config.exposure, wrist=wrist)
+    white = detect_overexposed(pictures, config.exposure, wrist=wrist)
+    findings = [Finding("too_dark", view, stage, dark), Finding("overexposed", view, stage, white)]
+    lost = _bad(findings[0]) | _bad(findings[1])
+    blank, noise = without_signal(pictures, config.corrupted)
+    fps = signals.episode.fps
+    blur = detect_blur(signals.sharpness[view], pictures, lost | blank | noise, fps, config.blur, wrist=wrist)
+    findings.append(Finding("blur", view, stage, blur))
+    tracks = signals.tracks(_arms_of(signals, view))
+    lost |= _bad(findings[-1])
+    corrupted = detect_corrupted(pictures, tracks, lost, unreliable, fps, config.corrupted, wrist=wrist)
+    return [*findings, Finding("corrupted", view, stage, corrupted)]
+
+
+def _bad(finding: Finding) -> np.ndarray:
+    bad = finding.verdict.bad_frames
+    return np.zeros(0, dtype=bool) if bad is None else bad
 
 
 def _required(config: FilterConfig, signals: Signals) -> list[Finding]:
@@ -151,11 +196,11 @@ def _time_alignment(config: FilterConfig, signals: Signals, T_base_tool: np.ndar
     motion = np.linalg.norm(relative[..., :3, 3], axis=-1)
     motion = motion + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
     streams, changes = [], []
-    for view, change in signals.change.items():
+    for view, pictures in signals.pictures.items():
         arms = _arms_of(signals, view)
         if arms:
             streams.append(motion[:, list(arms)].max(axis=1))
-            changes.append(change[1:])
+            changes.append(pictures.change[1:])
     findings = []
     if streams:
         verdict = detect_image_lag(np.stack(streams, axis=1), np.stack(changes, axis=1), fps, config.time_alignment)

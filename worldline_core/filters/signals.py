@@ -6,13 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from worldline_core.data.episode import Episode
+from worldline_core.data.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError, UnavailableError
+from worldline_core.filters.picture_statistics import PictureStatistics, picture_statistics
+from worldline_core.filters.static import range_speed
 
-GRAY_WIDTH = 96
+_METRES_A_RADIAN = 0.3
+"""How far a tool gets whose arm nobody knows, a radian of a joint: half the reach of a small arm."""
 
 
 @dataclass(frozen=True)
@@ -29,68 +32,54 @@ class Signals:
     """Everything about one episode; n counts frames with images.
 
     Attributes:
-        gray: by view, uint8 (n, h, w), GRAY_WIDTH wide. change: by view, (n,) mean absolute change, of 255.
-        joint_speed, gripper_speed: (n,) fastest joint [rad/s] and gripper [1/s], frame i against i - 1.
+        gray: by view, uint8 (n, h, 96). sharpness: by view, (n,) variance of the Laplacian at the images' own size.
+        pictures: by view, numbers about gray.
+        joint_speed, gripper_speed: (n,) fastest joint [rad/s] and gripper [1/s], by their range within half a second.
         joints: (n, j) joint positions [rad], without grippers; None for pose recordings.
         T_base_tool: (n, a, 4, 4), or None where neither poses nor kinematics are known. arms: its a arms.
     """
 
     episode: Episode
     gray: Mapping[str, np.ndarray]
-    change: Mapping[str, np.ndarray]
+    sharpness: Mapping[str, np.ndarray]
+    pictures: Mapping[str, PictureStatistics]
     joint_speed: np.ndarray
     gripper_speed: np.ndarray
     joints: np.ndarray | None
     T_base_tool: np.ndarray | None
     arms: tuple[ArmModel, ...]
 
-    def travel(self, arms: tuple[int, ...]) -> np.ndarray:
-        """(n,) largest tool travel [m] of some arms, frame i against i - 1; zeros where tools are unknown."""
-        if self.T_base_tool is None or not arms:
-            return np.zeros(len(self.joint_speed))
-        position = self.T_base_tool[:, list(arms)][..., :3, 3]
-        steps = np.linalg.norm(np.diff(position, axis=0), axis=-1).max(axis=1)
-        return np.concatenate([[0.0], steps])
+    def tracks(self, arms: tuple[int, ...]) -> np.ndarray:
+        """(n, k, 3) positions [m] of the tools of some arms; where tools are unknown, the joints stand in for them.
+
+        Nothing is known to move where joints are unknown too: k is 0.
+        """
+        count = len(self.joint_speed)
+        if self.T_base_tool is not None and arms:
+            return self.T_base_tool[:, list(arms)][..., :3, 3]
+        if self.joints is None:
+            return np.zeros((count, 0, 3))
+        return np.concatenate([self.joints[..., None] * _METRES_A_RADIAN, np.zeros((*self.joints.shape, 2))], axis=-1)
 
 
-def measure(episode: Episode, frames: Mapping[str, np.ndarray]) -> Signals:
-    """Signals of an episode from its images (by view, uint8 (n, H, W, 3))."""
-    num_frames = min(episode.num_video_frames, *(len(images) for images in frames.values()))
-    gray = {view: _gray(images[:num_frames]) for view, images in frames.items()}
+def measure(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> Signals:
+    """Signals of an episode from the small images of each view."""
+    num_frames = min(episode.num_video_frames, *(len(small) for small in thumbnails.values()))
+    gray = {view: small.gray[:num_frames] for view, small in thumbnails.items()}
     joint_columns, gripper_columns = _columns(episode)
     state = episode.state[:num_frames].astype(np.float64)
     tools, arms = tool_poses(episode)
     return Signals(
         episode,
         gray,
-        {view: _change(images) for view, images in gray.items()},
-        _speed(state[:, joint_columns], episode.fps),
-        _speed(state[:, gripper_columns], episode.fps),
+        {view: small.sharpness[:num_frames] for view, small in thumbnails.items()},
+        {view: picture_statistics(images) for view, images in gray.items()},
+        range_speed(state[:, joint_columns], episode.fps),
+        range_speed(state[:, gripper_columns], episode.fps),
         state[:, joint_columns] if episode.state_kind == "joints" else None,
         None if tools is None else tools[:num_frames],
         arms,
     )
-
-
-def _gray(images: np.ndarray) -> np.ndarray:
-    height = max(2, round(images.shape[1] * GRAY_WIDTH / images.shape[2]))
-    small = [
-        cv2.resize(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA)
-        for i in images
-    ]
-    return np.stack(small)
-
-
-def _change(gray: np.ndarray) -> np.ndarray:
-    value = gray.astype(np.float32)
-    return np.concatenate([[0.0], np.abs(np.diff(value, axis=0)).mean(axis=(1, 2))])
-
-
-def _speed(values: np.ndarray, fps: float) -> np.ndarray:
-    if values.shape[1] == 0 or len(values) < 2:
-        return np.zeros(len(values))
-    steps = np.abs(np.diff(values, axis=0)).max(axis=1) * fps
-    return np.concatenate([[steps[0]], steps])
 
 
 def _columns(episode: Episode) -> tuple[list[int], list[int]]:

@@ -45,9 +45,8 @@ def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> 
     for index, lag in enumerate(range(-max_lag, max_lag + 1)):
         a = motion[max(0, -lag) : len(motion) - max(0, lag)]
         b = change[max(0, lag) : len(change) - max(0, -lag)]
-        values = [_correlation(a[:, s], b[:, s]) for s in range(motion.shape[1])]
-        known = [value for value in values if value is not None]
-        if known:
+        known = _correlations(a, b)
+        if len(known):
             scores[index] = float(np.mean(known))
     best = int(scores.argmax())
     refined = float(best - max_lag)
@@ -59,10 +58,14 @@ def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> 
     return refined, float(scores[best]), float(scores[max_lag])
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float | None:
-    if len(a) < 8 or a.std() < 1e-9 or b.std() < 1e-9:
-        return None
-    return float(np.corrcoef(a, b)[0, 1])
+def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Pearson's of the columns of (n, s) and (n, s) that vary in both; none from fewer than eight rows."""
+    if len(a) < 8:
+        return np.zeros(0)
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    spread_a, spread_b = np.sqrt((a**2).mean(axis=0)), np.sqrt((b**2).mean(axis=0))
+    varies = (spread_a > 1e-9) & (spread_b > 1e-9)
+    return (a * b).mean(axis=0)[varies] / (spread_a * spread_b)[varies]
 
 
 def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config: TimeAlignmentConfig) -> Verdict:
@@ -90,16 +93,26 @@ def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config:
 def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -> tuple[int, float, float]:
     """Shift of a wrist camera's poses after its tool's that makes the pair most rigid.
 
+    A shift is looked for coarsely first, then around the best: the residual falls towards it over many frames.
+
     Returns: (lag in frames, hand-eye residual [m] there, residual at 0), residuals as root mean squares.
     """
-    residuals = {}
-    for lag in range(-max_lag, max_lag + 1):
-        tool = T_base_tool[max(0, -lag) : len(T_base_tool) - max(0, lag)]
-        camera = T_base_camera[max(0, lag) : len(T_base_camera) - max(0, -lag)]
-        _, metres, _ = hand_eye_residual(tool, camera)
-        residuals[lag] = float(np.sqrt((metres**2).mean()))
-    best = min(residuals, key=lambda lag: (residuals[lag], abs(lag)))
-    return best, residuals[best], residuals[0]
+    residuals: dict[int, float] = {}
+
+    def residual(lag: int) -> float:
+        if lag not in residuals:
+            tool = T_base_tool[max(0, -lag) : len(T_base_tool) - max(0, lag)]
+            camera = T_base_camera[max(0, lag) : len(T_base_camera) - max(0, -lag)]
+            _, metres, _ = hand_eye_residual(tool, camera)
+            residuals[lag] = float(np.sqrt((metres**2).mean()))
+        return residuals[lag]
+
+    coarse = max(1, max_lag // 6)
+    tried = [*range(0, max_lag + 1, coarse), *range(-coarse, -max_lag - 1, -coarse)]
+    around = min(tried, key=lambda lag: (residual(lag), abs(lag)))
+    near = range(max(-max_lag, around - coarse), min(max_lag, around + coarse) + 1)
+    best = min(near, key=lambda lag: (residual(lag), abs(lag)))
+    return best, residual(best), residual(0)
 
 
 def detect_pose_lag(

@@ -16,6 +16,7 @@ from worldline_core.exports.labels import Picture
 from worldline_core.exports.pictures import png_bytes
 from worldline_core.report.artifacts import read_json, read_rows
 from worldline_core.report.inspect_sheets import MOMENTS, episode_sheet, rollout_sheet, tracks_sheet
+from worldline_core.report.refusals import episode_of
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
@@ -66,8 +67,17 @@ def write_pictures(
             expected="a manifest that names a folder which is still there",
             next_step="name the EpisodeSet with --episodes FOLDER",
         )
-    written: list[Path] = []
     notes: list[str] = []
+    written = subject.write_filters(output, wanted, notes)
+    if written and wanted.episode_id is not None and wanted.episode_id not in subject.kept_ids:
+        if wanted.video:
+            raise DataError(
+                "There is no such kept episode to make a video of",
+                where=folder,
+                got=wanted.episode_id,
+                next_step="name one of its segments, or inspect the EpisodeSet that was filtered",
+            )
+        return written, notes
     picture = subject.sheet(wanted.episode_id, notes)
     if picture is not None:
         path = output / "contact_sheet.png"
@@ -115,6 +125,31 @@ class Subject:
         if self.episodes_folder is None:
             raise ArtifactError("The episodes that this artifact belongs to are not known", where=self.folder)
         return EpisodeSet.open(self.episodes_folder)
+
+    @property
+    def kept_ids(self) -> set[str]:
+        """Ids of the episodes, or segments of episodes, in the artifact."""
+        return {row.episode_id for row in self.episodes.rows}
+
+    def write_filters(self, output: Path, wanted: PicturesWanted, notes: list[str]) -> list[Path]:
+        """What the filters did, where the artifact is a filter step's: a page with a sheet for every reason, or one
+        episode's strip and recording."""
+        if self.kind != "EpisodeSet" or not (self.folder / "findings.parquet").is_file():
+            return []
+        curated = self.given_episodes or linked_folder(self.folder, "episodes")
+        if curated is None:
+            notes.append(
+                "dropped clips are not shown: the EpisodeSet that was filtered is not known (--episodes FOLDER)"
+            )
+            return []
+        from worldline_core.report.inspect_filters import FilteredSet, write_episode, write_filter_page
+
+        filtered = FilteredSet(self.folder, curated)
+        if wanted.episode_id is None:
+            return write_filter_page(filtered, output / "filters")
+        # A segment is shown with the episode that it was cut from.
+        whole = wanted.episode_id if wanted.episode_id in filtered.clips else episode_of(wanted.episode_id)
+        return write_episode(filtered, whole, output, rerun=wanted.rerun) if whole in filtered.clips else []
 
     @cached_property
     def tracks_folder(self) -> Path | None:

@@ -51,13 +51,14 @@ def filter_refusals(folder: Path) -> list[Refusal]:
     kept = read_rows(folder / "index.parquet")
     for row in first_of_each_episode(kept):
         if row.get("stage2_ok") is False:
-            failed = [f for f in findings.get(row["episode_id"], []) if not f["passed"] and f["stage"] == 2]
+            name = episode_of(row["episode_id"])
+            failed = [f for f in findings.get(name, []) if not f["passed"] and f["stage"] == 2]
             detectors = ", ".join(dict.fromkeys(str(f["detector"]).replace("_", " ") for f in failed))
             reason = str(row.get("stage2_reason") or "unfit for Stage II")
             detail = f"found by {detectors}" if detectors else "see the step's findings"
             numbers = parsed(failed[0]["numbers"]) if failed else {}
-            refusals.append(Refusal("filter", reason, NOT_STAGE2, row["episode_id"], detail, numbers, "head"))
-    names = {row["episode_id"] for row in kept}
+            refusals.append(Refusal("filter", reason, NOT_STAGE2, name, detail, numbers, "head"))
+    names = {episode_of(row["episode_id"]) for row in kept}
     for episode_id, rows in sorted(findings.items()):
         for row in rows:
             if row["cut_frames"] and episode_id in names:
@@ -77,7 +78,13 @@ def findings_by_episode(folder: Path) -> dict[str, list[JsonObject]]:
 
 def first_of_each_episode(rows: list[JsonObject]) -> list[JsonObject]:
     """One row an episode (an episode kept in several segments has several)."""
-    return list({row["episode_id"]: row for row in reversed(rows)}.values())[::-1]
+    return list({episode_of(row["episode_id"]): row for row in reversed(rows)}.values())[::-1]
+
+
+def episode_of(name: str) -> str:
+    """The episode that a kept row was cut from: `episode@00120` is a segment of `episode`."""
+    episode, _, start = name.rpartition("@")
+    return episode if episode and len(start) == 5 and start.isdigit() else name
 
 
 def parsed(evidence: Any) -> JsonObject:

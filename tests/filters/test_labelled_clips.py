@@ -1,0 +1,89 @@
+"""The filters on labelled clips, one of each kind; benchmarks/filters.py measures them on many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.config.loader import CONFIG_ROOT, load_config
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.thumbnails import view_thumbnails
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.filters.inspect_episode import Finding, inspect
+from worldline_core.filters.labelled_clips import FAULTS, HARMLESS, Clip, at_frames
+from worldline_core.filters.reasons import REASONS
+from worldline_core.filters.signals import measure
+
+
+@pytest.fixture(scope="module")
+def recording(project_root: Path) -> Clip:
+    episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
+    i = episodes.position("ur5e_pair-test-s1-00002")
+    masks = {view: episodes.robot_masks(i, view) for view in episodes.rows[i].views}
+    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
+    return Clip(episodes.episode(i), frames, {view: m for view, m in masks.items() if m is not None})
+
+
+def findings_of(clip: Clip) -> list[Finding]:
+    thumbnails = {view: view_thumbnails(images, clip.episode.fps) for view, images in clip.frames.items()}
+    return inspect(FilterConfig(), measure(clip.episode, thumbnails))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_gets_its_reason(recording: Clip, name: str) -> None:
+    clip = FAULTS[name](recording, np.random.default_rng(3))
+    assert clip.bad is not None
+    assert clip.bad.any()
+    assert len(clip.bad) == clip.episode.num_frames == len(clip.frames["head"])
+    found = [f for f in findings_of(clip) if f.verdict.reason == clip.fault and not f.verdict.clean]
+    assert found
+    assert clip.fault in REASONS
+    if found[0].verdict.bad_frames is not None:
+        cut = np.logical_or.reduce([f.verdict.bad_frames for f in found if f.verdict.bad_frames is not None])
+        assert (cut & clip.bad).sum() >= 0.7 * clip.bad.sum()
+        assert (cut & ~clip.bad).sum() <= 0.3 * cut.sum() + 2
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_nothing_is_dropped_for_a_change_that_is_no_fault(recording: Clip, name: str) -> None:
+    clip = HARMLESS[name](recording, np.random.default_rng(3))
+    assert clip.fault == ""
+    assert any(
+        not np.array_equal(clip.frames[v][: len(recording.frames[v])], recording.frames[v][: len(clip.frames[v])])
+        for v in clip.frames
+    )
+    assert all(f.verdict.clean for f in findings_of(clip))
+
+
+def test_the_same_seed_gives_the_same_clip(recording: Clip) -> None:
+    for change in (FAULTS["base_motion"], FAULTS["static"]):
+        first, second = (change(recording, np.random.default_rng(5)) for _ in range(2))
+        assert first.severity == second.severity
+        assert all(np.array_equal(first.frames[view], second.frames[view]) for view in first.frames)
+        assert np.array_equal(first.episode.state, second.episode.state)
+
+
+def test_frames_and_states_stay_together(recording: Clip) -> None:
+    index = np.array([0, 0, 5, 4])
+    clip = at_frames(recording, index)
+    assert np.array_equal(clip.frames["head"], recording.frames["head"][index])
+    assert np.array_equal(clip.episode.state, recording.episode.state[index])
+    wrist = clip.episode.cameras["left_wrist"].T_base_camera
+    assert np.array_equal(wrist, recording.episode.cameras["left_wrist"].T_base_camera[index])
+
+
+def test_curves_cover_every_frame(recording: Clip) -> None:
+    for finding in findings_of(recording):
+        for name, curve in finding.verdict.curves.items():
+            assert np.isfinite(curve.values).all(), name
+            assert len(curve.values) == recording.episode.num_frames, name
+
+
+@pytest.mark.parametrize("path", sorted((CONFIG_ROOT / "filters").glob("*.yaml")), ids=lambda path: path.stem)
+def test_thresholds_that_ship_are_valid(path: Path) -> None:
+    config = load_config(FilterConfig, path=path, section="filter")
+    assert config.sources
+    for name in config.sources:
+        assert config.for_source(name) != config

@@ -1,0 +1,121 @@
+"""`worldline inspect` on a filter step's artifact: kept and dropped clips by reason, timelines, curves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rerun.chunk import RrdReader
+
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.errors import DataError
+from worldline_core.exports.clip_strip import KEPT_COLOUR, reason_colour
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.report.artifacts import read_rows
+from worldline_core.report.inspect import inspect
+from worldline_core.report.inspect_filters import FilteredSet
+from worldline_core.report.refusals import CUT, QUARANTINED, episode_of, filter_refusals, first_of_each_episode
+from worldline_core.store.atomic import write_json_atomic
+
+CONFIG = FilterConfig(min_segment_frames=8)
+
+
+@pytest.fixture(scope="module")
+def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four episodes of one recording: healthy, dark in the middle, black throughout, and with a camera turned about."""
+    root = tmp_path_factory.mktemp("artifacts")
+    episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
+    i = episodes.position("ur5e_pair-test-s1-00002")
+    episode = episodes.episode(i)
+    frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
+    with EpisodeSetWriter(root / "curate" / "key") as writer:
+        writer.add(replace(episode, episode_id="healthy"), frames)
+        dark = frames["head"].copy()
+        dark[12:18] = dark[12:18] // 16
+        writer.add(replace(episode, episode_id="dark"), {**frames, "head": dark})
+        writer.add(replace(episode, episode_id="black"), {**frames, "head": frames["head"] // 16})
+        head = episode.cameras["head"]
+        turned = replace(head, T_base_camera=np.linalg.inv(head.T_base_camera))
+        writer.add(replace(episode, episode_id="turned", cameras={**episode.cameras, "head": turned}), frames)
+    folder = root / "filter" / "key"
+    filter_episodes(CONFIG, {"episodes": root / "curate" / "key"}, folder)
+    content = {
+        "config": CONFIG.model_dump(mode="json"),
+        "inputs": {"episodes": {"path": "curate/key", "digest": "0"}},
+    }
+    write_json_atomic(folder / "manifest.json", content)
+    return folder
+
+
+def test_every_clip_stands_under_its_reasons(filtered: Path) -> None:
+    found = FilteredSet(filtered, filtered.parent.parent / "curate" / "key")
+    assert found.clips["healthy"].reasons == ["kept"]
+    assert found.clips["black"].reasons == ["too_dark"]
+    assert found.clips["black"].segments == ()
+    assert found.clips["dark"].reasons == ["too_dark"]
+    assert found.clips["dark"].segments == ((0, 12), (18, 33))
+    assert found.clips["dark"].cut_by == {"too_dark": 6}
+    assert found.clips["turned"].stage2_reason is not None
+    assert found.clips["turned"].segments == ((0, 33),)
+    assert next(iter(found.by_reason())) == "too_dark"
+    assert list(found.by_reason())[-1] == "kept"
+    assert found.config == CONFIG
+
+
+def test_a_page_shows_kept_and_dropped_clips(filtered: Path, tmp_path: Path) -> None:
+    result = inspect(filtered, tmp_path)
+    html = (tmp_path / "filters" / "index.html").read_text()
+    assert "4 episodes: 3 kept in 4 segments, 1 dropped whole" in html
+    assert "1 dropped whole, 1 lost frames" in html
+    pictures = [path for path in result.written if path.suffix == ".jpg"]
+    assert {"too_dark.jpg", "kept.jpg"} <= {path.name for path in pictures}
+    for path in pictures:
+        assert f'src="{path.name}"' in html
+        with Image.open(path) as image:
+            assert image.width > 800
+
+
+def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_path: Path) -> None:
+    result = inspect(filtered, tmp_path, episode_id="dark", rerun=True)
+    assert [path.name for path in result.written] == ["dark_filters.png", "dark_filters.rrd"]
+    with Image.open(tmp_path / "dark_filters.png") as image:
+        picture = np.asarray(image.convert("RGB"))
+    row = next(r for r in picture if (np.abs(r.astype(int) - KEPT_COLOUR).max(axis=-1) < 8).mean() > 0.6)
+    dropped = np.flatnonzero(np.abs(row.astype(int) - reason_colour("too_dark")).max(axis=-1) < 8)
+    width = len(row) - 24
+    assert abs((dropped[0] - 12) / width - 12 / 33) < 0.02
+    assert abs((dropped[-1] - 12) / width - 18 / 33) < 0.02
+    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "dark_filters.rrd").stream()}
+    assert {"/segments/kept", "/segments/too_dark", "/views/head", "/curves/too_dark/head/bright_level"} <= entities
+    assert "/segments/static" not in entities
+
+
+def test_a_kept_episode_is_shown_with_its_controls_as_well(filtered: Path, tmp_path: Path) -> None:
+    names = [path.name for path in inspect(filtered, tmp_path, episode_id="healthy").written]
+    assert names == ["healthy_filters.png", "contact_sheet.png"]
+    segment = [path.name for path in inspect(filtered, tmp_path, episode_id="dark@00018").written]
+    assert segment == ["dark_filters.png", "contact_sheet.png"]
+    with pytest.raises(DataError, match=r"(?s)no such kept episode.*black"):
+        inspect(filtered, tmp_path, episode_id="black", video=True)
+    with pytest.raises(DataError, match=r"(?s)No such episode.*nobody"):
+        inspect(filtered, tmp_path, episode_id="nobody")
+
+
+def test_without_the_curated_set_it_is_said(filtered: Path, tmp_path: Path) -> None:
+    (filtered / "manifest.json").rename(tmp_path / "manifest.json")
+    try:
+        assert "dropped clips are not shown" in str(inspect(filtered, tmp_path))
+    finally:
+        (tmp_path / "manifest.json").rename(filtered / "manifest.json")
+
+
+def test_the_report_knows_which_episode_a_segment_is_of(filtered: Path) -> None:
+    found = {(item.episode_id, item.effect) for item in filter_refusals(filtered)}
+    assert ("dark", CUT) in found
+    assert ("black", QUARANTINED) in found
+    assert len(first_of_each_episode(read_rows(filtered / "index.parquet"))) == 3
+    assert [episode_of(name) for name in ("a@00012", "a@b", "a", "a@b@00001")] == ["a", "a@b", "a", "a@b"]

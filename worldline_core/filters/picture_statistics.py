@@ -1,0 +1,84 @@
+"""Numbers about each small grey picture of a view, which several detectors look at. About 0.04 ms a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+WHITE_LEVEL = 245
+"""Luma from which a pixel tells nothing any more."""
+_FLAT_LEVELS = 2
+_COARSE = 4
+
+
+@dataclass(frozen=True)
+class PictureStatistics:
+    """All (n,), of small pictures; grey levels are of 255.
+
+    Attributes:
+        mean, contrast: mean and standard deviation of the levels. bright_level: their 95th percentile.
+        white_share: share of pixels at WHITE_LEVEL or above.
+        roughness: 1 minus the correlation of adjacent pixels (the lower of across and down): near 0 for pictures, near 1
+            for noise. It does not depend on gain.
+        detail: mean squared difference of adjacent pixels, across plus down.
+        flat_share: share of rows at the lower edge that have together one grey level, plus those at the upper edge.
+        change: mean absolute difference from the picture before (0 for the first).
+        coarse_change: the same of pictures reduced by four, in which sensor noise hardly shows.
+    """
+
+    mean: np.ndarray
+    contrast: np.ndarray
+    bright_level: np.ndarray
+    white_share: np.ndarray
+    roughness: np.ndarray
+    detail: np.ndarray
+    flat_share: np.ndarray
+    change: np.ndarray
+    coarse_change: np.ndarray
+
+
+def picture_statistics(gray: np.ndarray) -> PictureStatistics:
+    """Of uint8 (n, h, w)."""
+    count, height, width = gray.shape
+    histograms = np.stack([np.bincount(image.reshape(-1), minlength=256) for image in gray]).astype(np.float64)
+    levels = np.arange(256)
+    pixels = height * width
+    mean = histograms @ levels / pixels
+    variance = np.maximum(histograms @ levels**2 / pixels - mean**2, 0)
+    across, down, change, coarse_change = (np.zeros(count) for _ in range(4))
+    low, high = gray.min(axis=2).astype(np.int16), gray.max(axis=2).astype(np.int16)
+    coarse_size = (max(1, width // _COARSE), max(1, height // _COARSE))
+    before = coarse_before = None
+    for i, image in enumerate(gray):
+        across[i] = cv2.norm(image[:, 1:], image[:, :-1], cv2.NORM_L2SQR) / (height * (width - 1))
+        down[i] = cv2.norm(image[1:], image[:-1], cv2.NORM_L2SQR) / ((height - 1) * width)
+        coarse = cv2.resize(image.astype(np.float32), coarse_size, interpolation=cv2.INTER_AREA)
+        if before is not None and coarse_before is not None:
+            change[i] = cv2.norm(image, before, cv2.NORM_L1) / pixels
+            coarse_change[i] = cv2.norm(coarse, coarse_before, cv2.NORM_L1) / coarse.size
+        before, coarse_before = image, coarse
+    cumulative = np.cumsum(histograms, axis=1)
+    return PictureStatistics(
+        mean,
+        np.sqrt(variance),
+        (cumulative < 0.95 * pixels).sum(axis=1).astype(np.float64),
+        histograms[:, WHITE_LEVEL:].sum(axis=1) / pixels,
+        np.minimum(np.maximum(across, down) / (2 * np.maximum(variance, 1e-3)), 1.0),
+        across + down,
+        _flat_edge(low, high) + _flat_edge(low[:, ::-1], high[:, ::-1]),
+        change,
+        coarse_change,
+    )
+
+
+def _flat_edge(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Share of rows, from the last one up, that together span no more than a few levels.
+
+    Args:
+        low, high: (n, h) darkest and brightest level of each row.
+    """
+    lowest = np.minimum.accumulate(low[:, ::-1], axis=1)
+    highest = np.maximum.accumulate(high[:, ::-1], axis=1)
+    return (highest - lowest <= _FLAT_LEVELS).mean(axis=1)
