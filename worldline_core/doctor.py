@@ -22,6 +22,7 @@ def examine_machine(project: Path) -> list[dict[str, Any]]:
         _accelerator(),
         _bfloat16(),
         _codec(),
+        _decoder(),
         *_packages(),
         _software_gl(),
         *_weights(project),
@@ -97,6 +98,15 @@ def _codec() -> dict[str, Any]:
             "video codecs", "missing", f"PyAV {av.__version__} without {', '.join(missing)}", "reinstall av from PyPI"
         )
     return _finding("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
+
+
+def _decoder() -> dict[str, Any]:
+    from worldline_core.data.frame_decoder import describe_decoders
+
+    found = describe_decoders()
+    status = "optional" if found["next_step"] else "ok"
+    reason = f" (torchcodec: {found['torchcodec']})" if found["next_step"] else ""
+    return _finding("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
 
 
 def _packages() -> list[dict[str, Any]]:

@@ -183,3 +183,17 @@ def model_config() -> Callable[..., WorldModelConfig]:
         return WorldModelConfig.model_validate(TINY_MODEL | changes)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small tokenizer whose latents have the shape of the world's."""
+    from worldline_core.model.tokenizer.patch import PatchTokenizer, PatchTokenizerConfig
+
+    generator = torch.Generator().manual_seed(5)
+    model = PatchTokenizer(PatchTokenizerConfig(static_channels=3, motion_channels=1))
+    for basis in (model.static_basis, model.motion_basis):
+        basis.copy_(torch.linalg.qr(torch.randn(basis.shape[1], basis.shape[0], generator=generator))[0].T)
+    folder = tmp_path_factory.mktemp("tokenizer")
+    model.save(folder)
+    return folder

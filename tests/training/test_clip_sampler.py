@@ -5,10 +5,12 @@ from collections import Counter
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.stage1 import Stage1Config
 
 
 @pytest.fixture
@@ -78,5 +80,99 @@ def test_single_view_steps_take_larger_batches(store: LatentStore) -> None:
 def test_impossible_requests_are_named(store: LatentStore) -> None:
     with pytest.raises(DataError, match="No episode is long enough"):
         make(store, ClipSampling(lengths=(33,)))
+    with pytest.raises(ConfigError, match=r"cannot code clips of these lengths[\s\S]*\[8, 15\]"):
+        make(store, ClipSampling(lengths=(5, 8, 15)))
     with pytest.raises(ConfigError, match="needs one weight"):
         make(store, ClipSampling(lengths=(5, 9), length_weights=(1.0,)))
+
+
+def every_clip(store: LatentStore, lengths: tuple[int, ...], hop: int = 4) -> set[tuple[str, int, int]]:
+    return {
+        (row.episode_id, start, length)
+        for row in store.rows
+        if row.split == "train"
+        for length in lengths
+        for start in range(0, row.num_frames - length + 1, hop)
+    }
+
+
+@pytest.mark.parametrize(("world_size", "hop"), [(1, None), (2, None), (3, 8)])
+def test_an_epoch_holds_every_clip_once_over_all_ranks(store: LatentStore, world_size: int, hop: int | None) -> None:
+    # 6 episodes x (4 + 3 + 1) starts at every fourth frame: 24, 18 and 6 clips; 12, 12 and 6 at every eighth.
+    config = ClipSampling(lengths=(5, 9, 17), order="epochs", hop=hop)
+    expected = every_clip(store, (5, 9, 17), hop or 4)
+    samplers = [
+        make(store, config, batch_size=6 // world_size, rank=rank, world_size=world_size) for rank in range(world_size)
+    ]
+    batches = len(expected) // 6
+    for epoch in range(2):
+        seen = Counter(
+            (clip.episode_id, clip.start, clip.num_frames)
+            for sampler in samplers
+            for index in range(epoch * batches, (epoch + 1) * batches)
+            for clip in sampler.clips(index).clips
+        )
+        assert set(seen) == expected
+        assert set(seen.values()) == {1}
+    assert samplers[0].clips_per_epoch == len(expected)
+    assert samplers[0].epochs(batches) == 1.0
+    assert make(store).epochs(batches) is None
+
+
+def test_an_epoch_goes_on_in_its_middle(store: LatentStore) -> None:
+    config = ClipSampling(lengths=(5, 9), order="epochs", view_weights={"primary": 1.0, "joint": 1.0})
+    whole = [make(store, config).clips(index) for index in range(30)]
+    later = make(store, config)
+    assert [later.clips(index) for index in range(13, 30)] == whole[13:]
+    assert {batch.view for batch in whole} == {"primary", None}
+    for batch in whole:
+        assert len({clip.num_frames for clip in batch.clips}) == 1
+
+
+def test_a_replacement_is_another_clip_of_the_same_kind(store: LatentStore) -> None:
+    for order in ("weighted", "epochs"):
+        sampler = make(store, ClipSampling(lengths=(5, 9), order=order))
+        drawn = [sampler.replacement(3, 1, attempt) for attempt in range(20)]
+        assert drawn == [make(store, ClipSampling(lengths=(5, 9), order=order)).replacement(3, 1, a) for a in range(20)]
+        assert {clip.num_frames for clip in drawn} == {sampler.clips(3).clips[1].num_frames}
+        assert len(set(drawn)) > 8
+        assert [sampler.replacement(3, 0, attempt) for attempt in range(20)] != drawn
+
+
+def test_lengths_may_be_a_range() -> None:
+    assert ClipSampling.model_validate({"lengths": {"from": 33, "to": 129}}).lengths == tuple(range(33, 130, 4))
+    assert ClipSampling.model_validate({"lengths": {"from": 33, "to": 129, "step": 32}}).lengths == (33, 65, 97, 129)
+    for value in ({"from": 33}, {"from": 33, "to": 129, "steps": 4}, {"from": 33, "to": "129"}):
+        with pytest.raises(ValidationError, match="has the whole numbers"):
+            ClipSampling.model_validate({"lengths": value})
+    for value in ({"from": 33, "to": 17}, {"from": 33, "to": 129, "step": 6}):
+        with pytest.raises(ValidationError, match="in steps of a multiple of 4"):
+            ClipSampling.model_validate({"lengths": value})
+
+
+def test_epochs_refuse_what_they_cannot_heed(store: LatentStore) -> None:
+    for changes in ({"length_weights": (1.0, 2.0)}, {"source_weights": {"a": 2.0}}, {"single_view_factor": 2}):
+        with pytest.raises(ConfigError, match="nothing can be weighted"):
+            make(store, ClipSampling.model_validate({"lengths": (5, 9), "order": "epochs", **changes}))
+    with pytest.raises(ConfigError, match="cannot start at every hop"):
+        make(store, ClipSampling(lengths=(5,), order="epochs", hop=6))
+    with pytest.raises(ConfigError, match="Only epochs have a hop"):
+        make(store, ClipSampling(lengths=(5,), hop=8))
+
+
+def test_configurations_from_before_epochs_keep_their_form() -> None:
+    # Keys of artifacts and fingerprints of training states are made of these dumps.
+    assert set(ClipSampling().model_dump(mode="json")) == {
+        "lengths",
+        "length_weights",
+        "strides",
+        "source_weights",
+        "view_weights",
+        "single_view_factor",
+    }
+    stated = ClipSampling(order="epochs", hop=8).model_dump(mode="json")
+    assert (stated["order"], stated["hop"]) == ("epochs", 8)
+    trainer = {"steps": 1}
+    assert "input" not in Stage1Config.model_validate({"trainer": trainer}).model_dump(mode="json")
+    changed = Stage1Config.model_validate({"trainer": trainer, "input": {"kind": "latents", "workers": 2}})
+    assert changed.model_dump(mode="json")["input"]["workers"] == 2

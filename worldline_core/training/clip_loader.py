@@ -1,4 +1,4 @@
-"""From clip names to tensors: latents, action maps rendered from tracks, text ids."""
+"""From clip names to tensors: latents (cached, or encoded from frames), action maps rendered from tracks, text ids."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
@@ -15,8 +15,9 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.errors import ArtifactError
 from worldline_core.model.text import ClipFacts
-from worldline_core.training.clip_sampler import PRIMARY, Clip, ClipBatch
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_reader import ReadBatch, batch_views, read_clips
+from worldline_core.training.clip_sampler import Clip, ClipBatch
+from worldline_core.training.clip_source import ClipSource
 from worldline_core.training.text import TextEncoder
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
@@ -24,7 +25,10 @@ WristProjection = Literal["current_camera", "clip_start_camera"]
 
 @dataclass(frozen=True)
 class Batch:
-    """One micro-batch. Outcome labels are not here on purpose: they never reach the model."""
+    """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
+
+    ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
+    """
 
     clips: tuple[Clip, ...]
     views: tuple[str, ...]
@@ -32,19 +36,21 @@ class Batch:
     action_maps: Float[Tensor, "b v 9 t h w"] | None = None
     text_ids: Int[Tensor, "b n"] | None = None
     text_mask: Bool[Tensor, "b n"] | None = None
+    frames: UInt8[Tensor, "b v n h w 3"] | None = None
 
 
 class ClipLoader:
-    """Loads batches of clips from the caches.
+    """Loads batches of clips.
 
     Args:
+        store: where clips are read from.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         frame_rates: frames a second of the recordings, by episode; needed with ``text``.
     """
 
     def __init__(
         self,
-        store: LatentStore,
+        store: ClipSource,
         *,
         views: tuple[str, ...],
         tracks: ActionTracks | None = None,
@@ -68,30 +74,29 @@ class ClipLoader:
         """Read, render and move one batch.
 
         Raises:
-            ArtifactError: if latents or tracks lack an episode.
-            DataError: if latents are not finite.
+            ArtifactError: if the store or the tracks lack an episode.
+            DataError: if a clip is damaged, or cached latents are not finite.
         """
-        rows = [self.store.row(clip.episode_id) for clip in batch.clips]
-        if batch.view is None:
-            views, per_clip = self.views, [self.views] * len(rows)
-        elif batch.view == PRIMARY:
-            # The task-facing view takes the head slot whatever it is called in its source.
-            views, per_clip = (self.views[0],), [(row.primary_view,) for row in rows]
-        else:
-            views, per_clip = (batch.view,), [(batch.view,)] * len(rows)
-        latents = torch.stack(
-            [
-                self.store.clip(clip.episode_id, clip.start, clip.num_frames, clip.stride, names)
-                for clip, names in zip(batch.clips, per_clip, strict=True)
-            ]
-        ).to(self.device)
+        return self.finish(ReadBatch(batch, read_clips(self.store, batch, self.views)))
+
+    def finish(self, read: ReadBatch) -> Batch:
+        """What a model sees of clips that were read, here or in a loader process.
+
+        Raises:
+            ArtifactError: if the tracks lack an episode.
+        """
+        batch = read.batch
+        views, _ = batch_views(batch, self.store, self.views)
+        latents = self.store.latents(read.data, self.device)
         maps = None if self.tracks is None else self.action_maps(batch.clips, views)
         ids = mask = None
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in batch.clips]
-            ids, mask = self.text([row.instruction for row in rows], facts)
+            instructions = [self.store.row(clip.episode_id).instruction for clip in batch.clips]
+            ids, mask = self.text(instructions, facts)
             ids, mask = ids.to(self.device), mask.to(self.device)
-        return Batch(batch.clips, views, latents, maps, ids, mask)
+        frames = read.data if read.data.dtype == torch.uint8 else None
+        return Batch(batch.clips, views, latents, maps, ids, mask, frames)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """What a prompt may say of a clip: a stride shows its frames at a lower rate."""

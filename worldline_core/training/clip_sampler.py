@@ -1,48 +1,68 @@
-"""Deterministic clip sampling: which clips a step trains on is a pure function of (seed, step)."""
+"""Deterministic clip sampling: which clips a step trains on is a pure function of (seed, step, rank).
+
+The number of the step is therefore all the state there is: a run goes on in the middle of an epoch, on any number of
+loader processes, with the clips that it would have had.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from worldline_core.config.base import StrictModel
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.training.latent_store import LatentRow, LatentStore
+from worldline_core.training.clip_order import EpochOrder
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, Clip, ClipRow, ClipSource
+
+__all__ = ["JOINT", "PRIMARY", "Clip", "ClipBatch", "ClipSampler", "ClipSampling", "source_counts"]
 
 PRIMARY = "primary"
 JOINT = "joint"
+_DRAWS_A_CLIP = 2
+
+
+def _lengths(value: Any) -> Any:
+    """``{from: 33, to: 129}`` (``step``: 4 unless given) as the lengths that it means."""
+    if not isinstance(value, Mapping):
+        return value
+    if not {"from", "to"} <= set(value) <= {"from", "to", "step"} or not all(
+        isinstance(v, int) for v in value.values()
+    ):
+        raise ValueError("a range of clip lengths has the whole numbers `from`, `to` and perhaps `step`")
+    step = value.get("step", TEMPORAL_COMPRESSION)
+    if step < 1 or step % TEMPORAL_COMPRESSION or value["to"] < value["from"]:
+        raise ValueError(f"a range of clip lengths rises in steps of a multiple of {TEMPORAL_COMPRESSION} frames")
+    return tuple(range(value["from"], value["to"] + 1, step))
 
 
 class ClipSampling(StrictModel):
     """How clips are drawn.
 
-    ``lengths``: clip lengths in video frames (4 k + 1), drawn with ``length_weights`` (default: equal).
-    ``strides``: temporal strides. ``source_weights``: weight of an episode by its source (default 1).
+    ``lengths``: clip lengths in video frames (4 k + 1), drawn with ``length_weights`` (default: equal); a list, or
+    ``{from: 33, to: 129}`` for all of them. ``strides``: temporal strides.
+    ``source_weights``: weight of an episode by its source (default 1).
     ``view_weights``: None trains all views jointly (Stage II); otherwise what a step trains on is drawn by these
     weights: the name of a view, "primary" (each episode's own task-facing view; Stage I), or "joint" (all views).
     Steps on one view cost a fraction of joint ones and teach most of what controls look like: where compute is short,
     a mixture learns faster. ``single_view_factor`` multiplies the batch of such steps.
+    ``order``: "weighted" draws without end by the weights; "epochs" takes every clip (each length and stride at every
+    ``hop``-th frame of every episode) once an epoch, and knows no weights of lengths and sources (see clip_order.py).
+    ``hop``: frames between the starts of neighbouring clips of an epoch (default: the smallest that the source has).
     """
 
-    lengths: tuple[int, ...] = Field(default=(33,), min_length=1)
+    lengths: Annotated[tuple[int, ...], BeforeValidator(_lengths)] = Field(default=(33,), min_length=1)
     length_weights: tuple[float, ...] | None = None
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
     source_weights: dict[str, float] = Field(default_factory=dict)
     view_weights: dict[str, float] | None = None
     single_view_factor: int = Field(default=1, ge=1)
-
-
-@dataclass(frozen=True)
-class Clip:
-    """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode."""
-
-    episode_id: str
-    start: int
-    num_frames: int
-    stride: int
+    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
+    order: Literal["weighted", "epochs"] = Field(default="weighted", exclude_if=lambda value: value == "weighted")
+    hop: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
 
 
 @dataclass(frozen=True)
@@ -54,11 +74,21 @@ class ClipBatch:
 
 
 class ClipSampler:
-    """Draws batches of clips. Every rank draws the same global batch and takes its own part."""
+    """Draws batches of clips. Every rank draws the same global batch and takes its own part.
+
+    Args:
+        store: where the clips are read from.
+        batch_size: clips of a micro-step on this rank.
+        rows: the episodes to draw from (default: all of the store).
+
+    Raises:
+        ConfigError: weights, order or hop do not fit together.
+        DataError: no episode is long enough for any clip.
+    """
 
     def __init__(
         self,
-        store: LatentStore,
+        store: ClipSource,
         config: ClipSampling,
         *,
         splits: Sequence[str],
@@ -66,27 +96,22 @@ class ClipSampler:
         seed: int,
         rank: int = 0,
         world_size: int = 1,
-        rows: Sequence[LatentRow] | None = None,
+        rows: Sequence[ClipRow] | None = None,
     ) -> None:
-        if config.length_weights is not None and len(config.length_weights) != len(config.lengths):
-            raise ConfigError(
-                "Every clip length needs one weight.",
-                where="clips.length_weights",
-                expected=len(config.lengths),
-                got=len(config.length_weights),
-            )
+        _check(config, store)
         self.store = store
         self.batch_size = batch_size
         self.single_view_factor = config.single_view_factor
         self.seed = seed
         self.rank = rank
         self.world_size = world_size
+        self.step = store.start_step
         self._view_names = sorted(config.view_weights or {})
         self._view_weights = _normalised([(config.view_weights or {})[name] for name in self._view_names])
         candidates = [row for row in (store.rows if rows is None else rows) if row.split in splits]
         self._kinds: list[tuple[int, int]] = []
         kind_weights: list[float] = []
-        self._rows: list[list[LatentRow]] = []
+        self._rows: list[list[ClipRow]] = []
         self._cumulative: list[np.ndarray] = []
         weights = config.length_weights or [1.0] * len(config.lengths)
         for length, weight in zip(config.lengths, weights, strict=True):
@@ -107,6 +132,13 @@ class ClipSampler:
                 got=f"{len(candidates)} episodes, the longest with {longest} frames",
             )
         self._kind_weights = _normalised(kind_weights)
+        self._epochs: EpochOrder | None = None
+        if config.order == "epochs":
+            self.step = config.hop or store.start_step
+            for kind, (length, stride) in enumerate(self._kinds):
+                self._cumulative[kind] = np.cumsum([self._starts(row, length, stride) for row in self._rows[kind]])
+            counts = [int(cumulative[-1]) for cumulative in self._cumulative]
+            self._epochs = EpochOrder(counts, batch_size * world_size, seed)
 
     def clips(self, index: int) -> ClipBatch:
         """The clips of micro-step ``index`` (of this rank)."""
@@ -116,18 +148,110 @@ class ClipSampler:
         if self._view_names:
             name = self._view_names[int(random.choice(len(self._view_names), p=self._view_weights))]
             view = None if name == JOINT else name
-        length, stride = self._kinds[kind]
+        if self._epochs is not None:
+            kind, numbers = self._epochs.locate(index)
+            mine = numbers[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
+            return ClipBatch(tuple(self._numbered(kind, number) for number in mine), view)
         size = self.batch_size * (1 if view is None else self.single_view_factor)
-        draws = random.random((size * self.world_size, 2))
-        mine = draws[self.rank * size : (self.rank + 1) * size]
-        return ClipBatch(tuple(self._clip(kind, length, stride, draw) for draw in mine), view)
+        return ClipBatch(self._drawn(random, kind, size), view)
 
-    def _clip(self, kind: int, length: int, stride: int, draw: np.ndarray) -> Clip:
+    def replacement(self, index: int, place: int, attempt: int) -> Clip:
+        """Another clip of the length and stride of micro-step ``index``, for its unreadable clip at ``place``.
+
+        Drawn at random (by the weights; in epochs by the number of clips), from a stream of its own.
+        """
+        first = self.clips(index).clips[place]
+        kind = self._kinds.index((first.num_frames, first.stride))
+        counter = [0, 0, 1 + attempt, 1 + place]
+        random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
+        if self._epochs is not None:
+            numbers = random.integers(self._epochs.counts[kind], size=self.world_size)
+            return self._numbered(kind, int(numbers[self.rank]))
+        return self._drawn(random, kind, 1)[0]
+
+    @property
+    def clips_per_epoch(self) -> int | None:
+        """Clips of one epoch, or None where clips are drawn by weights."""
+        return None if self._epochs is None else sum(self._epochs.counts)
+
+    def epochs(self, index: int) -> float | None:
+        """Epochs that the micro-steps before ``index`` make up, or None where clips are drawn by weights."""
+        total = self.clips_per_epoch
+        return None if total is None else index * self.batch_size * self.world_size / total
+
+    @property
+    def longest(self) -> int:
+        """Frames of the longest clip that is drawn."""
+        return max(length for length, _ in self._kinds)
+
+    @property
+    def batch_kinds(self) -> list[tuple[str | None, int]]:
+        """(view as in a ClipBatch, clips) of the kinds of batches that are drawn."""
+        if not self._view_names:
+            return [(None, self.batch_size)]
+        drawn = [name for name, weight in zip(self._view_names, self._view_weights, strict=True) if weight > 0]
+        factor = self.single_view_factor
+        return [(None, self.batch_size) if name == JOINT else (name, self.batch_size * factor) for name in drawn]
+
+    def _drawn(self, random: np.random.Generator, kind: int, size: int) -> tuple[Clip, ...]:
+        draws = random.random((size * self.world_size, _DRAWS_A_CLIP))
+        mine = draws[self.rank * size : (self.rank + 1) * size]
+        return tuple(self._clip(kind, draw) for draw in mine)
+
+    def _clip(self, kind: int, draw: np.ndarray) -> Clip:
         rows, cumulative = self._rows[kind], self._cumulative[kind]
+        length, stride = self._kinds[kind]
         row = rows[min(int(np.searchsorted(cumulative, draw[0], side="right")), len(rows) - 1)]
-        last_start = row.num_frames - 1 - (length - 1) * stride
-        choices = last_start // self.store.start_step + 1
-        return Clip(row.episode_id, int(draw[1] * choices) * self.store.start_step, length, stride)
+        start = int(draw[1] * self._starts(row, length, stride)) * self.step
+        return Clip(row.episode_id, start, length, stride)
+
+    def _numbered(self, kind: int, number: int) -> Clip:
+        cumulative = self._cumulative[kind]
+        place = int(np.searchsorted(cumulative, number, side="right"))
+        before = int(cumulative[place - 1]) if place else 0
+        length, stride = self._kinds[kind]
+        return Clip(self._rows[kind][place].episode_id, (number - before) * self.step, length, stride)
+
+    def _starts(self, row: ClipRow, length: int, stride: int) -> int:
+        """How many frames of an episode a clip may start at."""
+        return (row.num_frames - 1 - (length - 1) * stride) // self.step + 1
+
+
+def _check(config: ClipSampling, store: ClipSource) -> None:
+    odd = [length for length in config.lengths if length < 1 or (length - 1) % TEMPORAL_COMPRESSION]
+    if odd:
+        raise ConfigError(
+            "A causal tokenizer cannot code clips of these lengths.",
+            where="clips.lengths",
+            expected="4 k + 1 frames",
+            got=odd,
+        )
+    if config.length_weights is not None and len(config.length_weights) != len(config.lengths):
+        raise ConfigError(
+            "Every clip length needs one weight.",
+            where="clips.length_weights",
+            expected=len(config.lengths),
+            got=len(config.length_weights),
+        )
+    if config.order == "weighted":
+        if config.hop is not None:
+            raise ConfigError("Only epochs have a hop.", where="clips.hop", expected="order: epochs, or no hop")
+        return
+    if config.length_weights is not None or config.source_weights or config.single_view_factor != 1:
+        raise ConfigError(
+            "Epochs take every clip once, so nothing can be weighted.",
+            where="clips.order",
+            expected="neither length_weights nor source_weights, and single_view_factor 1",
+            got="epochs with weights",
+            next_step="take order: weighted, or leave the weights out",
+        )
+    if config.hop is not None and config.hop % store.start_step:
+        raise ConfigError(
+            "Clips cannot start at every hop.",
+            where="clips.hop",
+            expected=f"a multiple of {store.start_step}, the frames between possible starts",
+            got=config.hop,
+        )
 
 
 def _normalised(weights: Sequence[float]) -> np.ndarray:
@@ -136,7 +260,7 @@ def _normalised(weights: Sequence[float]) -> np.ndarray:
     return values / total if total > 0 else values
 
 
-def source_counts(rows: Sequence[LatentRow]) -> Mapping[str, int]:
+def source_counts(rows: Sequence[ClipRow]) -> Mapping[str, int]:
     """Episodes a source, for the checkpoint's metadata."""
     counts: dict[str, int] = {}
     for row in rows:

@@ -29,6 +29,7 @@ from worldline_core.training.latent_store import (
 )
 
 if TYPE_CHECKING:
+    from worldline_core.data.episode_index import EpisodeRow
     from worldline_core.data.episode_set import EpisodeSet
 
 
@@ -36,11 +37,14 @@ class EncodeLatentsConfig(StrictModel):
     """Which latents are cached.
 
     ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
+    ``primary_alone``: also encode, by their task-facing view alone, episodes that lack some of ``views``: Stage I takes
+    them (plain videos have one view), Stage II does not.
     ``layout``: "auto" compares both layouts on the first episode and takes ``groups`` only where it is exact.
     """
 
     splits: tuple[str, ...] | None = None
     views: tuple[str, ...] = ("head", "left_wrist", "right_wrist")
+    primary_alone: bool = False
     image_size: tuple[int, int] = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
@@ -148,7 +152,7 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     def video(index: int, view: str) -> Tensor:
         return frames_to_video(episodes.frames(index, view), config.image_size)
 
-    layout = choose_layout(tokenizer, video(selected[0], config.views[0]), config)
+    layout = choose_layout(tokenizer, video(selected[0], _views(episodes.rows[selected[0]], config)[0]), config)
     output.mkdir(parents=True, exist_ok=True)
     rows: list[LatentRow] = []
     shards = [selected[i : i + config.episodes_per_shard] for i in range(0, len(selected), config.episodes_per_shard)]
@@ -159,7 +163,7 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
         if not ((output / name).is_file() and marker.is_file()):
             tensors: dict[str, Tensor] = {}
             for index in members:
-                videos = torch.stack([video(index, view) for view in config.views])
+                videos = torch.stack([video(index, view) for view in _views(episodes.rows[index], config)])
                 tensors |= encode_episode(tokenizer, episodes.rows[index].episode_id, videos, layout, config)
             with atomic_path(output / name) as temporary:
                 save_file(dict(sorted(tensors.items())), temporary)
@@ -204,11 +208,18 @@ def tokenizer_fingerprint(tokenizer: Encoder, folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:
+    """Which views of an episode are encoded: all that are wanted, the task-facing one alone, or none."""
+    if all(view in row.views for view in config.views):
+        return tuple(config.views)
+    return (row.primary_view,) if config.primary_alone and row.stage1_ok and row.primary_view in row.views else ()
+
+
 def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:
     selected = [
         i
         for i, row in enumerate(episodes.rows)
-        if (config.splits is None or row.split in config.splits) and all(view in row.views for view in config.views)
+        if (config.splits is None or row.split in config.splits) and _views(row, config)
     ]
     if not selected:
         raise DataError(
@@ -226,7 +237,7 @@ def _row(episodes: EpisodeSet, index: int, shard: str, config: EncodeLatentsConf
         episode_id=episode.episode_id,
         shard=shard,
         num_frames=episode.video_frames,
-        views=tuple(config.views),
+        views=_views(episode, config),
         source=episode.source,
         embodiment=episode.embodiment,
         split=episode.split,

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float
@@ -22,8 +23,19 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, Clip, ClipRow, longest_clip
 
-TEMPORAL_COMPRESSION = 4
+__all__ = [
+    "TEMPORAL_COMPRESSION",
+    "LatentRow",
+    "LatentStore",
+    "Layout",
+    "clip_key",
+    "group_key",
+    "latent_frame_count",
+    "single_key",
+]
+
 Layout = Literal["groups", "clips"]
 
 
@@ -73,7 +85,9 @@ def single_key(episode_id: str) -> str:
 
 
 class LatentStore:
-    """Read access to a Latents artifact."""
+    """Read access to a Latents artifact; a clip source (see clip_source.py)."""
+
+    dtype: np.dtype[Any] = np.dtype(np.float32)
 
     def __init__(self, root: Path, description: dict[str, Any], rows: list[LatentRow]) -> None:
         self.root = root
@@ -129,10 +143,26 @@ class LatentStore:
             )
         return self._by_id[episode_id]
 
-    def max_frames(self, row: LatentRow, start: int, stride: int) -> int:
+    def max_frames(self, row: ClipRow, start: int, stride: int) -> int:
         """Longest clip length (4 k + 1 frames) that starts at ``start`` with ``stride``."""
-        steps = (row.num_frames - 1 - start) // stride
-        return 1 + TEMPORAL_COMPRESSION * (steps // TEMPORAL_COMPRESSION)
+        return longest_clip(row.num_frames, start, stride)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Open shards stay in the process that opened them.
+        return {**self.__dict__, "_shards": {}}
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        """(c, t, h, w) of a clip's latents."""
+        channels, height, width = self.latent_shape
+        return channels, latent_frame_count(num_frames), height, width
+
+    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
+        """Fill ``out`` (v, c, t, h, w) with the clip's latents; raises as `clip` does."""
+        torch.from_numpy(out).copy_(self.clip(clip.episode_id, clip.start, clip.num_frames, clip.stride, views))
+
+    def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
+        """A copy of what was read, on ``device``: buffers that were read into are used again."""
+        return read.to(device, copy=True)
 
     def clip(
         self,

@@ -43,7 +43,7 @@ class RelationalTerm:
         self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], batch: Batch, step: int
     ) -> tuple[Tensor, dict[str, float]]:
         """The flow-matching loss plus the weighted relational terms."""
-        taught = self.teacher.features(batch.clips, batch.views).to(features.device)
+        taught = self.teacher.features(batch.clips, batch.views, batch.frames).to(features.device)
         student_shape = (features.shape[2], features.shape[3], features.shape[4])
         teacher_shape = (taught.shape[2], taught.shape[3], taught.shape[4])
         shape = PoolingShape.common(self.config, student_shape, teacher_shape)

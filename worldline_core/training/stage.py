@@ -1,4 +1,4 @@
-"""What Stage I and Stage II share around their objective: caches, clips, the run itself, and its checkpoint."""
+"""What Stage I and Stage II share around their objective: clips, the run itself, and its checkpoint."""
 
 from __future__ import annotations
 
@@ -7,27 +7,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from pydantic import Field
 
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.config.base import StrictModel
 from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling, source_counts
+from worldline_core.training.clip_input import ClipInput, FrameInput, LatentInput
+from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_prefetcher import ClipPrefetcher
+from worldline_core.training.clip_reader import BatchReader, ClipReader, SkipLog
+from worldline_core.training.clip_sampler import PRIMARY, ClipSampler, ClipSampling, source_counts
+from worldline_core.training.clip_source import ClipRow, ClipSource
 from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
-from worldline_core.training.latent_store import LatentRow, LatentStore
+from worldline_core.training.frame_source import FrameSource
+from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.objective import FlowMatchingObjective
 from worldline_core.training.trainer import ParameterGroup, TrainerConfig, TrainingResult, train
 from worldline_core.training.validation import validation_function
 
 
 class StageConfig(StrictModel):
-    """What both stages are told of their clips, their loss and their run."""
+    """What both stages are told of their clips, their loss and their run.
+
+    ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
+    and encodes them on the way (see clip_input.py).
+    """
 
     trainer: TrainerConfig
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
     clips: ClipSampling = ClipSampling()
     splits: tuple[str, ...] = ("train",)
     validation_splits: tuple[str, ...] = ("validation",)
@@ -43,8 +56,8 @@ class Stage:
     title: str
     output: Path
     episodes: EpisodeSet
-    store: LatentStore
-    rows: list[LatentRow]
+    store: ClipSource
+    rows: list[ClipRow]
     rank: int
     world_size: int
 
@@ -57,25 +70,29 @@ class Stage:
         *,
         number: Literal[1, 2],
         title: str,
+        views: tuple[str, ...],
         processes: tuple[int, int],
         tracks: ActionTracks | None = None,
     ) -> Stage:
-        """Open ``latents`` and ``episodes`` and choose what stage ``number`` may train on.
+        """Open ``episodes``, and ``latents`` or ``tokenizer``, and choose what stage ``number`` may train on.
 
         Args:
+            views: the model's view slots.
             processes: (rank, world size).
 
         Raises:
             ArtifactError: a folder is not what it should be.
+            ConfigError: the input that the clips come from is not given.
             DataError: no episode is left.
+            UnavailableError: the decoder that is asked for cannot be loaded.
         """
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        store = LatentStore.open(Path(inputs["latents"]))
-        rows = training_rows(store, episodes, stage=number, tracks=tracks)
+        store = _open_source(config, inputs, episodes, views)
+        rows = list(training_rows(store, episodes, stage=number, tracks=tracks))
         return cls(config, title, output, episodes, store, rows, *processes)
 
     @property
-    def used(self) -> list[LatentRow]:
+    def used(self) -> list[ClipRow]:
         """Episodes of the training splits."""
         return [row for row in self.rows if row.split in self.config.splits]
 
@@ -89,35 +106,82 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config = self.config
-        sampler = ClipSampler(
+        sampler = self._sampler()
+        validate = validation_function(
             self.store,
             config.clips,
-            splits=config.splits,
-            batch_size=config.trainer.batch_size,
-            seed=config.trainer.seed,
+            config.validation_splits,
+            config.trainer,
+            self.rows,
+            loader,
+            objective,
+            config.input,
+        )
+        skips = SkipLog(self.output / "run", self.rank, config.input.max_skipped)
+        reader = self._reader(ClipReader(self.store, sampler, loader.views, config.input))
+
+        def load(index: int) -> Batch:
+            read = reader.read(index)
+            skips.add(read.skipped)
+            return loader.finish(read)
+
+        try:
+            return train(
+                config.trainer,
+                groups=groups,
+                objective=objective,
+                load=load,
+                validate=validate,
+                output=self.output,
+                identity={
+                    "config": config.model_dump(mode="json"),
+                    "start": start,
+                    "tokenizer": self.store.description["tokenizer"],
+                },
+                title=self.title,
+                rank=self.rank,
+                world_size=self.world_size,
+            )
+        finally:
+            reader.close()
+
+    def _sampler(self) -> ClipSampler:
+        return ClipSampler(
+            self.store,
+            self.config.clips,
+            splits=self.config.splits,
+            batch_size=self.config.trainer.batch_size,
+            seed=self.config.trainer.seed,
             rank=self.rank,
             world_size=self.world_size,
             rows=self.rows,
         )
-        validate = validation_function(
-            self.store, config.clips, config.validation_splits, config.trainer, self.rows, loader, objective
+
+    def _reader(self, reader: ClipReader) -> BatchReader:
+        """In this process, or in processes of its own."""
+        source, trainer = self.config.input, self.config.trainer
+        if not source.workers:
+            return reader
+        return ClipPrefetcher(
+            reader,
+            workers=source.workers,
+            prefetch=source.prefetch,
+            stop=trainer.steps * trainer.accumulation,
+            pinned=torch.device(trainer.device).type == "cuda",
         )
-        return train(
-            config.trainer,
-            groups=groups,
-            objective=objective,
-            load=lambda index: loader.load(sampler.clips(index)),
-            validate=validate,
-            output=self.output,
-            identity={
-                "config": config.model_dump(mode="json"),
-                "start": start,
-                "tokenizer": self.store.description["tokenizer"],
-            },
-            title=self.title,
-            rank=self.rank,
-            world_size=self.world_size,
-        )
+
+    def input_facts(self) -> dict[str, Any]:
+        """How clips were read, for the checkpoint; nothing where they were cached latents in the default order."""
+        facts: dict[str, Any] = {}
+        source, trainer = self.config.input, self.config.trainer
+        micro_steps = trainer.steps * trainer.accumulation
+        if isinstance(source, FrameInput):
+            facts["input"] = {"kind": source.kind, "decoder": self.store.description["decoder"]}
+        if self.config.clips.order == "epochs":
+            facts["epochs"] = self._sampler().epochs(micro_steps)
+        if source.on_unreadable == "skip":
+            facts["skipped_clips"] = SkipLog.count(self.output / "run", micro_steps)
+        return facts
 
     def save(
         self,
@@ -138,6 +202,7 @@ class Stage:
                 "episodes": len(self.used),
                 "sources": source_counts(self.used),
                 "metrics": result.metrics,
+                **self.input_facts(),
                 **facts,
             }
             weights = {**model.state_dict(), **result.average}
@@ -151,3 +216,27 @@ class Stage:
             )
         clips = trainer.steps * trainer.batch_size * trainer.accumulation * self.world_size
         return {"steps": trainer.steps, "clips": clips}
+
+
+def _open_source(
+    config: StageConfig, inputs: Mapping[str, Path], episodes: EpisodeSet, views: tuple[str, ...]
+) -> ClipSource:
+    needed = "tokenizer" if isinstance(config.input, FrameInput) else "latents"
+    if needed not in inputs:
+        raise ConfigError(
+            f"Clips from {config.input.kind} need the input {needed}.",
+            where="input.kind",
+            expected=f"an input named {needed}",
+            got=", ".join(sorted(inputs)),
+            next_step=f"give --input {needed}=FOLDER, or choose the other kind of input",
+        )
+    if not isinstance(config.input, FrameInput):
+        return LatentStore.open(Path(inputs["latents"]))
+    return FrameSource.open(
+        episodes,
+        Path(inputs["tokenizer"]),
+        config.input,
+        views=views,
+        primary_alone=set(config.clips.view_weights or {}) == {PRIMARY},
+        device=config.trainer.device,
+    )

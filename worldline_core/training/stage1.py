@@ -39,12 +39,12 @@ def stage1_groups(model: WorldModel) -> list[ParameterGroup]:
 
 
 def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Train on ``inputs['latents']`` (episodes that ``inputs['episodes']`` allows), optionally from ``inputs['base']``.
+    """Train on ``inputs['episodes']``, by cached ``latents`` or by frames and a ``tokenizer``; optionally from ``base``.
 
     Raises:
         CheckpointError: if ``base`` is not a base or Stage I checkpoint.
         ConfigError: if the text does not fit the model's vocabulary.
-        DataError: if no clip is long enough, or latents are not finite.
+        DataError: if no clip is long enough, or one cannot be read.
     """
     device = config.trainer.device
     processes = join_processes(device)
@@ -58,7 +58,7 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
         start = "scratch"
     model.to(device).train()
     title = "stage I" if config.kind == "stage1" else "base"
-    stage = Stage.open(config, inputs, output, number=1, title=title, processes=processes)
+    stage = Stage.open(config, inputs, output, number=1, title=title, views=model.config.views, processes=processes)
     loader = ClipLoader(
         stage.store,
         views=model.config.views,

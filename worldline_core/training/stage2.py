@@ -18,7 +18,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_source import ClipSource
 from worldline_core.training.objective import FlowMatchingObjective, RelationalTerm
 from worldline_core.training.processes import join_processes
 from worldline_core.training.relational import RelationalConfig
@@ -53,7 +53,7 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
     ]
 
 
-def action_contract(config: Stage2Config, store: LatentStore, fps: float, controls: str) -> dict[str, Any]:
+def action_contract(config: Stage2Config, store: ClipSource, fps: float, controls: str) -> dict[str, Any]:
     """What the maps mean; rollouts refuse controls rendered under another contract."""
     return {
         "controls": controls,
@@ -72,12 +72,14 @@ def action_contract(config: Stage2Config, store: LatentStore, fps: float, contro
 
 
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Train on ``latents``, ``tracks`` and ``episodes`` from the checkpoint ``stage1``; ``teacher`` for relations.
+    """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for relations.
+
+    Clips are cached ``latents``, or frames that ``tokenizer`` encodes on the way.
 
     Raises:
         CheckpointError: if the checkpoint is of the wrong kind.
         ConfigError: if relational terms are asked for without a teacher.
-        DataError: if no clip fits, or latents are not finite.
+        DataError: if no clip fits, or one cannot be read.
     """
     device = config.trainer.device
     processes = join_processes(device)
@@ -86,7 +88,16 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     model, info = load_checkpoint(Path(inputs["stage1"]), expect_kind=kinds, towers="generation")
     model.to(device).train()
     tracks = ActionTracks.open(Path(inputs["tracks"]))
-    stage = Stage.open(config, inputs, output, number=2, title="stage II", processes=processes, tracks=tracks)
+    stage = Stage.open(
+        config,
+        inputs,
+        output,
+        number=2,
+        title="stage II",
+        views=model.config.views,
+        processes=processes,
+        tracks=tracks,
+    )
     loader = ClipLoader(
         stage.store,
         views=model.config.views,

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -114,7 +114,7 @@ def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
 
 
 class TeacherFeatures:
-    """Teacher features of clips, read from the recordings' frames and kept in memory (half precision)."""
+    """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
 
     def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
         from worldline_core.data.episode_set import EpisodeSet
@@ -124,20 +124,30 @@ class TeacherFeatures:
         self.cached_clips = cached_clips
         self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Tensor] = OrderedDict()
 
-    def features(self, clips: Sequence[Clip], views: Sequence[str]) -> Float[Tensor, "b v t h w d"]:
-        """Features of every clip and view."""
-        # Half precision does not survive a stack under CPU autocast.
-        return torch.stack([self._clip(clip, tuple(views)).float() for clip in clips])
+    def features(
+        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n h w 3"] | None = None
+    ) -> Float[Tensor, "b v t h w d"]:
+        """Features of every clip and view.
 
-    def _clip(self, clip: Clip, views: tuple[str, ...]) -> Float[Tensor, "v t h w d"]:
+        Args:
+            frames: of these clips, where they are read already; else they are decoded here, at the size of the recording.
+        """
+        given = [None] * len(clips) if frames is None else list(frames)
+        # Half precision does not survive a stack under CPU autocast.
+        return torch.stack([self._clip(c, tuple(views), f).float() for c, f in zip(clips, given, strict=True)])
+
+    def _clip(
+        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n h w 3"] | None
+    ) -> Float[Tensor, "v t h w d"]:
         key = (clip, views)
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
-        position = self.episodes.position(clip.episode_id)
-        indices = [clip.start + clip.stride * index for index in range(clip.num_frames)]
-        frames = np.stack([self.episodes.frames(position, view, indices) for view in views])
-        video = rearrange(torch.from_numpy(frames).float() / 255.0, "v t h w c -> v c t h w")
+        if frames is None:
+            position = self.episodes.position(clip.episode_id)
+            decoded = [self.episodes.frames(position, view, list(clip.frames)) for view in views]
+            frames = torch.from_numpy(np.stack(decoded))
+        video = rearrange(frames.float() / 255.0, "v t h w c -> v c t h w")
         features = self.teacher.features(video).to("cpu", torch.float16)
         # Computed and cached values must be the same bits, so that a resumed run equals an undisturbed one.
         if self.cached_clips:

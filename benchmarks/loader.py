@@ -1,0 +1,259 @@
+"""Speed of the training input beside raw decoding of the same clips.
+
+Run: `python benchmarks/loader.py [--processes 2] [--only 480x640] [--decoder pyav]`. It makes its own recordings (three views, encoded as
+curation does) in a temporary folder, then times, in turns so that a busy machine disturbs all alike:
+
+- *raw*: processes that do nothing but decode the clips and drop the frames;
+- *loader*: the same number of loader processes of the same decoder that read the same clips in the same order into
+  shared memory, and the training process that takes every batch from them;
+- *whole clips*: torchcodec's own `get_frames_in_range` / `EpisodeSet.frames`, what one would write without this loader.
+
+The ratio of a table is loader to raw in frames per second of processor time, all processes added up (the training process
+too), which hardly depends on what else the machine does; the ratio by the clock stands beside it. Medians of the rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from worldline_core.data.episode import VIEWS, Episode
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.frame_decoder import torchcodec_fault
+from worldline_core.training.clip_input import FrameInput
+from worldline_core.training.clip_prefetcher import ClipPrefetcher
+from worldline_core.training.clip_reader import ClipReader
+from worldline_core.training.clip_sampler import Clip, ClipSampler, ClipSampling
+from worldline_core.training.frame_source import FrameSource, frame_rows
+
+TICK = os.sysconf("SC_CLK_TCK")
+CASES: dict[str, dict[str, Any]] = {
+    "480x640": {"size": (480, 640), "fps": 30.0, "episodes": 4, "frames": 160, "lengths": (33, 65, 97), "batch": 1, "steps": 10},
+    "64x96": {"size": (64, 96), "fps": 8.0, "episodes": 12, "frames": 80, "lengths": (33,), "batch": 8, "steps": 12},
+}  # fmt: skip
+
+
+def scene(seed: int, count: int, height: int, width: int) -> np.ndarray:
+    """uint8 (N, H, W, 3): textured things that move over a textured background, with sensor noise."""
+    random = np.random.default_rng(seed)
+    coarse = random.integers(30, 220, (height // 16 + 2, width // 16 + 2, 3), dtype=np.uint8)
+    background = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    thing = random.integers(0, 255, (height // 4, width // 4, 3), dtype=np.uint8)
+    thing = cv2.GaussianBlur(thing, (5, 5), 0)
+    frames = np.empty((count, height, width, 3), np.uint8)
+    for index in range(count):
+        frame = background.copy()
+        row = int((0.5 + 0.4 * np.sin(0.05 * index + seed)) * (height - thing.shape[0]))
+        column = int((0.5 + 0.4 * np.cos(0.03 * index + 2 * seed)) * (width - thing.shape[1]))
+        frame[row : row + thing.shape[0], column : column + thing.shape[1]] = thing
+        noise = random.integers(-3, 4, (height, width, 1), dtype=np.int16)
+        frames[index] = np.clip(frame + noise, 0, 255)
+    return frames
+
+
+def write_recordings(root: Path, case: dict[str, Any]) -> EpisodeSet:
+    """An EpisodeSet of the case's size."""
+    count = case["frames"]
+    with EpisodeSetWriter(root, fps=case["fps"], image_size=case["size"], video_preset="fast") as writer:
+        for number in range(case["episodes"]):
+            state = np.zeros((count, 2), np.float32)
+            episode = Episode(
+                episode_id=f"episode-{number:03d}",
+                source="benchmark",
+                embodiment="none",
+                scene=f"scene-{number}",
+                task_family="unknown",
+                instruction="",
+                outcome="unknown",
+                split="train",
+                fps=case["fps"],
+                state=state,
+                action=state,
+                timestamps=np.arange(count) / case["fps"],
+                state_names=("joint", "gripper"),
+            )
+            views = {view: scene(3 * number + place, count, *case["size"]) for place, view in enumerate(VIEWS)}
+            writer.add(episode, views)
+    return EpisodeSet.open(root)
+
+
+def processor_seconds(processes: Sequence[int]) -> float:
+    """User and system time that processes have used."""
+    total = 0
+    for number in processes:
+        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
+        total += int(fields[11]) + int(fields[12])
+    return total / TICK
+
+
+def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
+    """Every frame of the clips, and nothing more."""
+    for clip in clips:
+        position = source.row(clip.episode_id).position
+        for view in VIEWS:
+            for _ in source.decoder.frames(source.episodes.clip(position, view), clip.frames):
+                pass
+
+
+def decode_whole(source: FrameSource, clips: Sequence[Clip]) -> None:
+    """Whole clips as arrays of their own, as one would write it first."""
+    if source.config.decoder == "pyav":
+        for clip in clips:
+            position = source.row(clip.episode_id).position
+            np.stack([source.episodes.frames(position, view, list(clip.frames)) for view in VIEWS])
+        return
+    from torchcodec.decoders import VideoDecoder
+
+    for clip in clips:
+        position = source.row(clip.episode_id).position
+        views = []
+        for view in VIEWS:
+            video = source.episodes.clip(position, view)
+            decoder = VideoDecoder(str(video.path), dimension_order="NHWC", seek_mode="approximate")
+            first = round(video.start_time * video.fps) + clip.start
+            views.append(decoder.get_frames_in_range(first, first + clip.stride * clip.num_frames, clip.stride).data)
+        np.stack(views)
+
+
+def serve(
+    work: Callable[[FrameSource, Sequence[Clip]], None], source: FrameSource, clips: list[Clip], pipe: Connection
+) -> None:
+    """A process of a baseline: one pass over its clips whenever it is asked."""
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    while pipe.recv():
+        work(source, clips)
+        pipe.send(True)
+
+
+class Baseline:
+    """Processes that share clips as the loader's do: clip i belongs to process i modulo their number."""
+
+    def __init__(
+        self,
+        work: Callable[[FrameSource, Sequence[Clip]], None],
+        source: FrameSource,
+        batches: list[tuple[Clip, ...]],
+        processes: int,
+    ) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.processes, self.pipes = [], []
+        for number in range(processes):
+            ours, theirs = context.Pipe()
+            clips = [clip for batch in batches[number::processes] for clip in batch]
+            process = context.Process(target=serve, args=(work, source, clips, theirs), daemon=True)
+            process.start()
+            self.processes.append(process)
+            self.pipes.append(ours)
+
+    def run(self) -> None:
+        for pipe in self.pipes:
+            pipe.send(True)
+        for pipe in self.pipes:
+            pipe.recv()
+
+    def close(self) -> None:
+        for pipe in self.pipes:
+            pipe.send(False)
+        for process in self.processes:
+            process.join()
+
+
+def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes: int, rounds: int) -> dict[str, Any]:
+    """Frames a second of the loader and of both baselines."""
+    config = FrameInput.model_validate({"decoder": decoder, "image_size": case["size"]})
+    rows = frame_rows(episodes, VIEWS, primary_alone=False)
+    source = FrameSource(episodes, rows, config, tokenizer=None, latent_shape=(1, 1, 1), description={})
+    sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
+    sampler = ClipSampler(source, sampling, splits=["train"], batch_size=case["batch"], seed=0)
+    steps = case["steps"]
+    batches = [sampler.clips(index).clips for index in range(steps)]
+    frames = len(VIEWS) * sum(clip.num_frames for batch in batches for clip in batch)
+    raw, whole = (Baseline(work, source, batches, processes) for work in (decode_raw, decode_whole))
+    loader = ClipPrefetcher(ClipReader(source, sampler, VIEWS), workers=processes, stop=steps)
+
+    def load() -> None:
+        for index in range(steps):
+            loader.read(index)
+
+    me = os.getpid()
+    runs: dict[str, tuple[Callable[[], None], list[int]]] = {
+        "raw": (raw.run, [process.pid for process in raw.processes]),
+        "loader": (load, [process.pid or 0 for process, _ in loader._workers]),
+        "whole_clips": (whole.run, [process.pid for process in whole.processes]),
+    }
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
+    for turn in range(rounds + 1):
+        for name, (run, workers) in runs.items():
+            before, started = processor_seconds([me, *workers]), time.perf_counter()
+            run()
+            spent = processor_seconds([me, *workers]) - before, time.perf_counter() - started
+            if turn:  # the first round opens files and touches memory for the first time
+                times[name].append(spent)
+    loader.close()
+    raw.close()
+    whole.close()
+    found: dict[str, Any] = {"decoder": source.decoder.name, "frames_a_round": frames}
+    for name, spent in times.items():
+        found[f"{name}_frames_per_processor_second"] = frames / statistics.median(cpu for cpu, _ in spent)
+        found[f"{name}_frames_per_second"] = frames / statistics.median(wall for _, wall in spent)
+    found["ratio"] = found["loader_frames_per_processor_second"] / found["raw_frames_per_processor_second"]
+    # By pairs of neighbours in time: what else the machine did was most alike for those.
+    found["ratio_by_the_clock"] = statistics.median(
+        a[1] / b[1] for a, b in zip(times["raw"], times["loader"], strict=True)
+    )
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--only", choices=sorted(CASES))
+    parser.add_argument("--decoder", choices=["torchcodec", "pyav"], help="one decoder instead of both")
+    parser.add_argument("--json", type=Path, help="write the figures here as well")
+    arguments = parser.parse_args()
+    decoders = ["pyav"] if torchcodec_fault() else ["torchcodec", "pyav"]
+    decoders = [arguments.decoder] if arguments.decoder else decoders
+    results: dict[str, list[dict[str, Any]]] = {}
+    print(
+        f"{arguments.processes} processes; frames per second of processor time (by the clock), all processes together"
+    )
+    print(f"{'':9} {'decoder':32} {'raw':>15} {'loader':>15} {'ratio':>14} {'whole clips':>15}")
+    for name, case in CASES.items():
+        if arguments.only not in (None, name):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            episodes = write_recordings(Path(folder) / "set", case)
+            for decoder in decoders:
+                found = measure(case, episodes, decoder, arguments.processes, arguments.rounds)
+                results.setdefault(name, []).append(found)
+                cells = [
+                    f"{found[f'{kind}_frames_per_processor_second']:7.0f} ({found[f'{kind}_frames_per_second']:5.0f})"
+                    for kind in ("raw", "loader", "whole_clips")
+                ]
+                ratio = f"{found['ratio']:.2f} ({found['ratio_by_the_clock']:.2f})"
+                print(
+                    f"{name:9} {found['decoder']:32} {cells[0]:>15} {cells[1]:>15} {ratio:>14} {cells[2]:>15}",
+                    flush=True,
+                )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Stage I and Stage II on clips from frames and from caches, in this process and in loader processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from worldline_core.config import load_config
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.pipeline.config import PipelineConfig
+from worldline_core.pipeline.plan import plan
+from worldline_core.training import trainer as trainer_module
+from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
+from worldline_core.training.metrics_log import read_metrics
+from worldline_core.training.stage1 import Stage1Config, train_stage1
+from worldline_core.training.stage2 import Stage2Config, train_stage2
+from worldline_core.training.teacher import TeacherConfig, train_teacher
+
+TRAINER = {
+    "steps": 4,
+    "batch_size": 2,
+    "precision": "fp32",
+    "log_every": 1,
+    "validation_batches": 1,
+    "save_every_seconds": 1000.0,
+    "save_every_steps": 1,
+    "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
+}
+FRAMES = {"kind": "frames", "image_size": [32, 32], "start_step": 4}
+
+
+@pytest.fixture(scope="module")
+def latents(world: Any, tokenizer: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("latents")
+    config = EncodeLatentsConfig.model_validate({"image_size": [32, 32]})
+    encode_latents(config, {"episodes": world.episodes, "tokenizer": tokenizer}, folder)
+    return folder
+
+
+def stage1(tiny_model: dict[str, object], **changes: Any) -> Stage1Config:
+    clips = {"lengths": [9, 13], "view_weights": {"primary": 1}}
+    return Stage1Config.model_validate({"model": tiny_model, "trainer": TRAINER, "clips": clips, **changes})
+
+
+@pytest.fixture(scope="module")
+def first_stage(
+    world: Any, tokenizer: Path, tiny_model: dict[str, object], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("stage1")
+    train_stage1(stage1(tiny_model, input=FRAMES), {"episodes": world.episodes, "tokenizer": tokenizer}, folder)
+    return folder
+
+
+def losses(folder: Path) -> list[float]:
+    return [row["loss"] for row in read_metrics(folder / "metrics.jsonl") if "loss" in row]
+
+
+def test_stage1_learns_the_same_from_frames_as_from_their_cached_latents(
+    world: Any, latents: Path, first_stage: Path, tiny_model: dict[str, object], tmp_path: Path
+) -> None:
+    train_stage1(stage1(tiny_model), {"episodes": world.episodes, "latents": latents}, tmp_path)
+    # The same clips in the same order: the losses differ by the rounding of half precision alone.
+    assert losses(first_stage) == pytest.approx(losses(tmp_path), rel=1e-3)
+    cached, online = (load_checkpoint(folder, towers="both")[1] for folder in (tmp_path, first_stage))
+    assert "input" not in cached.metadata
+    assert online.metadata["input"]["kind"] == "frames"
+    assert online.metadata["input"]["decoder"].startswith(("torchcodec", "PyAV"))
+    assert online.metadata["tokenizer"] == cached.metadata["tokenizer"]
+
+
+def stage2(**changes: Any) -> Stage2Config:
+    values = {
+        "trainer": TRAINER,
+        "clips": {"lengths": [9, 13, 17], "order": "epochs"},
+        "sigma_px_ref": 60.0,
+        "action_multiplier": 3.0,
+        "relational": None,
+    }
+    return Stage2Config.model_validate(values | changes)
+
+
+class Killed(Exception):
+    pass
+
+
+def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    inner, calls = trainer_module._step, [0]
+
+    def step(*arguments: Any) -> Any:
+        if calls[0] == steps:
+            raise Killed("killed")
+        calls[0] += 1
+        return inner(*arguments)
+
+    monkeypatch.setattr(trainer_module, "_step", step)
+
+
+def test_stage2_goes_on_in_the_middle_of_an_epoch_with_the_same_bytes(
+    world: Any, tokenizer: Path, first_stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Undisturbed in this process; killed and continued with a loader process: one checkpoint, to the byte."""
+    inputs = {
+        "episodes": world.episodes,
+        "tokenizer": tokenizer,
+        "tracks": world.tracks,
+        "stage1": first_stage,
+    }
+    train_stage2(stage2(input=FRAMES), inputs, tmp_path / "whole")
+    ahead = stage2(input={**FRAMES, "workers": 1, "decoder": "auto"})
+    with monkeypatch.context() as patch:
+        kill_after(patch, 2)
+        with pytest.raises(Killed, match="killed"):
+            train_stage2(ahead, inputs, tmp_path / "parts")
+    train_stage2(ahead, inputs, tmp_path / "parts")
+    whole, parts = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert losses(tmp_path / "whole") == losses(tmp_path / "parts")
+    _, info = load_checkpoint(tmp_path / "parts", expect_kind="stage2")
+    # 6 episodes, 3 + 2 + 1 starts each: 36 clips an epoch; 4 steps of 2 clips.
+    assert info.metadata["epochs"] == pytest.approx(8 / 36)
+    assert "skipped_clips" not in info.metadata
+
+
+def test_the_teacher_is_shown_the_frames_that_were_read(
+    world: Any, tokenizer: Path, latents: Path, first_stage: Path, tmp_path: Path
+) -> None:
+    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
+    config = {"shape": shape, "trainer": {**TRAINER, "steps": 2}, "clip_frames": 9, "held_out_episodes": 1}
+    train_teacher(TeacherConfig.model_validate(config), {"episodes": world.episodes}, tmp_path / "teacher")
+    given = {"episodes": world.episodes, "tracks": world.tracks, "stage1": first_stage, "teacher": tmp_path / "teacher"}
+    found = []
+    for name, values, source in (
+        ("cached", {}, {"latents": latents}),
+        ("online", {"input": FRAMES}, {"tokenizer": tokenizer}),
+    ):
+        train_stage2(stage2(relational={"ramp_steps": 2}, **values), given | source, tmp_path / name)
+        rows = [row for row in read_metrics(tmp_path / name / "metrics.jsonl") if "loss" in row]
+        found.append([(row["relational_intra"], row["relational_cross"]) for row in rows])
+    for cached, online in zip(*found, strict=True):
+        assert online == pytest.approx(cached, rel=5e-3)
+
+
+def test_a_damaged_recording_stops_the_run_or_is_counted_in_the_checkpoint(
+    world: Any, tokenizer: Path, tiny_model: dict[str, object], tmp_path: Path
+) -> None:
+    shutil.copytree(world.episodes, tmp_path / "set")
+    (video,) = (tmp_path / "set").rglob("*head*/**/*.mp4")
+    content = bytearray(video.read_bytes())
+    content[len(content) // 2 :] = bytes(len(content) - len(content) // 2)
+    video.write_bytes(content)
+    inputs = {"episodes": tmp_path / "set", "tokenizer": tokenizer}
+    with pytest.raises(DataError, match="A clip cannot be read"):
+        train_stage1(stage1(tiny_model, input=FRAMES), inputs, tmp_path / "strict")
+    lenient = stage1(tiny_model, input={**FRAMES, "on_unreadable": "skip"})
+    train_stage1(lenient, inputs, tmp_path / "lenient")
+    _, info = load_checkpoint(tmp_path / "lenient", towers="both")
+    lines = (tmp_path / "lenient" / "run" / "skipped_clips-0.jsonl").read_text().splitlines()
+    assert info.metadata["skipped_clips"] == len(lines) > 0
+    assert "view head" in json.loads(lines[0])["reason"]
+    few = stage1(tiny_model, input={**FRAMES, "on_unreadable": "skip", "max_skipped": 1})
+    with pytest.raises(DataError, match="Too many clips cannot be read"):
+        train_stage1(few, inputs, tmp_path / "few")
+
+
+def test_the_input_that_is_missing_is_named(world: Any, tiny_model: dict[str, object], tmp_path: Path) -> None:
+    for values, name in (({}, "latents"), ({"input": FRAMES}, "tokenizer")):
+        with pytest.raises(ConfigError, match=f"need the input {name}"):
+            train_stage1(stage1(tiny_model, **values), {"episodes": world.episodes}, tmp_path / name)
+
+
+def test_the_plan_gives_a_stage_what_it_reads(tmp_path: Path) -> None:
+    config = load_config(PipelineConfig, preset="cosmos3-nano")
+    nodes = {node.name: node for node in plan(config, tmp_path)}
+    for name in ("train_stage1", "train_stage2"):
+        assert nodes[name].inputs["tokenizer"] == tmp_path / config.models.tokenizer
+        assert "latents" not in nodes[name].inputs
+        clips = getattr(config, name).clips
+        assert clips.lengths[0] == 33
+        assert clips.lengths[-1] == 129
+    # Stage I spans longer motion, Stage II is denser (method.md section 1).
+    assert min(config.train_stage1.clips.strides) > max(config.train_stage2.clips.strides)
+    tiny = {node.name: node for node in plan(load_config(PipelineConfig, preset="tiny"), tmp_path)}
+    for name in ("train_stage1", "train_stage2"):
+        assert tiny[name].inputs["latents"] == "encode_latents"
+        assert "tokenizer" not in tiny[name].inputs
