@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from flows.exchange_commands import add_exchange_commands
 from worldline_core.pipeline.steps import STEPS
 
 
@@ -59,6 +60,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--page", nargs="?", type=int, const=12, metavar="N", help="write a page to browse N episodes (12; 0: all)"
     )
     inspect.set_defaults(run=_inspect)
+    card = commands.add_parser("card", help="write the dataset card of an EpisodeSet: README.md, index.html, pictures")
+    card.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered")
+    card.add_argument("--output", type=Path, default=None, help="where the card goes (default: FOLDER/run/card)")
+    card.add_argument("--title", default=None, help="its heading (default: EpisodeSet and the folder's name)")
+    card.set_defaults(run=_card)
+    add_exchange_commands(commands)
     _add_embodiment(commands)
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
@@ -153,6 +160,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
 
 
 def _task(arguments: argparse.Namespace) -> None:
+    _use_local_prefect_storage(arguments.artifacts)
     from tasks.command_line import print_artifact, run_task
 
     print_artifact(run_task(arguments.step, arguments))
@@ -179,6 +187,15 @@ def _inspect(arguments: argparse.Namespace) -> None:
         page=arguments.page,
     )
     print(found)
+
+
+def _card(arguments: argparse.Namespace) -> None:
+    from worldline_core.report.dataset_card import write_card
+
+    for path in write_card(
+        arguments.artifact, arguments.output or arguments.artifact / "run" / "card", arguments.title
+    ):
+        print(f"wrote {path}")
 
 
 def _calibrate_check(arguments: argparse.Namespace) -> None:

@@ -1,0 +1,74 @@
+"""The verbs that hand recordings and predictions to others: export, push, pull."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_exchange_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add them to the command line's parser."""
+    export = commands.add_parser("export", help="write episodes or predictions as MCAP, Rerun, video or LeRobotDataset")
+    export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet or a RolloutSet")
+    export.add_argument(
+        "--format", action="append", required=True, choices=("lerobot", "mcap", "rrd", "mp4"), dest="formats",
+        help="repeatable; lerobot: EpisodeSets only, mp4: RolloutSets only",
+    )  # fmt: skip
+    export.add_argument("--output", type=Path, required=True, help="where the files go")
+    export.add_argument(
+        "--episode", action="append", default=[], metavar="ID", dest="episodes", help="only this one (repeatable)"
+    )
+    export.add_argument(
+        "--episodes", type=Path, metavar="FOLDER", dest="episode_set", help="the EpisodeSet of predictions"
+    )
+    export.set_defaults(run=_export)
+    places = "hf://datasets/ORG/NAME (token: HF_TOKEN), a URL such as s3://bucket/folder, or a folder"
+    push = commands.add_parser(
+        "push", help="publish an EpisodeSet with its dataset card; continues after an interruption"
+    )
+    push.add_argument("artifact", type=Path, metavar="FOLDER")
+    push.add_argument("where", metavar="WHERE", help=places)
+    push.add_argument("--public", action="store_true", help="others may read it there (default: a private repository)")
+    push.add_argument(
+        "--allow-restricted", action="store_true",
+        help="push although a source's licence forbids it or does not say: you have the right",
+    )  # fmt: skip
+    push.add_argument("--title", help="heading of the dataset card")
+    push.set_defaults(run=_push)
+    pull = commands.add_parser("pull", help="fetch a published EpisodeSet and compare every file with its digest")
+    pull.add_argument("where", metavar="WHERE", help=places)
+    pull.add_argument("folder", type=Path, metavar="FOLDER", help="a new folder")
+    pull.set_defaults(run=_pull)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from worldline_core.exports.export import export
+
+    for path in export(
+        arguments.artifact,
+        arguments.output,
+        arguments.formats,
+        episode_ids=arguments.episodes,
+        episodes=arguments.episode_set,
+    ):
+        print(f"wrote {path}")
+
+
+def _push(arguments: argparse.Namespace) -> None:
+    from worldline_core.exports.publish import push
+
+    pushed = push(
+        arguments.artifact,
+        arguments.where,
+        public=arguments.public,
+        allow_restricted=arguments.allow_restricted,
+        title=arguments.title,
+    )
+    print(f"{pushed.location}  {pushed.files} files  {pushed.num_bytes / 2**20:.1f} MiB")
+
+
+def _pull(arguments: argparse.Namespace) -> None:
+    from worldline_core.exports.publish import pull
+
+    pulled = pull(arguments.where, arguments.folder)
+    print(f"{arguments.folder}  {pulled.files} files  {pulled.num_bytes / 2**20:.1f} MiB")

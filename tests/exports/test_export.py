@@ -1,0 +1,116 @@
+"""Exports of an EpisodeSet: read by LeRobot's own class and edited by its own tools, by MCAP and Rerun readers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episode_index import read_index, write_index
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.mcap_reader import read_episode_mcap
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.exports.export import export
+from worldline_core.exports.publish_content import set_files
+
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def linked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set like a filter's: segments of episodes whose datasets lie in another artifact, with that one's licences."""
+    root = tmp_path_factory.mktemp("sets")
+    with EpisodeSetWriter(root / "curated", fps=10) as writer:
+        for number in range(3):
+            time = np.arange(FRAMES) / 10
+            state = np.stack([np.sin(time + number), np.cos(time)], axis=1).astype(np.float32)
+            rows, columns = np.mgrid[:32, :48]
+            shade = (columns[None] * 3 + rows[None] * 2 + 6 * np.arange(FRAMES)[:, None, None] + 30 * number) % 200
+            frames = np.stack([shade, 200 - shade, shade // 2], axis=-1).astype(np.uint8)
+            moving = np.tile(np.eye(4), (FRAMES, 1, 1))
+            moving[:, 0, 3] = time
+            cameras = {"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), moving, 48, 32)}
+            episode = Episode(
+                episode_id=f"e{number}", source="toy", embodiment="toy", scene="s", task_family="lift", instruction=f"lift {number}",
+                outcome="success", split="train", fps=10.0, state=state, action=state + 1, timestamps=time, cameras=cameras,
+                state_names=("right/a", "right/gripper"),
+            )  # fmt: skip
+            writer.add(episode, {"head": frames}, {"head": shade < 60})
+    (root / "curated/sources.json").write_text(json.dumps([{"label": "toy", "license": "MIT"}]))
+    (root / "filtered").mkdir()
+    rows = [replace(row, dataset=f"../curated/{row.dataset}") for row in read_index(root / "curated")]
+    whole, segment = rows[0], replace(rows[1], episode_id="e1#5-15", start=5, stop=15, num_frames=10, video_frames=10)
+    write_index(root / "filtered", [whole, segment, rows[2]])
+    return root / "filtered"
+
+
+@pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
+def test_lerobots_own_class_and_tools_work_on_an_export(
+    linked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    assert export(linked, tmp_path / "out", ["lerobot"]) == [tmp_path / "out"]
+    before, after = EpisodeSet.open(linked), EpisodeSet.open(tmp_path / "out")
+    assert [row.episode_id for row in after.rows] == ["e0", "e1#5-15", "e2"]
+    for i in range(3):
+        assert np.array_equal(after.episode(i).state, before.episode(i).state)
+        assert np.array_equal(
+            after.episode(i).cameras["head"].T_base_camera, before.episode(i).cameras["head"].T_base_camera
+        )
+        assert np.array_equal(after.robot_masks(i, "head"), before.robot_masks(i, "head"))
+        difference = np.abs(after.frames(i, "head").astype(int) - before.frames(i, "head"))
+        # Whole rows are copied; the segment begins between key frames and is encoded again.
+        assert difference.max() == 0 if i != 1 else difference.mean() < 2
+    assert set_files(tmp_path / "out")  # can be pushed: nothing of it lies elsewhere
+    assert json.loads((tmp_path / "out/sources.json").read_text()) == [{"label": "toy", "license": "MIT"}]
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path / "out/datasets/toy"
+    for backend in ("pyav", "torchcodec"):
+        offsets = {"observation.images.head": [-0.1, 0.0], "action": [0.0, 0.1, 0.2]}
+        opened = LeRobotDataset("local/set", root=root, video_backend=backend, delta_timestamps=offsets)
+        assert (opened.num_episodes, len(opened), opened.fps) == (3, 50, 10)
+        item = opened[22]  # frame 2 of the second episode
+        assert np.array_equal(item["action"].numpy(), after.episode(1).action[[2, 3, 4]])
+        pixels = (item["observation.images.head"].permute(0, 2, 3, 1).numpy() * 255).round()
+        assert np.abs(pixels - after.frames(1, "head", [1, 2])).max() <= 3  # torchcodec rounds colours otherwise
+        assert opened[20]["observation.images.head_is_pad"].tolist() == [True, False]
+    stats = opened.meta.stats["observation.state"]
+    everything = np.concatenate([after.episode(i).state for i in range(3)])
+    assert np.allclose(stats["mean"], everything.mean(axis=0), atol=1e-6)
+    assert np.allclose(stats["std"], everything.std(axis=0), atol=1e-6)
+    whole = LeRobotDataset("local/set", root=root, video_backend="pyav")
+    fewer = delete_episodes(whole, [1], output_dir=tmp_path / "fewer", repo_id="local/fewer")
+    assert (fewer.num_episodes, len(fewer)) == (2, 40)
+    parts = split_dataset(whole, {"a": [0], "b": [1, 2]}, output_dir=tmp_path / "parts")
+    merged = merge_datasets(list(parts.values()), output_repo_id="local/all", output_dir=tmp_path / "all")
+    assert (merged.num_episodes, len(merged)) == (3, 50)
+    assert np.array_equal(merged[45]["observation.state"].numpy(), after.episode(2).state[15])
+
+
+def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
+    written = export(linked, tmp_path, ["mcap", "rrd"], episode_ids=["e1#5-15"])
+    assert [path.name for path in written] == ["e1_5-15.mcap", "e1_5-15.rrd"]
+    read = read_episode_mcap(tmp_path / "e1_5-15.mcap")
+    episodes = EpisodeSet.open(linked)
+    assert np.array_equal(read.frames["head"], episodes.frames(1, "head"))
+    assert np.array_equal(read.robot_masks["head"], episodes.robot_masks(1, "head"))
+    assert np.array_equal(read.episode.state, episodes.episode(1).state)
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(tmp_path / "e1_5-15.rrd")
+    assert len(reader.blueprints()) == 1
+    assert {"/world/cameras/head/true", "/signals/action/right_gripper"} <= {c.entity_path for c in reader.stream()}
+
+
+def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"(?s)Not a format of EpisodeSet.*lerobot, mcap, rrd.*mp4"):
+        export(linked, tmp_path, ["mp4"])
+    with pytest.raises(DataError, match=r"(?s)No such episode.*nothing"):
+        export(linked, tmp_path, ["mcap"], episode_ids=["nothing"])

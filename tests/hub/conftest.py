@@ -1,0 +1,239 @@
+"""A small hub on the loopback: the HTTP endpoints that huggingface_hub's client uses for dataset repositories.
+
+Repositories live in memory. Large files go through the LFS batch protocol, small ones inside of the commit, as on the real
+hub; the newer chunk storage (xet) is switched off in the client. Faults are put in by `refuse`.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, unquote, urlsplit
+
+import pytest
+
+LFS_FROM_BYTES = 4096
+
+
+@dataclass
+class Repository:
+    private: bool
+    files: dict[str, tuple[bytes, bool]] = field(
+        default_factory=lambda: {".gitattributes": (b"*.mp4 filter=lfs\n", False)}
+    )
+    """Path -> content, and whether it went through LFS."""
+    commits: list[str] = field(default_factory=lambda: ["0" * 40])
+
+
+@dataclass
+class Hub:
+    """State of the server; `refuse(method, path)` returns a status to answer instead, or None."""
+
+    repositories: dict[str, Repository] = field(default_factory=dict)
+    objects: dict[str, bytes] = field(default_factory=dict)
+    requests: list[tuple[str, str]] = field(default_factory=list)
+    tokens: set[str] = field(default_factory=set)
+    refuse: Callable[[str, str], int | None] = lambda method, path: None
+    url: str = ""
+
+    def count(self, method: str, part: str) -> int:
+        return sum(1 for m, path in self.requests if m == method and part in path)
+
+
+def blob_oid(content: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()  # noqa: S324 - git's name of a blob
+
+
+def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_message(self, *arguments: Any) -> None:
+            del arguments
+
+        def answer(self, content: Any = None, status: int = 200, headers: dict[str, str] | None = None) -> None:
+            data = (
+                content if isinstance(content, bytes) else json.dumps(content if content is not None else {}).encode()
+            )
+            self.send_response(status)
+            for name, value in (headers or {}).items():
+                self.send_header(name, value)
+            if "Content-Length" not in (headers or {}):
+                self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(data)
+
+        def missing(self, code: str) -> None:
+            self.answer({"error": code}, 404, {"X-Error-Code": code})
+
+        def serve(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            parts = urlsplit(self.path)
+            path = unquote(parts.path)
+            hub.requests.append((self.command, path))
+            if self.headers.get("authorization"):
+                hub.tokens.add(self.headers["authorization"].removeprefix("Bearer "))
+            status = hub.refuse(self.command, path)
+            if status is not None:
+                return self.answer({"error": "refused by the test"}, status)
+            if self.command == "PUT" and path.startswith("/lfs/"):
+                return self.put_object(path.removeprefix("/lfs/"), body)
+            if path == "/api/repos/create":
+                return self.create(json.loads(body))
+            if path == "/api/validate-yaml":
+                return self.answer({"errors": [], "warnings": []})
+            if path == "/lfs/verify":
+                return self.answer({}) if json.loads(body)["oid"] in hub.objects else self.missing("EntryNotFound")
+            name, rest = self.repository(path)
+            if name not in hub.repositories:
+                return self.missing("RepoNotFound")
+            return self.inside(hub.repositories[name], name, rest, body, parse_qs(parts.query))
+
+        do_GET = do_HEAD = do_POST = do_PUT = serve  # noqa: N815
+
+        def repository(self, path: str) -> tuple[str, str]:
+            """ORG/NAME, and what comes after it."""
+            pieces = path.removeprefix("/api").removeprefix("/datasets/").split("/", 2)
+            pieces += [""] * (3 - len(pieces))
+            return f"{pieces[0]}/{pieces[1].removesuffix('.git')}", pieces[2]
+
+        def create(self, wanted: dict[str, Any]) -> None:
+            assert wanted["type"] == "dataset"
+            name = f"{wanted.get('organization') or 'me'}/{wanted['name']}"
+            if name in hub.repositories:
+                return self.answer({"error": "exists", "url": f"{hub.url}/datasets/{name}"}, 409)
+            if wanted["name"] == "forbidden":
+                return self.answer({"error": "no rights"}, 403)
+            hub.repositories[name] = Repository(
+                private=bool(wanted.get("private")) or wanted.get("visibility") == "private"
+            )
+            return self.answer({"url": f"{hub.url}/datasets/{name}", "name": name})
+
+        def put_object(self, oid: str, body: bytes) -> None:
+            assert hashlib.sha256(body).hexdigest() == oid
+            hub.objects[oid] = body
+            self.answer({})
+
+        def inside(
+            self, repository: Repository, name: str, rest: str, body: bytes, query: dict[str, list[str]]
+        ) -> None:
+            head, _, tail = rest.partition("/")
+            if head in ("", "revision"):
+                info = {
+                    "id": name,
+                    "sha": repository.commits[-1],
+                    "private": repository.private,
+                    "siblings": [{"rfilename": path} for path in repository.files],
+                }
+                return self.answer(info)
+            if head == "preupload":
+                listed = json.loads(body)["files"]
+                return self.answer({"files": [self.mode(repository, each) for each in listed]})
+            if head == "info":
+                return self.batch(json.loads(body))
+            if head == "commit":
+                return self.commit(repository, name, body)
+            if head == "branch":
+                return self.answer({})
+            if head == "tree":
+                return self.answer([self.entry(path, *found) for path, found in sorted(repository.files.items())])
+            assert head == "resolve", rest
+            return self.resolve(repository, tail.partition("/")[2])
+
+        def mode(self, repository: Repository, each: dict[str, Any]) -> dict[str, Any]:
+            found = repository.files.get(each["path"])
+            oid = (
+                None if found is None else blob_oid(found[0]) if not found[1] else hashlib.sha256(found[0]).hexdigest()
+            )
+            large = each["size"] >= LFS_FROM_BYTES
+            return {
+                "path": each["path"],
+                "uploadMode": "lfs" if large else "regular",
+                "shouldIgnore": False,
+                "oid": oid,
+            }
+
+        def batch(self, wanted: dict[str, Any]) -> None:
+            objects = []
+            for each in wanted["objects"]:
+                known = each["oid"] in hub.objects
+                actions = {
+                    "upload": {"href": f"{hub.url}/lfs/{each['oid']}"},
+                    "verify": {"href": f"{hub.url}/lfs/verify"},
+                }
+                objects.append({**each, **({} if known else {"actions": actions})})
+            self.answer({"transfer": "basic", "objects": objects})
+
+        def commit(self, repository: Repository, name: str, body: bytes) -> None:
+            changed = dict(repository.files)
+            for line in body.splitlines():
+                item = json.loads(line)
+                value = item["value"]
+                if item["key"] == "file":
+                    changed[value["path"]] = base64.b64decode(value["content"]), False
+                elif item["key"] == "lfsFile":
+                    changed[value["path"]] = hub.objects[value["oid"]], True
+                elif item["key"] == "deletedFile":
+                    del changed[value["path"]]
+            repository.files = changed
+            repository.commits.append(hashlib.sha1(body + repository.commits[-1].encode()).hexdigest())  # noqa: S324
+            oid = repository.commits[-1]
+            self.answer({"success": True, "commitOid": oid, "commitUrl": f"{hub.url}/datasets/{name}/commit/{oid}"})
+
+        def entry(self, path: str, content: bytes, lfs: bool) -> dict[str, Any]:
+            found: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": blob_oid(content)}
+            if lfs:
+                found["lfs"] = {"oid": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 130}
+            return found
+
+        def resolve(self, repository: Repository, path: str) -> None:
+            if path not in repository.files:
+                return self.missing("EntryNotFound")
+            content, lfs = repository.files[path]
+            etag = hashlib.sha256(content).hexdigest() if lfs else blob_oid(content)
+            headers = {"ETag": f'"{etag}"', "X-Repo-Commit": repository.commits[-1], "Accept-Ranges": "bytes"}
+            if self.command == "HEAD":
+                return self.answer(
+                    b"", 200, {**headers, "Content-Length": str(len(content)), "X-Linked-Size": str(len(content))}
+                )
+            ranged = self.headers.get("Range")
+            if ranged:
+                first = int(ranged.removeprefix("bytes=").split("-")[0])
+                headers["Content-Range"] = f"bytes {first}-{len(content) - 1}/{len(content)}"
+                return self.answer(content[first:], 206, headers)
+            return self.answer(content, 200, headers)
+
+    return Handler
+
+
+class _Server(ThreadingHTTPServer):
+    request_queue_size = 64  # the client opens a connection a thread
+    daemon_threads = True
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> Iterator[Hub]:
+    """A running hub that the client is pointed at."""
+    import huggingface_hub.constants as constants
+
+    state = Hub()
+    server = _Server(("127.0.0.1", 0), handler_of(state))
+    state.url = f"http://127.0.0.1:{server.server_address[1]}"
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    monkeypatch.setenv("HF_ENDPOINT", state.url)
+    monkeypatch.setenv("HF_TOKEN", "hf_test")
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    yield state
+    server.shutdown()
+    server.server_close()
+    thread.join(timeout=10)

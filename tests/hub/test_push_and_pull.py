@@ -1,0 +1,253 @@
+"""Through the real client: what is pushed comes back to the byte, nothing unfinished or foreign is taken for a set."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
+from worldline_core.exports.publish_content import FILE_LIST
+from worldline_core.exports.publish_hub import HubLocation, pull_from_hub, push_to_hub
+from worldline_core.store.digest import digest_folder
+
+PLACE = HubLocation("lab/toy")
+
+
+def make_set(root: Path, *, episodes: int = 2, conventions: dict[str, Any] | None = None) -> Path:
+    with EpisodeSetWriter(root, fps=8) as writer:
+        for number in range(episodes):
+            rng = np.random.default_rng(number)
+            state = rng.normal(size=(12, 3)).astype(np.float32) * 0.1
+            episode = Episode(
+                episode_id=f"e{number}", source="toy", embodiment="toy", scene=f"s{number}", task_family="lift", instruction="lift",
+                outcome="success", split="train", fps=8.0, state=state, action=state, timestamps=np.arange(12) / 8,
+                cameras={"head": CameraTrack("head", np.diag([30.0, 30, 1]), np.eye(4)[None], 64, 48)}, conventions=conventions or {},
+            )  # fmt: skip
+            writer.add(episode, {"head": rng.integers(0, 255, (12, 48, 64, 3), dtype=np.uint8)})
+    return root
+
+
+def declare(root: Path, **changes: Any) -> None:
+    """The table of sources that curation leaves."""
+    row = {
+        "label": "toy", "kind": "episode_set", "license": "MIT", "redistribution": "yes", "names": ["toy"], "found": 2, "kept": 2,
+        "reasons": {}, "image_size": None, "fps": None, "stride": None, "conventions": {}, **changes,
+    }  # fmt: skip
+    (root / "sources.json").write_text(json.dumps([row]))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    root = make_set(tmp_path / "set")
+    declare(root)
+    return root
+
+
+def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_path: Path) -> None:
+    pushed = push_to_hub(folder, PLACE, title="Toy arms")
+    repository = hub.repositories["lab/toy"]
+    assert repository.private
+    assert hub.tokens == {"hf_test"}
+    readme = repository.files["README.md"][0].decode()
+    assert readme.startswith("---\npretty_name: Toy arms\n")
+    assert not [path for path in repository.files if path.startswith("run/")]
+    video = next(path for path in repository.files if path.endswith(".mp4"))
+    assert repository.files[video][1]  # through LFS
+    pulled = pull_from_hub(PLACE, tmp_path / "back")
+    assert (pulled.commit, pulled.files, pulled.num_bytes) == (pushed.commit, pushed.files, pushed.num_bytes)
+    assert digest_folder(tmp_path / "back") == digest_folder(folder)
+    assert (tmp_path / "back/run/card/README.md").read_text() == readme
+    assert np.array_equal(
+        EpisodeSet.open(tmp_path / "back").frames(1, "head"), EpisodeSet.open(folder).frames(1, "head")
+    )
+    with pytest.raises(ArtifactError, match="Folder exists already"):
+        pull_from_hub(PLACE, tmp_path / "back")
+
+
+def test_lerobot_reads_what_was_pulled(hub: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
+
+    push_to_hub(folder, PLACE)
+    pull_from_hub(PLACE, tmp_path / "back")
+    dataset = LeRobotV3Dataset(tmp_path / "back/datasets/toy")
+    assert len(dataset.episodes) == 2
+
+
+def test_a_second_push_sends_only_what_changed_and_removes_what_is_gone(hub: Any, folder: Path, tmp_path: Path) -> None:
+    push_to_hub(folder, PLACE)
+    uploads = hub.count("PUT", "/lfs/")
+    assert uploads > 0
+    push_to_hub(folder, PLACE)
+    assert hub.count("PUT", "/lfs/") == uploads
+    other = make_set(tmp_path / "other", episodes=1)
+    declare(other)
+    (other / "extra.txt").write_text("new")
+    push_to_hub(other, PLACE)
+    assert "extra.txt" in hub.repositories["lab/toy"].files
+    (other / "extra.txt").unlink()
+    push_to_hub(other, PLACE)
+    assert "extra.txt" not in hub.repositories["lab/toy"].files
+    pull_from_hub(PLACE, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(other)
+
+
+def test_an_interrupted_push_is_not_a_set_and_continues(hub: Any, folder: Path, tmp_path: Path) -> None:
+    """The last upload is refused; then the last commit; the third run sends only what is missing."""
+    seen: list[str] = []
+
+    def refuse_second_object(method: str, path: str) -> int | None:
+        if method == "PUT":
+            seen.append(path)
+        return 400 if method == "PUT" and len(set(seen)) > 1 else None
+
+    hub.refuse = refuse_second_object
+    with pytest.raises(ArtifactError, match=r"(?s)did not finish the push.*continues where it stopped"):
+        push_to_hub(folder, PLACE)
+    first = set(hub.objects)
+    hub.refuse = lambda method, path: None
+    with pytest.raises(ArtifactError, match=r"(?s)No finished EpisodeSet is published.*push it again"):
+        pull_from_hub(PLACE, tmp_path / "early")
+    assert not (tmp_path / "early").exists()
+    commits = len(hub.repositories["lab/toy"].commits)
+
+    def refuse_last_commit(method: str, path: str) -> int | None:
+        done = len(hub.repositories["lab/toy"].commits) > commits
+        return 400 if method == "POST" and "/commit/" in path and done else None
+
+    hub.refuse = refuse_last_commit
+    with pytest.raises(ArtifactError, match="did not finish the push"):
+        push_to_hub(folder, PLACE)
+    with pytest.raises(ArtifactError, match="No finished EpisodeSet"):
+        pull_from_hub(PLACE, tmp_path / "early")
+    hub.refuse = lambda method, path: None
+    hub.requests.clear()
+    push_to_hub(folder, PLACE)
+    again = {path.removeprefix("/lfs/") for method, path in hub.requests if method == "PUT"}
+    assert not again & first
+    pull_from_hub(PLACE, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(folder)
+
+
+def test_a_hub_that_fails_now_and_then_is_asked_again(hub: Any, folder: Path, tmp_path: Path) -> None:
+    failed: set[str] = set()
+
+    def once(method: str, path: str) -> int | None:
+        if method in ("PUT", "HEAD") and path not in failed and len(failed) < 2:
+            failed.add(path)
+            return 503
+        return None
+
+    hub.refuse = once
+    push_to_hub(folder, PLACE)
+    pull_from_hub(PLACE, tmp_path / "back")
+    assert len(failed) == 2
+    assert digest_folder(tmp_path / "back") == digest_folder(folder)
+
+
+def test_a_pull_continues_and_a_changed_file_is_found(hub: Any, folder: Path, tmp_path: Path) -> None:
+    push_to_hub(folder, PLACE)
+    repository = hub.repositories["lab/toy"]
+    video = next(path for path in repository.files if path.endswith(".mp4"))
+    hub.refuse = lambda method, path: 400 if method == "GET" and path.endswith(".mp4") else None
+    with pytest.raises(ArtifactError, match="did not finish the pull"):
+        pull_from_hub(PLACE, tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+    hub.refuse = lambda method, path: None
+    hub.requests.clear()
+    pull_from_hub(PLACE, tmp_path / "back")
+    assert hub.count("GET", "/resolve/") < len(repository.files)  # the rest had arrived
+    content, lfs = repository.files[video]
+    repository.files[video] = content[:-1] + bytes([content[-1] ^ 1]), lfs
+    repository.files["stray.txt"] = b"?", False
+    repository.commits.append("f" * 40)
+    with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*mp4 differs.*stray\.txt is not of the set"):
+        pull_from_hub(PLACE, tmp_path / "changed")
+    assert not (tmp_path / "changed").exists()
+
+
+def test_a_list_that_leads_out_of_the_folder_is_refused(hub: Any, folder: Path, tmp_path: Path) -> None:
+    push_to_hub(folder, PLACE)
+    repository = hub.repositories["lab/toy"]
+    listed = json.loads(repository.files[FILE_LIST][0])
+    listed["files"][0]["path"] = "../outside"
+    repository.files[FILE_LIST] = json.dumps(listed).encode(), False
+    with pytest.raises(DataError, match="Path leads outside"):
+        pull_from_hub(PLACE, tmp_path / "back")
+
+
+@pytest.mark.parametrize(
+    ("declared", "public", "message"),
+    [
+        (
+            {"redistribution": "no", "license": "CC-BY-NC-SA-4.0"},
+            False,
+            r"may not be handed on.*toy \(CC-BY-NC-SA-4\.0\)",
+        ),
+        ({"redistribution": "unknown"}, True, "do not say whether they may be handed on"),
+        (None, True, "do not say whether they may be handed on"),
+    ],
+)
+def test_licences_are_kept(
+    hub: Any, tmp_path: Path, declared: dict[str, Any] | None, public: bool, message: str
+) -> None:
+    root = make_set(tmp_path / "set")
+    if declared is not None:
+        declare(root, **declared)
+    with pytest.raises(DataError, match=f"(?s){message}.*--allow-restricted"):
+        push_to_hub(root, PLACE, public=public)
+    assert hub.requests == []  # nothing was sent, not even the repository made
+    push_to_hub(root, PLACE, public=public, allow_restricted=True)
+    assert hub.repositories["lab/toy"].private is not public
+
+
+def test_evaluation_sources_are_not_handed_on(hub: Any, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    with EpisodeSetWriter(root, fps=8) as writer:
+        state = np.zeros((4, 1), np.float32)
+        episode = Episode(
+            episode_id="e", source="toy", embodiment="toy", scene="s", task_family="lift", instruction="", outcome="unknown", split="test",
+            fps=8.0, state=state, action=state, timestamps=np.arange(4) / 8, conventions={"layout": "robotwin"},
+        )  # fmt: skip
+        writer.add(episode, {"head": np.zeros((4, 16, 16, 3), np.uint8)})
+    declare(root)
+    with pytest.raises(DataError, match="for evaluation only"):
+        push_to_hub(root, PLACE)
+    assert hub.requests == []
+
+
+def test_visibility_rights_tokens_and_names(hub: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    push_to_hub(folder, PLACE, public=True)
+    with pytest.raises(ArtifactError, match=r"(?s)another visibility.*expected: private.*got: public"):
+        push_to_hub(folder, PLACE)
+    with pytest.raises(ArtifactError, match=r"(?s)did not finish the push.*HF_TOKEN"):
+        push_to_hub(folder, HubLocation("lab/forbidden"))
+    with pytest.raises(ArtifactError, match="did not finish the pull"):
+        pull_from_hub(HubLocation("lab/nothing"), folder.with_name("x"))
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(UnavailableError, match="HF_TOKEN"):
+        push_to_hub(folder, PLACE)
+    for text in ("hf://lab/toy", "hf://datasets/toy", "https://x/y", "hf://datasets/a/b/c"):
+        with pytest.raises(ConfigError, match="Not a place on the hub"):
+            HubLocation.parse(text)
+    assert HubLocation.parse("hf://datasets/lab/toy@v1") == HubLocation("lab/toy", "v1")
+
+
+def test_sets_that_need_another_artifact_are_not_pushed(
+    hub: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    from worldline_core.data.episode_index import read_index, write_index
+
+    linked = folder.with_name("linked")
+    linked.mkdir()
+    write_index(linked, [replace(row, dataset=f"../{folder.name}/{row.dataset}") for row in read_index(folder)])
+    with pytest.raises(ArtifactError, match=r"(?s)datasets of another artifact.*worldline export"):
+        push_to_hub(linked, PLACE)
+    assert hub.requests == []

@@ -1,0 +1,163 @@
+"""Episodes and predictions in formats of other tools: MCAP (Foxglove), Rerun, LeRobotDataset v3."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
+from worldline_core.data.mcap_io import write_episode_mcap
+from worldline_core.data.recorded_poses import with_rigid_poses
+from worldline_core.data.source_table import SOURCES_FILE
+from worldline_core.data.video import PixelFormat
+from worldline_core.data.view_recording import RecordedView
+from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
+from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
+from worldline_core.exports.rollout import Format as RolloutFormat
+from worldline_core.exports.rollout import export_rollout, safe_stem
+from worldline_core.report.inspect import kind_of
+from worldline_core.report.inspect_pictures import linked_folder
+from worldline_core.store.atomic import write_json_atomic
+
+EPISODE_FORMATS = ("lerobot", "mcap", "rrd")
+# Stream copies keep the stored videos as they are; this is for what has to be encoded again (a cut not at a key frame).
+_CRF, _PRESET = 10, "veryfast"
+
+
+def export(
+    artifact: Path,
+    output: Path,
+    formats: Sequence[str],
+    *,
+    episode_ids: Sequence[str] = (),
+    episodes: Path | None = None,
+) -> list[Path]:
+    """Write episodes of an EpisodeSet, or predictions of a RolloutSet, below a folder.
+
+    Args:
+        formats: of an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
+            artifact refers to another one's), `mcap` and `rrd` (one file an episode); of a RolloutSet `mp4`, `rrd`, `mcap`.
+        episode_ids: which episodes; none: all.
+        episodes: the EpisodeSet that predictions belong to; default: the one that their manifest names.
+
+    Returns: the files, or the folder of the new set.
+
+    Raises: ConfigError for a format that the artifact does not have; DataError for an unknown episode; ArtifactError for
+        another kind of artifact.
+    """
+    kind = kind_of(artifact)
+    offered = {"EpisodeSet": EPISODE_FORMATS, "RolloutSet": ROLLOUT_FORMATS}.get(kind)
+    if offered is None:
+        raise ArtifactError("This kind is not exported", where=artifact, expected="EpisodeSet or RolloutSet", got=kind)
+    unknown = [wanted for wanted in formats if wanted not in offered]
+    if unknown or not formats:
+        raise ConfigError(f"Not a format of {kind}", expected=", ".join(offered), got=", ".join(unknown) or "none")
+    if kind == "EpisodeSet":
+        return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids)
+    return _export_rollouts(artifact, output, formats, episode_ids, episodes)
+
+
+def _export_episodes(
+    episodes: EpisodeSet, output: Path, formats: Sequence[str], episode_ids: Sequence[str]
+) -> list[Path]:
+    positions = [episodes.position(name) for name in episode_ids] if episode_ids else list(range(len(episodes)))
+    written: list[Path] = []
+    if "lerobot" in formats:
+        written.append(export_lerobot(episodes, output / "lerobot" if len(formats) > 1 else output, positions))
+    output.mkdir(parents=True, exist_ok=True)
+    stems = [safe_stem(episodes.rows[position].episode_id) for position in positions]
+    if len(set(stems)) != len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise DataError("Two episodes would get one file name", where=output, got=twice, next_step="export them apart")
+    for position in positions if {"mcap", "rrd"} & set(formats) else ():
+        row, episode = episodes.rows[position], episodes.episode(position)
+        frames = {view: np.asarray(episodes.frames(position, view)) for view in row.views}
+        stem = output / safe_stem(row.episode_id)
+        if "mcap" in formats:
+            masks = {view: mask for view in row.views if (mask := episodes.robot_masks(position, view)) is not None}
+            write_episode_mcap(stem.with_suffix(".mcap"), episode, frames, robot_masks=masks)
+            written.append(stem.with_suffix(".mcap"))
+        if "rrd" in formats:
+            content = RecordingContent(episode, frames, joint_names=episode.state_names or ())
+            write_rerun_recording(stem.with_suffix(".rrd"), content)
+            written.append(stem.with_suffix(".rrd"))
+    return written
+
+
+def export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> Path:
+    """Write rows of a set as a set of its own, whose datasets lie inside of it; one episode is in memory at a time.
+
+    Videos are copied without encoding where a row begins at a key frame.
+
+    Raises: DataError when the folder holds a finished set.
+    """
+    pixel_format = _pixel_format(episodes, positions)
+    with EpisodeSetWriter(output, video_crf=_CRF, video_preset=_PRESET, pixel_format=pixel_format) as writer:
+        for position in positions:
+            row = episodes.rows[position]
+            if writer.has(row.episode_id):
+                continue
+            views = {
+                view: RecordedView(
+                    lambda position=position, view=view: iter(episodes.frames(position, view)),
+                    row.video_frames,
+                    episodes.clip(position, view),
+                )
+                for view in row.views
+            }
+            masks = {view: mask for view in row.views if (mask := episodes.robot_masks(position, view)) is not None}
+            writer.add(with_rigid_poses(episodes.episode(position)), views, masks or None)
+    _copy_sources(episodes, output, positions)
+    return output
+
+
+def _pixel_format(episodes: EpisodeSet, positions: Sequence[int]) -> PixelFormat:
+    """That of the stored videos, so that what is encoded again fits into one dataset with what is copied."""
+    folders = {episodes.dataset_path(position) for position in positions}
+    features = [feature for folder in folders for feature in LeRobotV3Dataset(folder).features.values()]
+    found = {
+        (feature.get("info") or {}).get("video.pix_fmt") for feature in features if feature.get("dtype") == "video"
+    }
+    return "yuv420p" if found == {"yuv420p"} else "yuv444p"
+
+
+def _copy_sources(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> None:
+    """Sources and their licences go with the recordings; a filtered set has them where its datasets lie."""
+    roots = {episodes.dataset_path(position).parent.parent for position in positions} | {episodes.root}
+    tables = [
+        json.loads((root / SOURCES_FILE).read_text()) for root in sorted(roots) if (root / SOURCES_FILE).is_file()
+    ]
+    rows = {json.dumps(row, sort_keys=True): row for table in tables for row in table}
+    if rows:
+        write_json_atomic(output / SOURCES_FILE, list(rows.values()))
+
+
+def _export_rollouts(
+    artifact: Path, output: Path, formats: Sequence[str], episode_ids: Sequence[str], episodes: Path | None
+) -> list[Path]:
+    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.rollout.rollout_set import RolloutSet
+
+    folder = episodes or linked_folder(artifact, "episodes")
+    if folder is None:
+        raise ArtifactError(
+            "The episodes of these predictions are not known", where=artifact, next_step="name them: --episodes FOLDER"
+        )
+    rollouts, recorded = RolloutSet.open(artifact), EpisodeSet.open(folder)
+    tracks_folder = linked_folder(artifact, "tracks")
+    tracks = None if tracks_folder is None else ActionTracks.open(tracks_folder)
+    wanted = [name for name in get_args(RolloutFormat) if name in formats]
+    missing = sorted(set(episode_ids) - set(rollouts.episode_ids))
+    if missing:
+        raise DataError("No prediction of this episode", where=artifact, got=", ".join(missing))
+    written: list[Path] = []
+    for name in episode_ids or rollouts.episode_ids:
+        written += export_rollout(rollouts, recorded, tracks, name, output, wanted)
+    return written

@@ -1,0 +1,193 @@
+"""What of a finished EpisodeSet is published, with the digest of every file, and whether it may be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from worldline_core.data.curate_checks import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
+from worldline_core.data.episode_index import EpisodeRow
+from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.source_paths import inside
+from worldline_core.data.source_table import read_source_table
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.atomic import atomic_path
+from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_file, folder_files
+
+FILE_LIST = "worldline_files.json"
+"""Written last wherever a set is published: a copy without it is not complete."""
+FILE_LIST_VERSION = 1
+Place = Literal["content", "card"]
+
+
+@dataclass(frozen=True)
+class PublishedFile:
+    """One file of a published set.
+
+    Attributes:
+        path: where it lies in the published copy.
+        place: whether it belongs to the set, or to the card that was made for the publication.
+    """
+
+    path: str
+    size: int
+    sha256: str
+    place: Place = "content"
+
+
+@dataclass(frozen=True)
+class FileList:
+    """All files of a published set but the list itself, by path."""
+
+    files: Mapping[str, PublishedFile]
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(file.size for file in self.files.values())
+
+    def write(self, path: Path) -> None:
+        """As JSON, whole or not at all; equal lists give equal bytes."""
+        rows = [asdict(file) for _, file in sorted(self.files.items())]
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps({"version": FILE_LIST_VERSION, "files": rows}, indent=1) + "\n")
+
+    @classmethod
+    def read(cls, path: Path, where: object) -> FileList:
+        """The list of a copy.
+
+        Raises: ArtifactError when there is none (the publication was not finished), or it is not understood.
+        """
+        if not path.is_file():
+            raise ArtifactError(
+                "No finished EpisodeSet is published here",
+                where=where,
+                expected=FILE_LIST,
+                next_step="push it again: an interrupted push continues",
+            )
+        try:
+            content = json.loads(path.read_text())
+            if content["version"] != FILE_LIST_VERSION:
+                raise ValueError(f"version {content['version']}")
+            files = [_published_file(row) for row in content["files"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArtifactError(
+                "List of files is damaged or of another version", where=where, got=str(error)
+            ) from error
+        return cls({file.path: file for file in files})
+
+    def check(self, root: Path) -> None:
+        """Compare a copy with the list.
+
+        Raises: ArtifactError naming files that are missing, different, or not of the list; RejectedInputError
+            (path_traversal) for a listed path that leads out of the copy.
+        """
+        wrong: list[str] = []
+        for file in self.files.values():
+            path = inside(root, file.path)
+            if not path.is_file():
+                wrong.append(f"{file.path} is missing")
+            elif path.stat().st_size != file.size or digest_file(path) != file.sha256:
+                wrong.append(f"{file.path} differs")
+        present = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+        wrong += [f"{name} is not of the set" for name in sorted(present - set(self.files)) if not _ignored(name)]
+        if wrong:
+            raise ArtifactError(
+                "Published files are not those of the set",
+                where=root,
+                expected=f"{len(self.files)} files with the digests of {FILE_LIST}",
+                got="; ".join(wrong[:5]) + (f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""),
+                next_step="pull again; if it stays, push the set again",
+            )
+
+
+def _published_file(row: Mapping[str, Any]) -> PublishedFile:
+    place = row["place"]
+    if place not in ("content", "card") or not isinstance(row["path"], str):
+        raise ValueError(f"entry {dict(row)}")
+    return PublishedFile(row["path"], int(row["size"]), str(row["sha256"]), place)
+
+
+def _ignored(name: str) -> bool:
+    """What a hub or a client adds of itself."""
+    return name in (FILE_LIST, ".gitattributes") or name.startswith(".cache/")
+
+
+def set_files(folder: Path) -> dict[str, Path]:
+    """Path in the publication -> file, of everything that makes up a finished, self-contained set.
+
+    Raises: DataError when the folder is no finished EpisodeSet; ArtifactError when it needs another artifact's datasets.
+    """
+    rows = EpisodeSet.open(folder).rows
+    linked = sorted({row.dataset for row in rows if ".." in PurePosixPath(row.dataset).parts})
+    if linked:
+        raise ArtifactError(
+            "The set refers to datasets of another artifact",
+            where=folder,
+            expected="datasets inside of the folder",
+            got=", ".join(linked[:3]),
+            next_step=f"make it whole first: worldline export {folder} --format lerobot --output FOLDER",
+        )
+    files = {path.relative_to(folder).as_posix(): path for path in folder_files(folder)}
+    if FILE_LIST in files:
+        raise DataError("A file of the set has the name of the list of files", where=folder, got=FILE_LIST)
+    manifest = folder / MANIFEST_NAME
+    return files | ({MANIFEST_NAME: manifest} if manifest.is_file() else {})
+
+
+def listed(files: Mapping[str, Path], card: Mapping[str, Path]) -> FileList:
+    """Sizes and digests of what is published."""
+    places: list[tuple[Place, Mapping[str, Path]]] = [("content", files), ("card", card)]
+    found = [
+        PublishedFile(name, path.stat().st_size, digest_file(path), place)
+        for place, members in places
+        for name, path in members.items()
+    ]
+    return FileList({file.path: file for file in found})
+
+
+def card_files(folder: Path, taken: Iterable[str], title: str | None) -> dict[str, Path]:
+    """The dataset card, made now: path in the publication -> file. Nothing where the set has a README.md of its own."""
+    from worldline_core.report.dataset_card import write_card
+
+    if "README.md" in taken:
+        return {}
+    output = folder / VOLATILE_FOLDER / "card"
+    written = write_card(folder, output, title)
+    return {path.relative_to(output).as_posix(): path for path in written}
+
+
+def check_may_publish(folder: Path, *, public: bool, allow_restricted: bool) -> None:
+    """Raises: DataError when licences do not allow it: a source says that it may not be handed on, holds recordings for
+    evaluation only, or, for a public place, does not say.
+    """
+    if allow_restricted:
+        return
+    sources = read_source_table(folder)
+    forbidden = [f"{source.label} ({source.license})" for source in sources if source.redistribution == "no"]
+    unknown = [f"{source.label} ({source.license})" for source in sources if source.redistribution == "unknown"]
+    evaluation = sorted({row.source for row in EpisodeSet.open(folder).rows if _evaluation_only(row)})
+    for what, names in (
+        ("Sources may not be handed on", forbidden),
+        ("Sources are for evaluation only", evaluation),
+        (
+            "Sources do not say whether they may be handed on",
+            (unknown or ([] if sources else ["all"])) if public else [],
+        ),
+    ):
+        if names:
+            raise DataError(
+                what,
+                where=folder,
+                expected="curate.sources[].redistribution: yes",
+                got=", ".join(names),
+                next_step="leave these sources out, or, if you have the right, say --allow-restricted",
+            )
+
+
+def _evaluation_only(row: EpisodeRow) -> bool:
+    conventions = json.loads(row.conventions)
+    noted = conventions.get("layout") in EVALUATION_LAYOUTS or EVALUATION_ONLY in conventions
+    return noted or says_droid(row.source, row.embodiment)
