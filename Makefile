@@ -10,8 +10,9 @@ RUN := $(UV) run --frozen
 demo: install
 	$(RUN) worldline pipeline --preset tiny
 
+# One process a core, one thread each.
 test: install-scale
-	$(RUN) pytest
+	OMP_NUM_THREADS=1 $(RUN) pytest -n auto
 
 # Deployment against a real server and worker, and the largest model classes: minutes.
 test-slow: install-scale

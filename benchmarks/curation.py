@@ -1,8 +1,8 @@
 """Curation and filtering of 480x640 recordings with three views at 30 fps: times real time, and where the time goes.
 
-Run: `python benchmarks/curation.py [--episodes 12] [--seconds 10] [--scaling 10,100] [--old-way] [--processes 2] [--output out.json]`.
+Run: `python benchmarks/curation.py [--episodes 12] [--seconds 10] [--crf 23] [--scaling 10,100] [--old-way] [--processes 2] [--output out.json]`.
 The corpus is made from the shipped recordings: enlarged, slowed down to the wanted length, given texture and sensor
-noise, and encoded by libx264 as cameras' recordings usually are (crf 23, preset medium, B-frames); states and calibration
+noise, and encoded by libx264 as cameras' recordings usually are (preset medium, B-frames); states and calibration
 follow, so every filter runs. Figures are processor time (the machine may be shared), the floor is FFmpeg's plain decoding
 of the same files in the same process, and the share of decoding is measured inside of the run by the profiler. Several
 processes are timed by the clock as well, which means something on an idle machine only.
@@ -84,7 +84,7 @@ def slowed(episode: Episode, count: int) -> tuple[Episode, np.ndarray]:
     ), at
 
 
-def write_clip(path: Path, frames: np.ndarray, at: np.ndarray, preset: str, seed: int) -> None:
+def write_clip(path: Path, frames: np.ndarray, at: np.ndarray, crf: int, preset: str, seed: int) -> None:
     """The frames at the places `at`, enlarged, with texture and sensor noise, as an ordinary H.264 mp4."""
     generator = np.random.default_rng(seed)
     texture = cv2.GaussianBlur(generator.normal(0, 30, (*SIZE, 1)).astype(np.float32), (0, 0), 1.5)[..., None]
@@ -95,7 +95,7 @@ def write_clip(path: Path, frames: np.ndarray, at: np.ndarray, preset: str, seed
     with av.open(str(path), "w", format="mp4") as out:
         stream = out.add_stream("libx264", rate=int(FPS))
         stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
-        stream.options = {"crf": "23", "preset": preset, "threads": "1"}
+        stream.options = {"crf": str(crf), "preset": preset, "threads": "1"}
         for number, place in enumerate(at):
             low = int(place)
             blended = cv2.addWeighted(
@@ -106,7 +106,7 @@ def write_clip(path: Path, frames: np.ndarray, at: np.ndarray, preset: str, seed
         out.mux(stream.encode(None))
 
 
-def make_corpus(folder: Path, episodes: int, seconds: float, preset: str) -> None:
+def make_corpus(folder: Path, episodes: int, seconds: float, crf: int, preset: str) -> None:
     """An EpisodeSet whose videos are such clips, one file each."""
     recordings = EpisodeSet.open(RECORDINGS)
     usable = [i for i, row in enumerate(recordings.rows) if len(row.views) == 3 and row.split != "bank"]
@@ -124,7 +124,7 @@ def make_corpus(folder: Path, episodes: int, seconds: float, preset: str) -> Non
             views = {}
             for k, view in enumerate(recordings.rows[source].views):
                 path = clips / f"{number}.{view}.mp4"
-                write_clip(path, recordings.frames(source, view), at, preset, 10 * number + k)
+                write_clip(path, recordings.frames(source, view), at, crf, preset, 10 * number + k)
                 clip = VideoClip.whole_file(path, count, FPS)
                 views[view] = RecordedView(lambda: iter(()), count, clip)
             writer.add(episode, views)
@@ -302,7 +302,7 @@ def scaling(folder: Path, sizes: list[int], seconds: float) -> dict[str, Any]:
     for size in sizes:
         corpus = folder / f"scaling-{size}-{seconds}"
         if not corpus.is_dir():
-            make_corpus(corpus, size, seconds, "veryfast")
+            make_corpus(corpus, size, seconds, 23, "veryfast")
         rows[str(size)] = own_process(corpus)
     few, many = rows[str(sizes[0])], rows[str(sizes[-1])]
     return {
@@ -317,6 +317,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--episodes", type=int, default=12, help="0: leave this part out")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of an episode")
+    parser.add_argument("--crf", type=int, default=23, help="x264's quality; 16 gives the 2 Mbit/s of real head cameras")
     parser.add_argument("--corpus", type=Path, help="where corpora are kept for the next time")
     parser.add_argument("--scaling", default="", help="numbers of episodes, for example 10,100")
     parser.add_argument("--scaling-seconds", type=float, default=4.0, help="length of these episodes")
@@ -328,10 +329,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.corpus or Path(scratch) / "corpora"
         folder.mkdir(parents=True, exist_ok=True)
-        corpus = folder / f"corpus-{given.episodes}-{given.seconds}"
+        corpus = folder / f"corpus-{given.episodes}-{given.seconds}-crf{given.crf}"
         result: dict[str, Any] = {}
         if given.episodes and not corpus.is_dir():
-            make_corpus(corpus, given.episodes, given.seconds, "medium")
+            make_corpus(corpus, given.episodes, given.seconds, given.crf, "medium")
         if given.episodes:
             result = measure(corpus, Path(scratch) / "work", old_way=given.old_way)
             result["video_bytes_a_frame"] = sum(p.stat().st_size for p in corpus.rglob("*.mp4")) / result["frames"]
