@@ -119,9 +119,7 @@ class PrefectMapper:
             case "ray":
                 return _ray_runner(workers, self.config.address)
             case _:
-                from prefect.task_runners import ProcessPoolTaskRunner
-
-                return ProcessPoolTaskRunner(max_workers=workers)
+                return _process_runner(workers)
 
 
 @dataclass(frozen=True)
@@ -183,6 +181,21 @@ def _outcome[J: Job](job: J, future: Any) -> Outcome[J, Any]:
             got="a crash in compiled code, or killed for its memory",
         )
         return Outcome(job, error=died)
+
+
+def _process_runner(workers: int) -> Any:
+    from prefect.task_runners import ProcessPoolTaskRunner
+
+    class ProcessRunner(ProcessPoolTaskRunner):
+        """Does not wait for its queue of messages: a worker that was killed while it wrote there holds the lock for ever,
+        and this process would then never end."""
+
+        def _stop_message_forwarding(self) -> None:
+            if self._subprocess_message_queue is not None:
+                self._subprocess_message_queue.cancel_join_thread()
+            super()._stop_message_forwarding()
+
+    return ProcessRunner(max_workers=workers)
 
 
 def _dask_runner(workers: int, address: str | None) -> Any:
