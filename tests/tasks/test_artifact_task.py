@@ -12,6 +12,7 @@ import pytest
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import TaskRunFilter
+from prefect.events.worker import EventsWorker
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.testing.utilities import prefect_test_harness
 
@@ -41,6 +42,8 @@ class WriteStep(Step):
 
 @pytest.fixture(scope="module")
 def prefect_server() -> Iterator[None]:
+    # What sends task states is one for the process: another server's, where tests before this one had one.
+    EventsWorker.drain_all(timeout=10)
     with prefect_test_harness(server_startup_timeout=90):
         yield
 
