@@ -213,6 +213,10 @@ def _dask_runner(workers: int, address: str | None) -> Any:
 
 
 def _ray_runner(workers: int, address: str | None) -> Any:
+    if address is None:
+        # Read when Ray is imported. Started by `uv run`, it would have every worker build an environment of its own from
+        # a copy of the working directory; workers of this machine have this one.
+        os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     try:
         from prefect_ray import RayTaskRunner
     except ImportError as error:
