@@ -168,6 +168,11 @@ def test_picture_statistics_are_what_numpy_says() -> None:
     change = np.abs(np.diff(value, axis=0)).mean(axis=(1, 2))
     assert np.allclose(found.change, np.concatenate([[0.0], change]))
     assert (found.flat_share == 0).all()
+    for count in (1, 2, 16, 17):  # sums are taken over batches of pictures
+        few = picture_statistics(gray[:count])
+        assert np.array_equal(few.change, found.change[:count])
+        assert np.array_equal(few.detail, found.detail[:count])
+        assert np.array_equal(few.roughness, found.roughness[:count])
     half = gray.copy()
     half[:, 32:] = 128
     assert np.allclose(picture_statistics(half).flat_share, 0.5)

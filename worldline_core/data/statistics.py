@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
@@ -57,10 +56,8 @@ class ImageSampler:
         """One of the wanted pictures, uint8 (H, W, 3)."""
         longest = max(image.shape[:2])
         every = longest // _SAMPLED_SIDE if longest >= _LARGE_SIDE else 1
-        sample = np.ascontiguousarray(image[::every, ::every])
         for channel in range(3):
-            counts = cv2.calcHist([sample], [channel], None, [256], [0, 256])
-            self.histogram[channel] += counts.reshape(-1).astype(np.int64)
+            self.histogram[channel] += np.bincount(image[::every, ::every, channel].reshape(-1), minlength=256)
 
 
 def image_statistics(histograms: Sequence[np.ndarray], num_frames: int) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Numbers about each small grey picture of a view, which several detectors look at. About 0.04 ms a picture."""
+"""Numbers about each small grey picture of a view, which several detectors look at. About 0.05 ms a picture."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ WHITE_LEVEL = 245
 """Luma from which a pixel tells nothing any more."""
 _FLAT_LEVELS = 2
 _COARSE = 4
+# Pictures whose differences are worked on at a time: they stay in the processor's cache.
+_BATCH = 16
 
 
 @dataclass(frozen=True)
@@ -47,18 +49,17 @@ def picture_statistics(gray: np.ndarray) -> PictureStatistics:
     pixels = height * width
     mean = histograms @ levels / pixels
     variance = np.maximum(histograms @ levels**2 / pixels - mean**2, 0)
-    across, down, change, coarse_change = (np.zeros(count) for _ in range(4))
-    low, high = gray.min(axis=2).astype(np.int16), gray.max(axis=2).astype(np.int16)
+    across, down, change = _differences(gray)
     coarse_size = (max(1, width // _COARSE), max(1, height // _COARSE))
-    before = coarse_before = None
+    coarse_change = np.zeros(count)
+    coarse_before = None
     for i, image in enumerate(gray):
-        across[i] = cv2.norm(image[:, 1:], image[:, :-1], cv2.NORM_L2SQR) / (height * (width - 1))
-        down[i] = cv2.norm(image[1:], image[:-1], cv2.NORM_L2SQR) / ((height - 1) * width)
         coarse = cv2.resize(image.astype(np.float32), coarse_size, interpolation=cv2.INTER_AREA)
-        if before is not None and coarse_before is not None:
-            change[i] = cv2.norm(image, before, cv2.NORM_L1) / pixels
+        if coarse_before is not None:
             coarse_change[i] = cv2.norm(coarse, coarse_before, cv2.NORM_L1) / coarse.size
-        before, coarse_before = image, coarse
+        coarse_before = coarse
+    across, down, change = across / (height * (width - 1)), down / ((height - 1) * width), change / pixels
+    low, high = gray.min(axis=2).astype(np.int16), gray.max(axis=2).astype(np.int16)
     cumulative = np.cumsum(histograms, axis=1)
     return PictureStatistics(
         mean,
@@ -71,6 +72,37 @@ def picture_statistics(gray: np.ndarray) -> PictureStatistics:
         change,
         coarse_change,
     )
+
+
+def _differences(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of uint8 (n, h, w), three (n,): summed squared differences of adjacent pixels across and down, and summed absolute
+    differences from the picture before (0 for the first).
+
+    A row's sum of squares is a whole number below 2^24 (for w <= 258), so float32 holds it exactly in whatever order BLAS
+    adds.
+    """
+    count, height, width = gray.shape
+    across, down, change = np.empty(count), np.empty(count), np.zeros(count)
+    ones = np.ones(width, dtype=np.float32)
+
+    def row_sums(one: np.ndarray, other: np.ndarray, *, squared: bool) -> np.ndarray:
+        difference = cv2.absdiff(one, other).astype(np.float32)
+        if squared:
+            np.multiply(difference, difference, out=difference)
+        return (difference @ ones[: difference.shape[1]]).astype(np.float64)
+
+    for start in range(0, count, _BATCH):
+        part = slice(start, start + _BATCH)
+        rows = np.ascontiguousarray(gray[part]).reshape(-1, width)
+        across[part] = row_sums(rows[:, 1:], rows[:, :-1], squared=True).reshape(-1, height).sum(axis=1)
+        # The last row of a picture and the first one of the next are no neighbours.
+        below = np.append(row_sums(rows[1:], rows[:-1], squared=True), 0.0)
+        down[part] = below.reshape(-1, height)[:, :-1].sum(axis=1)
+        with_previous = np.ascontiguousarray(gray[max(start - 1, 0) : part.stop]).reshape(-1, width)
+        if len(with_previous) > height:
+            moved = row_sums(with_previous[height:], with_previous[:-height], squared=False)
+            change[max(start, 1) : part.stop] = moved.reshape(-1, height).sum(axis=1)
+    return across, down, change
 
 
 def _flat_edge(low: np.ndarray, high: np.ndarray) -> np.ndarray:
