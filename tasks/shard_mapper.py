@@ -11,7 +11,7 @@ import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -94,7 +94,8 @@ class PrefectMapper:
         room = int(self.config.remote_cache_gb * 2**30)
 
         def hand_out(job: Any) -> Any:
-            return work.with_options(task_run_name=job.label).submit(pickle.dumps((function, job)), room)
+            with self._one_try():
+                return work.with_options(task_run_name=job.label).submit(pickle.dumps((function, job)), room)
 
         first = waiting[0].label
         name = first.rsplit(" shard", 1)[0]
@@ -111,6 +112,14 @@ class PrefectMapper:
                 shards()
         finally:
             _round.reset(token)
+
+    def _one_try(self) -> AbstractContextManager[Any]:
+        """In which a shard is handed out: doing it again after its worker died is `run_jobs`' business, not the runner's."""
+        if self.config.kind != "ray":  # Dask's is said of the whole cluster, pools have none
+            return nullcontext()
+        from prefect_ray.context import remote_options
+
+        return remote_options(max_retries=0)
 
     def _task_runner(self, workers: int) -> Any:
         match self.config.kind:

@@ -65,6 +65,15 @@ def _prefect(environment: dict[str, str], cwd: Path, *arguments: str, timeout: i
     return result.stdout
 
 
+def _stop(worker: subprocess.Popen[bytes]) -> None:
+    os.killpg(worker.pid, signal.SIGTERM)
+    try:
+        worker.wait(timeout=20)
+    except subprocess.TimeoutExpired:  # Prefect's worker now and then loses the signal and polls on
+        os.killpg(worker.pid, signal.SIGKILL)
+        worker.wait()
+
+
 @pytest.mark.slow
 def test_deployed_pipeline_runs_on_a_worker(environment: dict[str, str], project_root: Path, tmp_path: Path) -> None:
     _prefect(environment, project_root, "work-pool", "create", "worldline", "--type", "process")
@@ -81,7 +90,6 @@ def test_deployed_pipeline_runs_on_a_worker(environment: dict[str, str], project
             "--params", parameters, "--watch", "--watch-timeout", "240", timeout=270,
         )  # fmt: skip
     finally:
-        os.killpg(worker.pid, signal.SIGTERM)
-        worker.wait(timeout=60)
+        _stop(worker)
     reports = list((tmp_path / "artifacts" / "report").glob("*/index.html"))
     assert len(reports) == 1, (tmp_path / "worker.log").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +54,16 @@ SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("dask", "ray")]
 
 @pytest.mark.parametrize("kind", ["processes", *SLOW])
 def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kind: str) -> None:
-    if kind in ("dask", "ray"):
-        pytest.importorskip(f"prefect_{kind}")
+    # Asked without importing: what Ray reads at its import is set by the mapper.
+    if kind in ("dask", "ray") and find_spec(f"prefect_{kind}") is None:
+        pytest.skip(f"prefect_{kind} is not installed")
     record = run(tmp_path, jobs_of(tmp_path, range(4, 24), 4), kind)  # 5 flickers, 7 fails, 13 kills its worker
     assert record.crashed == {7: "ZeroDivisionError", 13: "WorkerDiedError"}
     assert results(tmp_path) == {value: value**2 for value in range(4, 24) if value not in (7, 13)}
     assert attempts(tmp_path, 5) == 3  # retried: it passes
-    # In its shard, unless the dying worker took that one along, and alone: bad data is not retried.
-    assert attempts(tmp_path, 7) in ((1, 2) if kind == "processes" else (2,))
+    # In its shard and alone, which retries would make six: bad data is not retried. A dying worker may take along the shard
+    # (a pool ends as a whole) or an answer that nobody has fetched yet (Dask then does the shard again).
+    assert attempts(tmp_path, 7) in ((1, 2) if kind == "processes" else (2, 3))
     assert attempts(tmp_path, 13) == 2
     assert str(os.getpid()) not in processes(tmp_path)
 
