@@ -134,8 +134,10 @@ def cell_means(values: np.ndarray) -> np.ndarray:
     """(n, h, w, ...) -> (n, r, c, ...): mean over CELL_PX squares; what is left over at the border is dropped."""
     n, height, width = values.shape[:3]
     r, c = height // CELL_PX, width // CELL_PX
-    cut = values[:, : r * CELL_PX, : c * CELL_PX]
-    return cut.reshape(n, r, CELL_PX, c, CELL_PX, *values.shape[3:]).mean(axis=(2, 4), dtype=np.float32)
+    cut = np.ascontiguousarray(values[:, : r * CELL_PX, : c * CELL_PX], dtype=np.float32)
+    # Rows of pixels first: whole rows are added, which is several times as fast as square by square.
+    rows = cut.reshape(n, r, CELL_PX, -1).sum(axis=2)
+    return rows.reshape(n, r, c, CELL_PX, *values.shape[3:]).sum(axis=3) / np.float32(CELL_PX**2)
 
 
 def _motion(gray: np.ndarray) -> Motion:
