@@ -20,7 +20,7 @@ import torch
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks, robot_capsules
 from worldline_core.actions.tool_projection import project_tools
-from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 

@@ -22,15 +22,15 @@ import numpy as np
 from worldline_core.calibration.diagnosis import Diagnosis
 from worldline_core.calibration.doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.observation import small_gray
-from worldline_core.data.convention_needs import applicable
-from worldline_core.data.conventions import (
+from worldline_core.data.episodes.convention_needs import applicable
+from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
     corrupt,
     corrupted_image_frames,
 )
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics

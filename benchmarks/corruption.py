@@ -21,7 +21,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from worldline_core.data.curate import curate
+from worldline_core.data.curation.curate import curate
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.recorder.corrupted.corpus import (

@@ -33,12 +33,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video_clip import VideoClip
-from worldline_core.data.view_recording import RecordedView
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.video.clip import VideoClip
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.scale.mapping import Outcome
@@ -317,7 +317,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--episodes", type=int, default=12, help="0: leave this part out")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of an episode")
-    parser.add_argument("--crf", type=int, default=23, help="x264's quality: 23 gives 0.7 Mbit/s a view, 22 1.3, 21 2.6, 16 13")
+    parser.add_argument(
+        "--crf", type=int, default=23, help="x264's quality: 23 gives 0.7 Mbit/s a view, 22 1.3, 21 2.6, 16 13"
+    )
     parser.add_argument("--corpus", type=Path, help="where corpora are kept for the next time")
     parser.add_argument("--scaling", default="", help="numbers of episodes, for example 10,100")
     parser.add_argument("--scaling-seconds", type=float, default=4.0, help="length of these episodes")

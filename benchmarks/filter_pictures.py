@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.data.conventions import RecordedConventions, corrupt
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.thumbnails import view_thumbnails
+from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.exports.clip_strip import ClipStrip, clip_strip
 from worldline_core.exports.contact_sheet import evenly_spaced
 from worldline_core.exports.overlays import draw_overlay

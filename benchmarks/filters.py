@@ -26,9 +26,10 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.thumbnails import view_thumbnails
-from worldline_core.data.video import decode_video, encode_video
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.inspect_episode import Finding, inspect
 from worldline_core.filters.labelled_clips import FAULTS, HARMLESS, Clip

@@ -29,9 +29,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from worldline_core.data.episode import VIEWS, Episode
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.frame_decoder import torchcodec_fault
+from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.video.frame_decoder import torchcodec_fault
 from worldline_core.training.clip_input import FrameInput
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_reader import ClipReader

@@ -17,7 +17,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from worldline_core.data.episode_index import EpisodeRow, read_index, write_index
+from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, write_index
 from worldline_core.data.sources.lerobot import LeRobotSource
 from worldline_core.data.sources.lerobot_config import LeRobotSourceConfig
 

@@ -23,12 +23,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
-from worldline_core.data.near_duplicates import NearDuplicateConfig, find_near_duplicates
-from worldline_core.data.thumbnails import view_thumbnails
-from worldline_core.data.video import decode_video, encode_video
+from worldline_core.data.curation.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
+from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, find_near_duplicates
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.exports.pictures import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic

@@ -12,7 +12,7 @@ from prefect.context import TaskRunContext
 
 from tasks.shard_mapper import shard_mapper
 from worldline_core.config.base import StrictModel
-from worldline_core.data.source_paths import SourceFolder, is_remote, parse_location
+from worldline_core.data.guards.source_paths import SourceFolder, is_remote, parse_location
 from worldline_core.pipeline.steps import Step, get_step, run_step
 from worldline_core.scale.runner_config import RunnerConfig
 from worldline_core.store.store import ArtifactStore

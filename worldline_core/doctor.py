@@ -101,7 +101,7 @@ def _codec() -> dict[str, Any]:
 
 
 def _decoder() -> dict[str, Any]:
-    from worldline_core.data.frame_decoder import describe_decoders
+    from worldline_core.data.video.frame_decoder import describe_decoders
 
     found = describe_decoders()
     status = "optional" if found["next_step"] else "ok"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 

@@ -10,7 +10,7 @@ import torch
 
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import collate_tracks, project_tools
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import CalibrationError, DataError
 
 K = torch.tensor([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1.0]], dtype=torch.float64)

@@ -10,9 +10,9 @@ import pytest
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
 from worldline_core.actions.tracks import ActionTracks
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.exports.overlays import ARM_COLOURS, OverlayStyle, draw_overlay
 

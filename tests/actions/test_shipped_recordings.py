@@ -10,7 +10,7 @@ import torch
 
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 

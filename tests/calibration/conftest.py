@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 
 COUNT, HEIGHT, WIDTH, FPS = 24, 60, 80, 10.0
 

@@ -17,9 +17,9 @@ from worldline_core.calibration.check_report import as_json, cautions, plain, ta
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, ViewMeasures
 from worldline_core.calibration.findings import CalibrationCheck, Finding, SetFinding
 from worldline_core.calibration.listing import ListedEpisode, combined_conventions, repairing_lines
-from worldline_core.data.conventions import RecordedConventions, apply_conventions, corrupt
-from worldline_core.data.episode import Episode
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, corrupt
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import LoadedEpisode, no_masks
 from worldline_core.errors import ConfigError, DataError
 

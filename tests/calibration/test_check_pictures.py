@@ -19,8 +19,8 @@ from worldline_core.calibration.pictures import (
     recorded_tracks,
     telling_moments,
 )
-from worldline_core.data.conventions import RecordedConventions, corrupt, corrupted_image_frames
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.conventions import RecordedConventions, corrupt, corrupted_image_frames
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 
 

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.convention_needs import arm_blocks
-from worldline_core.data.conventions import (
+from worldline_core.data.episodes.convention_needs import arm_blocks
+from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
     corrupt,
     corrupted_image_frames,
     image_frames,
 )
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import LoadedEpisode, no_masks
 from worldline_core.data.sources.repaired import repair
 

@@ -14,8 +14,8 @@ import pytest
 
 from worldline_core.calibration.diagnosis import Diagnosis
 from worldline_core.calibration.doctor import CalibrationDoctorConfig, diagnose, diagnose_set
-from worldline_core.data.conventions import RecordedConventions, corrupt
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics

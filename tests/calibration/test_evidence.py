@@ -21,8 +21,8 @@ from worldline_core.calibration.measures import refined_peak
 from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
 from worldline_core.calibration.pose_evidence import pose_terms, rms_hand_eye, unrest_log_likelihood
 from worldline_core.calibration.reading import read
-from worldline_core.data.conventions import RecordedConventions
-from worldline_core.data.episode import CameraTrack, Episode
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.rigid import project_points, rigid_inverse
 
 CONFIG = CalibrationDoctorConfig()

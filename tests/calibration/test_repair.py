@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 from worldline_core.calibration.doctor import diagnose
-from worldline_core.data.conventions import RecordedConventions, corrupt, corrupted_image_frames
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.conventions import RecordedConventions, corrupt, corrupted_image_frames
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 
 sys.path.insert(0, str(Path(__file__).parent))  # several tests write the layouts in `published_*`
 

@@ -15,12 +15,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_index import read_index, write_index
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.resize import resize_masks
-from worldline_core.data.video import encode_video
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_index import read_index, write_index
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.resize import resize_masks
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]
@@ -221,7 +221,7 @@ def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> 
 
 
 def test_unsteady_frame_times_are_a_wrong_rate(tmp_path: Path, sample: Make) -> None:
-    from worldline_core.data.mcap_io import write_episode_mcap
+    from worldline_core.data.mcap.io import write_episode_mcap
 
     folder = tmp_path / "raw"
     for number in range(2):
@@ -282,7 +282,7 @@ def test_a_killed_curation_continues_to_the_same_bytes(tmp_path: Path, sample: M
     settings = config(raw)
     curate(settings, {}, tmp_path / "undisturbed")
     script = (
-        "import sys; from pathlib import Path; from worldline_core.data.curate import curate; from worldline_core.data.curate_config import CurateConfig;"
+        "import sys; from pathlib import Path; from worldline_core.data.curation.curate import curate; from worldline_core.data.curation.config import CurateConfig;"
         "curate(CurateConfig.model_validate_json(sys.argv[1]), {}, Path(sys.argv[2]))"
     )
     killed = tmp_path / "killed"

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 
 from worldline_core.config import validate
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.curate_description import described
-from worldline_core.data.curation_rules import curation_findings
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_index import EpisodeRow, read_index
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.primary_view import PRIMARY_VIEW_REASON, with_primary_view
-from worldline_core.data.source_table import read_source_table
-from worldline_core.data.source_weights import (
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.description import described
+from worldline_core.data.curation.primary_view import PRIMARY_VIEW_REASON, with_primary_view
+from worldline_core.data.curation.rules import curation_findings
+from worldline_core.data.curation.source_table import read_source_table
+from worldline_core.data.curation.source_weights import (
     SourceSampling,
     read_source_weights,
     source_weights,
     write_source_weights,
 )
-from worldline_core.data.thumbnails import view_thumbnails
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import EpisodeRow, read_index
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]
@@ -125,7 +125,7 @@ def test_a_scene_that_leaks_under_another_name(tmp_path: Path, action: str) -> N
 
 
 def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) -> None:
-    from worldline_core.data.curation_rules import decided_findings
+    from worldline_core.data.curation.rules import decided_findings
 
     parts = described_parts([room(0, "a"), room(0, "b"), room(1, "c")])
     first = decided_findings(config(tmp_path), parts, tmp_path)
@@ -136,7 +136,7 @@ def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) 
 
 
 def described_parts(samples: list[tuple]) -> list[dict[str, Any]]:
-    from worldline_core.data.fingerprint import fingerprint
+    from worldline_core.data.curation.fingerprint import fingerprint
 
     return [
         {

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.episode import CameraTrack
-from worldline_core.data.episode_index import read_index, write_index
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode_index import read_index, write_index
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]

@@ -12,17 +12,17 @@ import av
 import numpy as np
 import pytest
 
-from worldline_core.data import frame_decoder
-from worldline_core.data.frame_decoder import (
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video import frame_decoder
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.encoder import concatenate_videos, encode_video
+from worldline_core.data.video.frame_decoder import (
     FrameDecoder,
     PyavDecoder,
     describe_decoders,
     open_decoder,
     torchcodec_fault,
 )
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.video import concatenate_videos, encode_video
-from worldline_core.data.video_clip import VideoClip
 from worldline_core.doctor import examine_machine, format_findings
 from worldline_core.errors import DataError, UnavailableError
 
@@ -188,7 +188,7 @@ def test_open_files_are_bounded(decoder: FrameDecoder, tmp_path: Path) -> None:
 
 @needs_torchcodec
 def test_torchcodec_leaves_approximate_seeking_where_it_misses(tmp_path: Path) -> None:
-    from worldline_core.data.torchcodec_decoder import TorchcodecDecoder
+    from worldline_core.data.video.torchcodec_decoder import TorchcodecDecoder
 
     # The rate in the header is the mean of two: frame numbers computed from it are wrong nearly everywhere.
     times = [*range(30), *range(30, 120, 3)]
@@ -225,7 +225,7 @@ def test_the_fault_of_torchcodec_is_read_from_its_import(tmp_path: Path) -> None
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "decoders.py").write_text("raise RuntimeError('Could not load libtorchcodec.\\nMany more lines')")
-    code = "from worldline_core.data.frame_decoder import torchcodec_fault; print(torchcodec_fault())"
+    code = "from worldline_core.data.video.frame_decoder import torchcodec_fault; print(torchcodec_fault())"
     found = subprocess.run(
         [sys.executable, "-c", code],
         env={"PYTHONPATH": f"{tmp_path}:{Path(__file__).parents[2]}", "PATH": ""},

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from worldline_core.data.instructions import (
+from worldline_core.data.curation.instructions import (
     RAW_INSTRUCTION,
     InstructionConfig,
     mentions_outcome,

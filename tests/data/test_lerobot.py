@@ -13,12 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video import decode_video, encode_video
-from worldline_core.data.video_clip import VideoClip
-from worldline_core.data.view_recording import RecordedView
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]

@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.recorded_poses import camera_pose, with_rigid_poses
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.pose_formats import (
     pose_from_euler_fixed_xyz,

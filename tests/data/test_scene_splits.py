@@ -10,9 +10,9 @@ import pytest
 from pydantic import ValidationError
 
 from worldline_core.config import validate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.scene_leaks import LeakageConfig, SceneView, find_scene_leaks
-from worldline_core.data.scene_splits import SceneSplits, drawn_split, with_split
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.scene_leaks import LeakageConfig, SceneView, find_scene_leaks
+from worldline_core.data.curation.scene_splits import SceneSplits, drawn_split, with_split
 from worldline_core.errors import ConfigError
 
 Make = Callable[..., tuple]

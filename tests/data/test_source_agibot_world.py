@@ -15,13 +15,13 @@ from pydantic import ValidationError
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.agibot_world import AgibotWorldSourceConfig
 from worldline_core.data.sources.open import open_source
-from worldline_core.data.video import encode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import UnavailableError
 
 LENGTH, HEIGHT, WIDTH = 8, 48, 64

@@ -23,9 +23,9 @@ from published_lerobot import (
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 
 K = [[60.0, 0.0, 63.5], [0.0, 62.0, 35.5], [0.0, 0.0, 1.0]]

@@ -29,10 +29,10 @@ from published_robomind import (
     write_version_2,
 )
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.hdf5 import open_hdf5
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.hdf5 import open_hdf5
 from worldline_core.data.sources.robomind import LayoutName, RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS
 from worldline_core.errors import DataError

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 
 LENGTH, HEIGHT, WIDTH = 6, 48, 64

@@ -14,16 +14,16 @@ import pytest
 from mcap.reader import make_reader
 from pydantic import ValidationError
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode import CameraTrack
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.mcap_io import write_episode_mcap
-from worldline_core.data.mcap_reader import read_episode_mcap
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.io import write_episode_mcap
+from worldline_core.data.mcap.reader import read_episode_mcap
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
 from worldline_core.data.sources.base import LoadedEpisode
-from worldline_core.data.undistort import undistorted
+from worldline_core.data.video.undistort import undistorted
 from worldline_core.geometry.distortion import Distortion
 
 Make = Callable[..., tuple]
@@ -152,7 +152,7 @@ def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, samp
     path = tmp_path / "mcap" / "2.mcap"
     write_episode_mcap(path, third, frames)
     with pytest.MonkeyPatch.context() as patch:
-        from worldline_core.data import mcap_io
+        from worldline_core.data.mcap import io as mcap_io
 
         original = mcap_io._calibration
         changed = lambda *a, **k: {**original(*a, **k), "distortion_model": "double_sphere", "D": [0.1]}  # noqa: E731

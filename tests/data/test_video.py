@@ -7,14 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.video import (
-    X264_PARAMETERS,
-    concatenate_videos,
-    decode_segment,
-    decode_video,
-    encode_video,
-    video_size,
-)
+from worldline_core.data.video.decode import decode_segment, decode_video, video_size
+from worldline_core.data.video.encoder import X264_PARAMETERS, concatenate_videos, encode_video
 from worldline_core.errors import DataError
 
 
@@ -53,7 +47,7 @@ def test_bytes_do_not_depend_on_the_processor(
         scene.append(np.clip(picture, 0, 255).astype(np.uint8))
     frames = np.stack(scene)
     encode_video(tmp_path / "here.mp4", frames, 8, crf=8, pixel_format=pixel_format)  # type: ignore[arg-type]
-    monkeypatch.setattr("worldline_core.data.video.X264_PARAMETERS", X264_PARAMETERS + ":asm=0")
+    monkeypatch.setattr("worldline_core.data.video.encoder.X264_PARAMETERS", X264_PARAMETERS + ":asm=0")
     encode_video(tmp_path / "plain.mp4", frames, 8, crf=8, pixel_format=pixel_format)  # type: ignore[arg-type]
     assert (tmp_path / "here.mp4").read_bytes() == (tmp_path / "plain.mp4").read_bytes()
 

@@ -9,11 +9,12 @@ import av
 import numpy as np
 import pytest
 
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.video import concatenate_videos, decode_segment, decode_video, encode_video
-from worldline_core.data.video_clip import VideoClip, open_video, read_clip
-from worldline_core.data.video_copy import clip_copy
-from worldline_core.data.view_recording import RecordedView, VideoSettings, store_view
+from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.clip import VideoClip, open_video, read_clip
+from worldline_core.data.video.copy import clip_copy
+from worldline_core.data.video.decode import decode_segment, decode_video
+from worldline_core.data.video.encoder import concatenate_videos, encode_video
 
 FPS = 30.0
 ENCODERS = {

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.tracks import write_index, write_shard
-from worldline_core.data.episode import VIEWS, Episode
-from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 
 NUM_FRAMES = 17

@@ -23,7 +23,7 @@ CONFIG = SegmenterConfig(
 @pytest.fixture
 def training(recordings, monkeypatch) -> Path:
     """The small recordings, with every episode taken for a training one."""
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     select = EpisodeSet.select
     monkeypatch.setattr(EpisodeSet, "select", lambda self, **values: select(self))
@@ -118,7 +118,7 @@ def test_missing_weights_are_named(tmp_path, training):
 
 
 def test_training_needs_masks(training, tmp_path, monkeypatch):
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     monkeypatch.setattr(EpisodeSet, "robot_masks", lambda self, index, view: None)
     with pytest.raises(DataError, match="exact robot masks"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.exports.rerun_recording import RecordingContent
 
 COUNT, HEIGHT, WIDTH = 5, 32, 48

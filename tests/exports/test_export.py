@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.episode_index import read_index, write_index
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.mcap_reader import read_episode_mcap
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode_index import read_index, write_index
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.mcap.reader import read_episode_mcap
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.export import export
 from worldline_core.exports.publish_content import set_files

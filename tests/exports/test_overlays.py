@@ -10,7 +10,7 @@ import torch
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.data.video import decode_video
+from worldline_core.data.video.decode import decode_video
 from worldline_core.errors import DataError
 from worldline_core.exports.labels import text_width_px
 from worldline_core.exports.overlay_views import (

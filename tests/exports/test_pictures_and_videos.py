@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.video import decode_video
+from worldline_core.data.video.decode import decode_video
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.exports.labels import fit_text, text_strip, text_width_px
 from worldline_core.exports.overlays import heat_picture

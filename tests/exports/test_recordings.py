@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from PIL import Image
 
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.mcap_recording import write_mcap_recordings
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording

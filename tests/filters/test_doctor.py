@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.conventions import RecordedConventions, corrupt
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.thumbnails import ViewThumbnails
+from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.filters.doctor import FilterDoctorConfig, detect_mistake, kinematics_of
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.inspect_episode import inspect

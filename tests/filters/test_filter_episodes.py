@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.cameras import project, transform_intrinsics
 from worldline_core.geometry.image_transforms import ImageTransform

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.rigid import (
@@ -86,7 +86,7 @@ def test_pyright_refuses_a_bare_array_for_a_pose(tmp_path: Path) -> None:
     snippet = tmp_path / "snippet.py"
     snippet.write_text(
         "import numpy as np\n"
-        "from worldline_core.data.episode import CameraTrack\n"
+        "from worldline_core.data.episodes.episode import CameraTrack\n"
         "from worldline_core.geometry.camera_pose import CameraPose\n"
         "T = np.eye(4)[None]\n"
         'CameraTrack.from_pose("head", np.eye(3), T, width=4, height=4)\n'

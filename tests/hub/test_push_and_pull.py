@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.exports.publish_content import FILE_LIST
 from worldline_core.exports.publish_hub import HubLocation, pull_from_hub, push_to_hub
@@ -71,7 +71,7 @@ def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_
 
 
 def test_lerobot_reads_what_was_pulled(hub: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
+    from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
 
     push_to_hub(folder, PLACE)
     pull_from_hub(PLACE, tmp_path / "back")
@@ -243,7 +243,7 @@ def test_sets_that_need_another_artifact_are_not_pushed(
 ) -> None:
     from dataclasses import replace
 
-    from worldline_core.data.episode_index import read_index, write_index
+    from worldline_core.data.episodes.episode_index import read_index, write_index
 
     linked = folder.with_name("linked")
     linked.mkdir()

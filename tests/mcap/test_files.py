@@ -11,10 +11,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as RawWriter
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_index import read_quarantine
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
 from worldline_core.data.sources.open import open_source
 

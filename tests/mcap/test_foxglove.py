@@ -14,9 +14,9 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap_protobuf.writer import Writer
 
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.mcap_io import write_episode_mcap
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.io import write_episode_mcap
 from worldline_core.data.sources.base import LoadedEpisode
 from worldline_core.data.sources.open import open_source
 
@@ -263,7 +263,7 @@ def test_video_that_does_not_decode_is_refused(tmp_path: Path, toy: Any, foxglov
 
 def test_the_projects_own_export_is_read_through_its_topics(tmp_path: Path, toy: Any) -> None:
     """JSON in Foxglove's schemas: the same recording as any other tool would see it."""
-    from worldline_core.data.episode import CameraTrack, Episode
+    from worldline_core.data.episodes.episode import CameraTrack, Episode
 
     count = 20
     time = np.arange(count) / 10

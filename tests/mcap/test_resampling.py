@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from worldline_core.data.mcap_topics import resampling
-from worldline_core.data.mcap_topics.clock import Clock, in_order
-from worldline_core.data.mcap_topics.images import spoiled_frames
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.topics import resampling
+from worldline_core.data.mcap.topics.clock import Clock, in_order
+from worldline_core.data.mcap.topics.images import spoiled_frames
 
 MS = 1_000_000
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS
 from worldline_core.recorder.episode_recorder import EpisodeRecorder, Recording

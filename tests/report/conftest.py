@@ -10,8 +10,8 @@ import pytest
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.tracks import write_index, write_shard
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.evaluation.policy.accuracy import summarise_decisions
 from worldline_core.evaluation.scores import Score, summarise, write_scores
 from worldline_core.evaluation.video.by_frame import write_by_frame

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from worldline_core.config import validate
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_index import read_index
-from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import read_index
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from worldline_core.data.video import decode_video
+from worldline_core.data.video.decode import decode_video
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.exports.overlays import ARM_COLOURS
 from worldline_core.report.inspect import inspect

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.exports.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.filters.filter import filter_episodes

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.video import encode_video
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.recorder.corrupted import lerobot_v21
 
 

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.curate import curate
-from worldline_core.data.episode_index import read_quarantine
-from worldline_core.data.rejection import REASONS
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.guards.rejection import REASONS
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.recorder.corrupted import lerobot_v21

@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data import parquet_file
-from worldline_core.data.json_file import read_json, read_json_lines
-from worldline_core.data.npy_file import read_npy
-from worldline_core.data.parquet_file import column_names, read_table
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards import parquet_file
+from worldline_core.data.guards.json_file import read_json, read_json_lines
+from worldline_core.data.guards.npy_file import read_npy
+from worldline_core.data.guards.parquet_file import column_names, read_table
+from worldline_core.data.guards.rejection import RejectedInputError
 
 
 def npy_of(path: Path, shape: tuple[int, ...], content: bytes = b"\0" * 64, kind: str = "<f8") -> Path:

@@ -10,8 +10,8 @@ import pytest
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.hdf5 import open_hdf5
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards.hdf5 import open_hdf5
+from worldline_core.data.guards.rejection import RejectedInputError
 
 IMAGES = [bytes([n]) * (40 + n) for n in range(5)]
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from worldline_core.data.images import decode_image, image_size, read_image
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards.images import decode_image, image_size, read_image
+from worldline_core.data.guards.rejection import RejectedInputError
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8)
 

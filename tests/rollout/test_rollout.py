@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.tracks import write_index, write_shard
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.config import WorldModelConfig

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.scale import transient
 from worldline_core.scale.crashes import portable_message

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from object_store import BUCKET, ObjectStore
 
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import parse_location
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import parse_location
 from worldline_core.errors import ArtifactError
 from worldline_core.exports.publish import pull, push
 from worldline_core.exports.publish_content import FILE_LIST

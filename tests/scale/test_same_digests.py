@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from tasks.shard_mapper import shard_mapper
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_index import read_index, read_quarantine
-from worldline_core.data.episode_set import EpisodeSetWriter
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.episodes.episode_index import read_index, read_quarantine
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.scale.mapping import SerialMapper
@@ -169,7 +169,7 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
 def test_an_unforeseen_error_is_a_quarantined_episode(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from worldline_core.data import curate_shard
+    from worldline_core.data.curation import shard as curate_shard
 
     whole = curate_shard.check_episode
 
@@ -186,7 +186,7 @@ def test_an_unforeseen_error_is_a_quarantined_episode(
     evidence = json.loads(row.evidence)
     assert evidence["type"] == "ZeroDivisionError"
     assert evidence["trace"][-1].endswith("fails_on_one")
-    assert any(line.startswith("worldline_core/data/curate_shard.py:") for line in evidence["trace"])
+    assert any(line.startswith("worldline_core/data/curation/shard.py:") for line in evidence["trace"])
     assert str(tmp_path) not in row.evidence + row.detail
     assert "deadbeef" not in row.evidence + row.detail
 

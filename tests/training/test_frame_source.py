@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.model.tokenizer.pixels import frames_to_video
 from worldline_core.training.clip_input import FrameInput, LatentInput, ReadingConfig
@@ -237,7 +237,7 @@ def test_cached_latents_can_be_skipped_too(world: Any, tmp_path: Path) -> None:
 def test_an_explicit_torchcodec_that_cannot_load_stops_before_training(
     world: Any, tokenizer: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worldline_core.data.frame_decoder.torchcodec_fault", lambda: "OSError: libavcodec.so")
+    monkeypatch.setattr("worldline_core.data.video.frame_decoder.torchcodec_fault", lambda: "OSError: libavcodec.so")
     with pytest.raises(UnavailableError, match="torchcodec cannot be loaded"):
         open_source(world.episodes, tokenizer, decoder="torchcodec")
     assert open_source(world.episodes, tokenizer).description["decoder"].startswith("PyAV")

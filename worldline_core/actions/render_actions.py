@@ -15,8 +15,8 @@ from worldline_core.actions.render_config import RenderActionsConfig
 from worldline_core.actions.render_shard import RenderShard, note_crash, opened, render_shard, result_path
 from worldline_core.actions.track_counts import TrackCounts, add_counts
 from worldline_core.actions.tracks import ActionTracks, shard_name, write_index
-from worldline_core.data.episode_index import QuarantineRow, write_quarantine
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.contact_sheet import evenly_spaced
 from worldline_core.exports.overlay_views import overlay_sheet, write_overlay_video

@@ -14,9 +14,9 @@ from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.render_config import RenderActionsConfig
 from worldline_core.actions.track_counts import TrackCounts, add_counts
 from worldline_core.actions.tracks import shard_name, write_shard
-from worldline_core.data.episode import Episode
-from worldline_core.data.episode_index import EpisodeRow
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics

@@ -21,8 +21,8 @@ from worldline_core.calibration.doctor import diagnose, diagnose_set
 from worldline_core.calibration.findings import CalibrationCheck, Finding, SetFinding
 from worldline_core.calibration.listing import ListedEpisode, repairing_lines
 from worldline_core.calibration.pictures import diagnosis_picture
-from worldline_core.data.curate_checks import check_camera, check_times, check_values
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.curation.checks import check_camera, check_times, check_values
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import LoadedEpisode
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.exports.pictures import jpeg_bytes
@@ -30,7 +30,7 @@ from worldline_core.exports.rollout import safe_stem
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode import Episode
+    from worldline_core.data.episodes.episode import Episode
     from worldline_core.geometry.kinematics import ArmKinematics
 
 TIME_TOLERANCE_FRAMES = 0.25

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from worldline_core.data.conventions import RecordedConventions
+from worldline_core.data.episodes.conventions import RecordedConventions
 
 VerdictName = Literal["consistent", "explained", "unexplained", "too_little_evidence"]
 

@@ -17,9 +17,9 @@ from worldline_core.calibration.measures import notes_on, view_measures
 from worldline_core.calibration.observation import Observation, observe
 from worldline_core.calibration.pose_evidence import pose_terms, unrest_log_likelihood
 from worldline_core.calibration.reading import Reading, read
-from worldline_core.data.conventions import RecordedConventions
-from worldline_core.data.episode import Episode
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.geometry.kinematics import ArmKinematics
 
 __all__ = ["CalibrationDoctorConfig", "diagnose", "diagnose_set"]

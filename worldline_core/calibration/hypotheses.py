@@ -8,9 +8,9 @@ from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Observation
 from worldline_core.calibration.pose_evidence import rms_hand_eye, unrest_log_likelihood
 from worldline_core.calibration.reading import Reading
-from worldline_core.data.convention_needs import applicable
-from worldline_core.data.conventions import RecordedConventions
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.convention_needs import applicable
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.rigid import rigid_inverse
 
 _COMMON_SIZES = (

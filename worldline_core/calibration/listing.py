@@ -8,7 +8,7 @@ from pathlib import Path
 
 from worldline_core.calibration.diagnosis import Explanation
 from worldline_core.config.loader import apply_overrides, read_yaml, validate
-from worldline_core.data.conventions import RecordedConventions
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.sources.base import LoadedEpisode
 from worldline_core.errors import ConfigError, DataError
 
@@ -90,7 +90,7 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
         ConfigError: the file has no such section, or a mistake in it.
         DataError: a source cannot be opened.
     """
-    from worldline_core.data.curate_config import CurateConfig
+    from worldline_core.data.curation.config import CurateConfig
     from worldline_core.data.sources.open import open_source
 
     values = apply_overrides(read_yaml(path), overrides)
@@ -119,7 +119,7 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
     Raises:
         DataError: the folder holds no readable index.
     """
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     episodes = EpisodeSet.open(folder)
 

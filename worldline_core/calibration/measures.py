@@ -17,7 +17,7 @@ from worldline_core.calibration.image_evidence import (
 from worldline_core.calibration.observation import Observation
 from worldline_core.calibration.pose_evidence import in_view_share, mount_offset, principal_point_offset, rms_hand_eye
 from worldline_core.calibration.reading import Reading
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 
 _FOLLOWS = 3.0  # times as rigid
 _NOTICEABLE_M = 0.001

@@ -10,7 +10,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rigid import hand_eye_residual

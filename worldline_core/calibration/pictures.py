@@ -15,7 +15,7 @@ import torch
 
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, project_tools
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
-from worldline_core.data.conventions import along_tool_z, apply_conventions, image_frames
+from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced, pad
 from worldline_core.exports.labels import INK, MUTED, Picture, draw_tag, text_strip
@@ -24,8 +24,8 @@ from worldline_core.exports.overlays import OverlayStyle, draw_overlay
 
 if TYPE_CHECKING:
     from worldline_core.calibration.diagnosis import Diagnosis, ViewMeasures
-    from worldline_core.data.conventions import RecordedConventions
-    from worldline_core.data.episode import Episode
+    from worldline_core.data.episodes.conventions import RecordedConventions
+    from worldline_core.data.episodes.episode import Episode
     from worldline_core.geometry.kinematics import ArmKinematics
 
 TILE_HEIGHT = 256

@@ -7,7 +7,7 @@ import numpy as np
 from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Arm, Observation
 from worldline_core.calibration.reading import Reading
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.rigid import (
     hand_eye_residual,
     inside_image,

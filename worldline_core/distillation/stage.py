@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 
 from worldline_core.actions.tracks import ActionTracks
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance
 from worldline_core.distillation.config import DistillConfig
 from worldline_core.distillation.perceptual import PerceptualLoss

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldline_core.data.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import ArtifactError, DataError
 
 if TYPE_CHECKING:
     from worldline_core.actions.tracks import ActionTracks
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
 
 ROLLOUT_PREFIX = "rollouts."
@@ -30,7 +30,7 @@ class Recordings:
 
     @classmethod
     def open(cls, root: Path) -> Recordings:
-        from worldline_core.data.episode_set import EpisodeSet
+        from worldline_core.data.episodes.episode_set import EpisodeSet
 
         episodes = EpisodeSet.open(root)
         return cls(episodes, {row.episode_id: index for index, row in enumerate(episodes.rows)})

@@ -9,14 +9,14 @@ from typing import get_args
 
 import numpy as np
 
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.episode_set_writer import EpisodeSetWriter
-from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
-from worldline_core.data.mcap_io import write_episode_mcap
-from worldline_core.data.recorded_poses import with_rigid_poses
-from worldline_core.data.source_table import SOURCES_FILE
-from worldline_core.data.video import PixelFormat
-from worldline_core.data.view_recording import RecordedView
+from worldline_core.data.curation.source_table import SOURCES_FILE
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.recorded_poses import with_rigid_poses
+from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
+from worldline_core.data.mcap.io import write_episode_mcap
+from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS

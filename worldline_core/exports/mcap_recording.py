@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from worldline_core.data.mcap_io import write_rollout_mcap
+from worldline_core.data.mcap.io import write_rollout_mcap
 from worldline_core.exports.rerun_recording import RecordingContent
 
 

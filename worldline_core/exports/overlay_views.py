@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from worldline_core.data.video import encode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet
 from worldline_core.exports.labels import INK, PAPER, Picture, font, text_strip, text_width_px

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from worldline_core.data.curate_checks import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
-from worldline_core.data.episode_index import EpisodeRow
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.source_paths import inside
-from worldline_core.data.source_table import read_source_table
+from worldline_core.data.curation.checks import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
+from worldline_core.data.curation.source_table import read_source_table
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.atomic import atomic_path
 from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_file, folder_files

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldline_core.data.source_paths import inside
+from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
 from worldline_core.exports.publish_content import (
     FILE_LIST,

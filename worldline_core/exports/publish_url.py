@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from worldline_core.data.source_paths import inside
+from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError
 from worldline_core.exports.publish_content import (
     FILE_LIST,

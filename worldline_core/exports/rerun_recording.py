@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
     from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.data.episode import Episode
+    from worldline_core.data.episodes.episode import Episode
 
 Clip = NDArray[np.uint8]
 """`n h w 3` RGB frames."""

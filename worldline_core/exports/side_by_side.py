@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from worldline_core.data.video import encode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.exports.labels import text_strip
 from worldline_core.exports.pictures import Upscale, jpeg_bytes, scale_frames, scaled_size
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic

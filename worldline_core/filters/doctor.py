@@ -16,7 +16,7 @@ from pydantic import Field
 from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation
 from worldline_core.calibration.doctor import bad_terms, diagnose
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import UnavailableError
 from worldline_core.filters.verdict import Verdict, runs
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment

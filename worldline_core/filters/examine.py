@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.inspect_episode import Finding, inspect

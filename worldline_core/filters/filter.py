@@ -19,9 +19,9 @@ from typing import Any
 import pyarrow as pa
 from tqdm import tqdm
 
-from worldline_core.data.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.lerobot_v3 import write_table
+from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.lerobot.v3 import write_table
 from worldline_core.errors import DataError
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.filter_shard import (

@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from worldline_core.data.episode_parts import part_name
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_parts import part_name
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.filters.examine import examine
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.scale.crashes import crash_evidence, portable_message

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.filters.base_motion import changed_area, detect_base_motion
 from worldline_core.filters.blur import detect_blur
 from worldline_core.filters.calibration import (

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.filters.picture_faults import (
     blurred,
     brightened,

@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from worldline_core.data.episode import Episode
-from worldline_core.data.thumbnails import ViewThumbnails
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.filters.picture_statistics import PictureStatistics, picture_statistics
 from worldline_core.filters.static import range_speed

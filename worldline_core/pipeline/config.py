@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.actions.render_actions import RenderActionsConfig
 from worldline_core.config.base import StrictModel
-from worldline_core.data.curate_config import CurateConfig
+from worldline_core.data.curation.config import CurateConfig
 from worldline_core.distillation.distill import DistillConfig
 from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
 from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig

@@ -69,7 +69,7 @@ _STEPS = (
     Step(
         "curate",
         3,
-        "worldline_core.data.curate",
+        "worldline_core.data.curation.curate",
         "curate",
         "CurateConfig",
         (),

@@ -86,7 +86,7 @@ def record_banks(config: RecordBanksConfig, inputs: Mapping[str, Path], output: 
 
     Raises: UnavailableError without MuJoCo; DataError when a bank cannot be drawn.
     """
-    from worldline_core.data.episode_set import EpisodeSetWriter
+    from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 
     prepare_rendering()
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)

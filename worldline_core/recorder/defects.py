@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.recorder.episode_recorder import Recording
 
 DEFECTS_FILE = "injected_defects.json"

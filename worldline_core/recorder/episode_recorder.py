@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episode import Episode
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.recorder.controllers import plan_waypoints
 from worldline_core.recorder.inverse_kinematics import InverseKinematics

@@ -151,7 +151,7 @@ _RECORDERS: dict[str, Any] = {}
 
 def _record_job(task: tuple[Job, RecordConfig, Path]) -> tuple[str, str, str]:
     """Record one episode into the set's parts; runs in a worker process."""
-    from worldline_core.data.episode_set import EpisodeSetWriter
+    from worldline_core.data.episodes.episode_set import EpisodeSetWriter
     from worldline_core.recorder.defects import DEFECTS
     from worldline_core.recorder.episode_recorder import EpisodeRecorder
     from worldline_core.recorder.scene_model import FRAME_RATE
@@ -172,7 +172,7 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> tuple[str, str, str]:
     if job.defect is not None:
         recording = DEFECTS[job.defect](recording, np.random.default_rng((*job.entropy, 1)))
     if config.mcap:
-        from worldline_core.data.mcap_io import write_episode_mcap
+        from worldline_core.data.mcap.io import write_episode_mcap
 
         path = output / "mcap" / f"{job.episode_id}.mcap"
         write_episode_mcap(path, recording.episode, recording.frames, robot_masks=recording.robot_masks)
@@ -204,7 +204,7 @@ def record(config: RecordConfig, inputs: Mapping[str, Path], output: Path) -> di
 
     Raises: UnavailableError without MuJoCo; DataError when a task cannot be reached by an arm.
     """
-    from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+    from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
     from worldline_core.recorder.defects import DEFECTS_FILE
     from worldline_core.recorder.scene_model import FRAME_RATE
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.recorder.scene_model import SceneModel
 from worldline_core.recorder.scenes import Scene
 

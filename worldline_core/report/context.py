@@ -16,7 +16,7 @@ from worldline_core.report.video_scores import VideoScores
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.exports.labels import Picture
     from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -71,7 +71,7 @@ class ReportContext:
     @cached_property
     def episodes(self) -> EpisodeSet | None:
         """The filtered episodes, or the curated ones when there are no filtered ones."""
-        from worldline_core.data.episode_set import EpisodeSet
+        from worldline_core.data.episodes.episode_set import EpisodeSet
 
         folder = self.inputs.get("filter") or self.inputs.get("curate") or self.inputs.get("episodes")
         return None if folder is None else EpisodeSet.open(folder)

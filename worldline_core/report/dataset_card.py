@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
 from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.exports.pictures import jpeg_bytes

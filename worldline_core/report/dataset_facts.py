@@ -9,12 +9,18 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from worldline_core.data.curation_rules import CURATION_FILE
-from worldline_core.data.episode_index import INDEX_FILE, EpisodeRow, QuarantineRow, read_index, read_quarantine
-from worldline_core.data.instructions import RAW_INSTRUCTION
-from worldline_core.data.primary_view import PRIMARY_VIEW_REASON
-from worldline_core.data.source_table import SourceFacts, read_source_table
-from worldline_core.data.source_weights import WEIGHTS_FILE
+from worldline_core.data.curation.instructions import RAW_INSTRUCTION
+from worldline_core.data.curation.primary_view import PRIMARY_VIEW_REASON
+from worldline_core.data.curation.rules import CURATION_FILE
+from worldline_core.data.curation.source_table import SourceFacts, read_source_table
+from worldline_core.data.curation.source_weights import WEIGHTS_FILE
+from worldline_core.data.episodes.episode_index import (
+    INDEX_FILE,
+    EpisodeRow,
+    QuarantineRow,
+    read_index,
+    read_quarantine,
+)
 from worldline_core.report.artifacts import JsonObject, read_json, read_rows, read_table
 from worldline_core.report.inspect_pictures import linked_folder
 

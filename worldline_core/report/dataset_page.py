@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from worldline_core.data.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.report.markup import Child, Html, element, join, notice
 from worldline_core.report.page import asset
 

@@ -23,7 +23,7 @@ from worldline_core.report.filters_page import ReasonGroup, filters_page
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.filters.filter_config import FilterConfig
     from worldline_core.filters.inspect_episode import Finding
     from worldline_core.filters.verdict import Curve
@@ -77,7 +77,7 @@ class FilteredSet:
 
     @cached_property
     def episodes(self) -> EpisodeSet:
-        from worldline_core.data.episode_set import EpisodeSet
+        from worldline_core.data.episodes.episode_set import EpisodeSet
 
         return EpisodeSet.open(self.curated)
 

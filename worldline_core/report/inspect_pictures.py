@@ -21,7 +21,7 @@ from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
 
 PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
@@ -120,7 +120,7 @@ class Subject:
 
     @cached_property
     def episodes(self) -> EpisodeSet:
-        from worldline_core.data.episode_set import EpisodeSet
+        from worldline_core.data.episodes.episode_set import EpisodeSet
 
         if self.episodes_folder is None:
             raise ArtifactError("The episodes that this artifact belongs to are not known", where=self.folder)

@@ -13,7 +13,7 @@ from worldline_core.report.artifacts import read_rows
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
 
 SHEET_ROWS = 8

@@ -10,7 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from worldline_core.actions.tracks import ActionTracks
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.rollout.block_causal import BLOCK_SIZE
 from worldline_core.rollout.config import Job, RolloutConfig

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.frame_decoder import DecoderChoice
+from worldline_core.data.video.frame_decoder import DecoderChoice
 
 
 class ReadingConfig(StrictModel):

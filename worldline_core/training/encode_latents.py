@@ -29,8 +29,8 @@ from worldline_core.training.latent_store import (
 )
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_index import EpisodeRow
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_index import EpisodeRow
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
 
 class EncodeLatentsConfig(StrictModel):
@@ -139,7 +139,7 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     """
     from tqdm import tqdm
 
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.model.tokenizer.base import load_tokenizer
     from worldline_core.model.tokenizer.pixels import frames_to_video
 

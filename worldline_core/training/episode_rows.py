@@ -6,7 +6,7 @@ import logging
 from typing import Literal
 
 from worldline_core.actions.tracks import ActionTracks
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.training.clip_source import ClipRow, ClipSource
 

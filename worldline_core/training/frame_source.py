@@ -14,8 +14,8 @@ from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.frame_decoder import FrameDecoder, open_decoder
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
 from worldline_core.model.tokenizer.pixels import resize_frame

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from worldline_core.actions.tracks import ActionTracks
 from worldline_core.config.base import StrictModel
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.model.tokenizer.pixels import frames_to_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic

@@ -117,7 +117,7 @@ class TeacherFeatures:
     """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
 
     def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
-        from worldline_core.data.episode_set import EpisodeSet
+        from worldline_core.data.episodes.episode_set import EpisodeSet
 
         self.teacher = teacher
         self.episodes = EpisodeSet.open(episodes)

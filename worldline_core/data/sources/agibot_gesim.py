@@ -16,14 +16,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.conventions import along_tool_z
-from worldline_core.data.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.images import read_image
-from worldline_core.data.json_file import read_text
-from worldline_core.data.npy_file import read_npy
-from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
+from worldline_core.data.episodes.conventions import along_tool_z
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.guards.images import read_image
+from worldline_core.data.guards.json_file import read_text
+from worldline_core.data.guards.npy_file import read_npy
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
 from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.distortion import Distortion

@@ -19,13 +19,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.conventions import along_tool_z
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.hdf5 import Hdf5File, open_hdf5, require_h5py
-from worldline_core.data.json_file import read_json
-from worldline_core.data.recorded_poses import camera_pose, rejected_as, repair_notes
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, find_folders, inside
+from worldline_core.data.episodes.conventions import along_tool_z
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
+from worldline_core.data.guards.json_file import read_json
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_folders, inside
 from worldline_core.data.sources.agibot_gesim import (
     AGIBOT_CAMERAS,
     GRIPPER_COMMAND_RAW,
@@ -33,8 +33,8 @@ from worldline_core.data.sources.agibot_gesim import (
     TOOL_OFFSET_RAW_M,
 )
 from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
-from worldline_core.data.video import decode_video, video_size
-from worldline_core.data.video_clip import VideoClip
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.decode import decode_video, video_size
 from worldline_core.geometry.camera_pose import CameraPose
 from worldline_core.geometry.pose_formats import pose_from_quaternion_xyzw
 

@@ -11,12 +11,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.conventions import RecordedConventions
-from worldline_core.data.curate_checks import TRAINING_SPLITS
-from worldline_core.data.episode import Episode, Outcome, Split, TaskFamily
-from worldline_core.data.resize import Fit
-from worldline_core.data.source_paths import SourceFolder
-from worldline_core.data.video_clip import VideoClip, read_clip
+from worldline_core.data.curation.checks import TRAINING_SPLITS
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import Episode, Outcome, Split, TaskFamily
+from worldline_core.data.guards.source_paths import SourceFolder
+from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.resize import Fit
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.distortion import Distortion, DistortionModel
 

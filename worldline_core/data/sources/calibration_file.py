@@ -25,12 +25,12 @@ import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.episode import CameraTrack
-from worldline_core.data.json_file import read_json
-from worldline_core.data.limits import regular_file, too_large
-from worldline_core.data.recorded_poses import Extrinsics, camera_pose
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
+from worldline_core.data.guards.json_file import read_json
+from worldline_core.data.guards.limits import regular_file, too_large
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath
 from worldline_core.data.sources.base import LensConfig
 from worldline_core.geometry.camera_pose import CameraAxes, CameraPose
 from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz

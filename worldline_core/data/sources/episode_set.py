@@ -6,10 +6,10 @@ from collections import Counter
 from dataclasses import replace
 from typing import Literal
 
-from worldline_core.data.episode_set import EpisodeSet
-from worldline_core.data.recorded_poses import with_rigid_poses
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.recorded_poses import with_rigid_poses
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath
 from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
 
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.curate_checks import EVALUATION_ONLY, TRAINING_SPLITS, says_droid
-from worldline_core.data.episode import Episode
-from worldline_core.data.lerobot_v3 import LeRobotV3Dataset
-from worldline_core.data.lerobot_v21 import LeRobotV21Dataset
-from worldline_core.data.recorded_poses import repair_notes
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, fill_template, inside
+from worldline_core.data.curation.checks import EVALUATION_ONLY, TRAINING_SPLITS, says_droid
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.recorded_poses import repair_notes
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, inside
+from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
+from worldline_core.data.lerobot.v21 import LeRobotV21Dataset
 from worldline_core.data.sources.base import LoadedEpisode, no_masks
 from worldline_core.data.sources.calibration_file import (
     CalibratedView,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from worldline_core.data.source_paths import AnyPath, find_files, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, find_files, relative_name
 from worldline_core.data.sources.base import LoadedEpisode
 from worldline_core.data.sources.lerobot import LeRobotSource
 from worldline_core.data.sources.lerobot_config import LeRobotSourceConfig

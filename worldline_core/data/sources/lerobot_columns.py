@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import GripperRange
 from worldline_core.errors import ConfigError
 

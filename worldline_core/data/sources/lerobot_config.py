@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from worldline_core.data.curate_checks import TRAINING_SPLITS
+from worldline_core.data.curation.checks import TRAINING_SPLITS
 from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange
 from worldline_core.data.sources.lerobot_columns import ArmColumns
 

@@ -1,13 +1,13 @@
-"""MCAP files written by `worldline_core.data.mcap_io`, one episode a file."""
+"""MCAP files written by `worldline_core.data.mcap.io`, one episode a file."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Literal
 
-from worldline_core.data.mcap_reader import read_episode_id, read_episode_mcap
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.mcap.reader import read_episode_id, read_episode_mcap
 from worldline_core.data.sources.base import LoadedEpisode, SourceConfigBase
 from worldline_core.errors import DataError
 

@@ -7,12 +7,12 @@ or timed by another clock is written into the episode's conventions. See docs/mc
 
 from __future__ import annotations
 
-from worldline_core.data.mcap_topics.config import Markers, McapTopicsSourceConfig
-from worldline_core.data.mcap_topics.episode import read_episode
-from worldline_core.data.mcap_topics.episodes import Segment, segments
-from worldline_core.data.mcap_topics.file import McapFile
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.mcap.topics.config import Markers, McapTopicsSourceConfig
+from worldline_core.data.mcap.topics.episode import read_episode
+from worldline_core.data.mcap.topics.episodes import Segment, segments
+from worldline_core.data.mcap.topics.file import McapFile
 from worldline_core.data.sources.base import LoadedEpisode
 
 

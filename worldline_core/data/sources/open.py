@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from worldline_core.data.source_paths import AnyPath, exists
+from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
 from worldline_core.data.sources.base import EpisodeSource
@@ -20,7 +20,7 @@ from worldline_core.data.sources.repaired import RepairedSource
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
-from worldline_core.data.undistort import PinholeSource
+from worldline_core.data.video.undistort import PinholeSource
 from worldline_core.errors import DataError
 
 SourceConfig = Annotated[

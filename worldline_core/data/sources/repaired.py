@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldline_core.data.conventions import RecordedConventions, apply_conventions, image_frames
-from worldline_core.data.rejection import RejectedInputError
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
 
 

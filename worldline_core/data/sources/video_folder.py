@@ -16,15 +16,15 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.captions import caption_of, caption_table
-from worldline_core.data.episode import Episode
-from worldline_core.data.rejection import RejectedInputError
-from worldline_core.data.source_paths import AnyPath, find_files, inside, relative_name
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
 from worldline_core.data.sources.base import ForeignSourceConfig, LoadedEpisode, no_masks
+from worldline_core.data.sources.captions import caption_of, caption_table
 from worldline_core.data.sources.episode_names import printable, unique_names
-from worldline_core.data.video import decode_video, video_size
-from worldline_core.data.video_clip import VideoClip
-from worldline_core.data.video_times import frame_times
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.decode import decode_video, video_size
+from worldline_core.data.video.times import frame_times
 
 
 class CaptionTable(StrictModel):

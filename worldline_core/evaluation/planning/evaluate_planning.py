@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.vlm.config import VLMConfig
 from worldline_core.store.atomic import write_json_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_set import EpisodeRow
+    from worldline_core.data.episodes.episode_set import EpisodeRow
     from worldline_core.evaluation.planning.selector import CandidateVideo, Selector
     from worldline_core.evaluation.recordings import Recordings
 

@@ -16,7 +16,7 @@ from worldline_core.evaluation.statistics import Interval, bootstrap_mean
 from worldline_core.store.atomic import write_json_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_set import EpisodeRow
+    from worldline_core.data.episodes.episode_set import EpisodeRow
     from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
 
 DIRECT = "direct_execution"

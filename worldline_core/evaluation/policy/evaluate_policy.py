@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from worldline_core.config.base import StrictModel
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.evaluation.vlm.config import VLMConfig
 from worldline_core.store.atomic import write_json_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode import Episode
+    from worldline_core.data.episodes.episode import Episode
     from worldline_core.evaluation.policy.judge import Judge
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.evaluation.segmenters.unet import UNet
 
 HEAD = "head"
@@ -60,7 +60,7 @@ def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output:
     import torch
     from tqdm import tqdm
 
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.evaluation.segmenters.augmentation import augment
     from worldline_core.evaluation.segmenters.learned import save_segmenter
     from worldline_core.evaluation.segmenters.unet import UNet
@@ -129,7 +129,7 @@ def _load(
     episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] | None
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Every ``stride``-th head frame of a row and its exact masks, or None where it has no masks."""
-    from worldline_core.data.resize import resize_frames, resize_masks
+    from worldline_core.data.video.resize import resize_frames, resize_masks
 
     masks = episodes.robot_masks(index, HEAD)
     if masks is None:

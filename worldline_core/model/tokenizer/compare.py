@@ -75,7 +75,7 @@ def compare(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=Path, required=True)

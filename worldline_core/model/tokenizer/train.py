@@ -26,7 +26,7 @@ from worldline_core.model.tokenizer.refinement import Refinement
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 if TYPE_CHECKING:
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
 STATE = Path("run") / "decoder_state.pt"
 BASES = Path("run") / "bases"
@@ -225,7 +225,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     Returns:
         reconstruction metrics on held-out scenes.
     """
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     episodes = EpisodeSet.open(inputs["episodes"])
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.hdf5 import require_h5py
-from worldline_core.data.video import encode_video
+from worldline_core.data.guards.hdf5 import require_h5py
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.recorder.corrupted import files
 from worldline_core.recorder.corrupted.content import FPS, NUM_FRAMES, gripper_motion, joint_motion, pictures
 from worldline_core.recorder.corrupted.labels import Kind, Label

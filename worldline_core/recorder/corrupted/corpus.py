@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.episode_index import read_index, read_quarantine
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.episodes.episode_index import read_index, read_quarantine
 from worldline_core.recorder.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap, recordings
 from worldline_core.recorder.corrupted.labels import SECOND, Label
 from worldline_core.store.atomic import write_json_atomic

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.video import encode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.recorder.corrupted.content import FPS, gripper_motion, joint_motion, pictures
 from worldline_core.recorder.corrupted.labels import Kind, Label
 

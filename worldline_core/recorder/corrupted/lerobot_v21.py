@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from worldline_core.data.video import encode_video
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.recorder.corrupted import files
 from worldline_core.recorder.corrupted.content import FPS, NUM_FRAMES, gripper_motion, joint_motion, pictures
 from worldline_core.recorder.corrupted.labels import SECOND, Kind, Label, Stage

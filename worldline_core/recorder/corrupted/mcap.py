@@ -14,8 +14,8 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from worldline_core.data.episode import CameraTrack, Episode
-from worldline_core.data.mcap_io import write_episode_mcap
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.mcap.io import write_episode_mcap
 from worldline_core.recorder.corrupted import files
 from worldline_core.recorder.corrupted.content import (
     FPS,

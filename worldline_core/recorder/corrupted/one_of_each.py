@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from worldline_core.data.curate import curate
-from worldline_core.data.curate_config import CurateConfig
-from worldline_core.data.hdf5 import require_h5py
-from worldline_core.data.video import encode_video
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.guards.hdf5 import require_h5py
+from worldline_core.data.video.encoder import encode_video
 from worldline_core.recorder.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap
 from worldline_core.recorder.corrupted.content import FPS, HEIGHT, WIDTH, gripper_motion, joint_motion, pictures
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.recorder.corrupted.labels import Kind, Label
 from worldline_core.recorder.defects import DEFECTS_FILE, lagged_state

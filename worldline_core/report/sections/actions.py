@@ -19,7 +19,7 @@ from worldline_core.report.markup import Column, Html, element, figure, join, no
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.actions.tracks import ActionTracks
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
 TITLE = "Action maps"
 LATENT_PIXELS = 8

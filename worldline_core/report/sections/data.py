@@ -122,7 +122,7 @@ def sources(folder: Path) -> Html:
 
 def sheet(context: ReportContext, rows: Sequence[JsonObject]) -> Html:
     """A contact sheet: one episode an embodiment and task, six moments of its primary view."""
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     folder = context.inputs.get("curate") or context.inputs.get("filter") or context.inputs.get("episodes")
     if folder is None:

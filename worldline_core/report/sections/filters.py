@@ -136,7 +136,7 @@ def moments(context: ReportContext, curated: Path, item: Refusal) -> Picture:
     Raises:
         DataError: the set does not hold the episode, or cannot decode it.
     """
-    from worldline_core.data.episode_set import EpisodeSet
+    from worldline_core.data.episodes.episode_set import EpisodeSet
 
     episodes = EpisodeSet.open(curated)
     index = episodes.position(item.episode_id)

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from worldline_core.data.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError
 from worldline_core.exports.side_by_side import SideBySide, write_side_by_side
 from worldline_core.report.context import ReportContext, Section

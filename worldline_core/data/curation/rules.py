@@ -1,0 +1,202 @@
+"""Rules over the whole set, once every episode has been read: duplicates, scenes on both sides of the split, leaks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.fingerprint import Fingerprint
+from worldline_core.data.curation.near_duplicates import NearDuplicate, find_near_duplicates
+from worldline_core.data.curation.scene_leaks import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
+from worldline_core.data.episodes.episode_index import QuarantineRow
+from worldline_core.errors import DataError
+from worldline_core.store.atomic import write_json_atomic
+
+CURATION_FILE = "curation.json"
+
+
+class Described(Protocol):
+    """What the rules read of a waiting episode: the entries of its part.json."""
+
+    def __getitem__(self, key: str) -> Any: ...
+
+
+@dataclass(frozen=True)
+class CurationFindings:
+    """What the rules found.
+
+    Attributes:
+        rows: episodes to take out, in listed order. leaks: pairs of scenes that look like one across the split.
+    """
+
+    rows: tuple[QuarantineRow, ...]
+    leaks: tuple[SceneLeak, ...]
+    leakage_action: str
+
+    def as_json(self) -> dict[str, Any]:
+        counts: dict[str, int] = {}
+        for row in self.rows:
+            counts[row.reason] = counts.get(row.reason, 0) + 1
+        return {
+            "reasons": counts,
+            "scene_leaks": [leak.as_json() for leak in self.leaks],
+            "leakage_action": self.leakage_action,
+        }
+
+
+def select_episodes(config: CurateConfig, parts: Sequence[Described]) -> list[QuarantineRow]:
+    """Episodes that the rules over the whole set take out; see `curation_findings`."""
+    return list(curation_findings(config, parts).rows)
+
+
+def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> CurationFindings:
+    """Decide over all episodes at once.
+
+    Args:
+        parts: descriptions in the order in which the sources list them: of equal episodes the first is kept.
+
+    Raises: DataError when an episode has no fingerprint, a scene is both learnt from and tested on, or scenes leak and
+        the configuration refuses that.
+    """
+    prints = [_fingerprint(part) for part in parts]
+    rows: dict[int, QuarantineRow] = {}
+    first: dict[str, int] = {}
+    for position, seen in enumerate(prints):
+        original = first.setdefault(seen.digest, position)
+        if original != position:
+            rows[position] = _duplicate(parts, position, original)
+    left = [position for position in range(len(parts)) if position not in rows]
+    for found in find_near_duplicates([prints[position] for position in left], config.near_duplicates):
+        rows[left[found.position]] = _near_duplicate(parts, left, found)
+    kept = [position for position in range(len(parts)) if position not in rows]
+    check_scenes_disjoint([parts[position] for position in kept])
+    leaks = find_scene_leaks(
+        [_scene_view(parts[i], prints[i]) for i in kept if _has_primary(parts[i], prints[i])], config.leakage
+    )
+    if leaks and config.leakage.action == "refuse":
+        raise _refusal(leaks)
+    if config.leakage.action == "quarantine":
+        rows.update(_leaking(parts, kept, leaks))
+    return CurationFindings(tuple(rows[position] for position in sorted(rows)), tuple(leaks), config.leakage.action)
+
+
+def decided_findings(config: CurateConfig, parts: Sequence[Described], output: Path) -> CurationFindings:
+    """`curation_findings`, decided once: a run that is killed while episodes are taken out goes on by the same decision.
+
+    Also writes curation.json: counts by reason, and the scenes that look like one.
+    """
+    decision = output / "run" / "selection.json"
+    if decision.is_file():
+        stored = json.loads(decision.read_text())
+        findings = CurationFindings(
+            tuple(QuarantineRow(**row) for row in stored["rows"]),
+            tuple(SceneLeak(**leak) for leak in stored["scene_leaks"]),
+            stored["leakage_action"],
+        )
+    else:
+        findings = curation_findings(config, parts)
+        write_json_atomic(decision, findings.as_json() | {"rows": [asdict(row) for row in findings.rows]})
+    write_json_atomic(output / CURATION_FILE, findings.as_json())
+    return findings
+
+
+def check_scenes_disjoint(parts: Sequence[Described]) -> None:
+    """Raises: DataError when a scene that is trained or validated on is also tested on."""
+    scenes: dict[str, set[str]] = {}
+    for part in parts:
+        scenes.setdefault(part["split"], set()).add(part["scene"])
+    for learning in LEARNING:
+        for testing in TESTING:
+            shared = sorted(scenes.get(learning, set()) & scenes.get(testing, set()))
+            if shared:
+                raise DataError(
+                    f"Scenes are both in {learning} and in {testing}",
+                    where="curate.splits",
+                    expected="disjoint scenes",
+                    got=", ".join(shared[:10]) + (" ..." if len(shared) > 10 else ""),
+                    next_step="give each scene one split",
+                )
+
+
+def _fingerprint(part: Described) -> Fingerprint:
+    try:
+        stored = part["fingerprint"]
+    except KeyError:
+        stored = None
+    if not isinstance(stored, Mapping):
+        raise DataError(
+            "Episode has no fingerprint",
+            where=f"episode {part['episode_id']}",
+            expected="the fingerprint that curation leaves with each episode",
+            got="none",
+            next_step="remove the unfinished folder and curate again",
+        )
+    return Fingerprint.from_json(stored)
+
+
+def _row(part: Described, reason: str, detail: str, evidence: Mapping[str, Any]) -> QuarantineRow:
+    return QuarantineRow(part["episode_id"], part["source"], reason, detail, json.dumps(dict(evidence), sort_keys=True))
+
+
+def _duplicate(parts: Sequence[Described], position: int, original: int) -> QuarantineRow:
+    name = parts[original]["episode_id"]
+    evidence = {"duplicate_of": name} | _crossing(parts[position], parts[original])
+    return _row(parts[position], "duplicate", f"Same frames, states and actions as episode {name}", evidence)
+
+
+def _near_duplicate(parts: Sequence[Described], left: Sequence[int], found: NearDuplicate) -> QuarantineRow:
+    part, original = parts[left[found.position]], parts[left[found.original]]
+    evidence = {
+        "duplicate_of": original["episode_id"],
+        "compared_with": parts[left[found.compared_with]]["episode_id"],
+        "motion_overlap": None if found.motion_overlap is None else round(found.motion_overlap, 4),
+        "frame_distance_bits": round(found.frame_distance, 4),
+        "moving_distance": round(found.moving_distance, 4),
+    }
+    detail = f"The same recording as episode {original['episode_id']}, encoded or cut another way"
+    return _row(part, "near_duplicate", detail, evidence | _crossing(part, original))
+
+
+def _crossing(part: Described, original: Described) -> dict[str, Any]:
+    """Both splits, where a copy lies on the other side."""
+    if part["split"] == original["split"]:
+        return {}
+    return {"split": part["split"], "split_of_original": original["split"]}
+
+
+def _has_primary(part: Described, seen: Fingerprint) -> bool:
+    return part["primary_view"] in seen.views
+
+
+def _scene_view(part: Described, seen: Fingerprint) -> SceneView:
+    return SceneView(part["episode_id"], part["scene"], part["split"], seen.views[part["primary_view"]].first)
+
+
+def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[SceneLeak]) -> dict[int, QuarantineRow]:
+    """Learning episodes of scenes that are tested on under another name; what tests stays as it is."""
+    by_scene: dict[str, SceneLeak] = {}
+    for leak in sorted(leaks, key=lambda leak: (leak.distance, leak.testing_scene)):
+        by_scene.setdefault(leak.learning_scene, leak)
+    rows: dict[int, QuarantineRow] = {}
+    for position in kept:
+        part = parts[position]
+        leak = by_scene.get(part["scene"])
+        if leak is not None and part["split"] in LEARNING:
+            detail = f"Scene {leak.learning_scene} looks like scene {leak.testing_scene}, which is tested on"
+            rows[position] = _row(part, "scene_leak", detail, leak.as_json())
+    return rows
+
+
+def _refusal(leaks: Sequence[SceneLeak]) -> DataError:
+    named = [f"{leak.learning_scene} ~ {leak.testing_scene} ({leak.distance} bits)" for leak in leaks]
+    return DataError(
+        "Scenes that are learnt from look like scenes that are tested on",
+        where="curate.leakage",
+        expected="no two scenes across the split whose first images are alike",
+        got=", ".join(named[:10]) + (" ..." if len(named) > 10 else ""),
+        next_step="give both names one split in curate.splits, or set curate.leakage.action to quarantine or report",
+    )

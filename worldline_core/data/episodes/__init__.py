@@ -1,0 +1,1 @@
+"""Episodes and the sets they form: the contract between recordings and everything else."""

@@ -1,0 +1,322 @@
+"""How a source wrote its numbers where it departs from the contract, how to undo that, and how to do it on purpose.
+
+The contract (`worldline_core.data.episodes.episode`): `T_base_camera` maps camera points to base, cameras have OpenCV axes, metres,
+radians, quaternions xyzw, state blocks left then right, tool poses between the fingertips, K at the image's own size,
+all arrays of one frame from one instant, gripper 0 closed .. 1 open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from worldline_core.config.base import StrictModel
+from worldline_core.data.episodes.convention_needs import arm_blocks, check_applicable
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.geometry.pose_formats import (
+    quaternion_wxyz_from_rotation,
+    reread_as_moving,
+    reread_as_wxyz,
+    rotation_from_quaternion_wxyz,
+    written_as_moving,
+    written_as_wxyz,
+)
+from worldline_core.geometry.rigid import rigid_inverse
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class RecordedConventions(StrictModel):
+    """How a source wrote its numbers where it departs from the contract; the default says: as the contract.
+
+    One field for each usual mistake; each is the config line that repairs it.
+    """
+
+    extrinsics: Literal["camera_to_base", "base_to_camera"] = Field(
+        default="camera_to_base", description="what the recorded camera matrices map"
+    )
+    camera_axes: Literal["opencv", "opengl"] = Field(
+        default="opencv", description="opencv: x right, y down, z forward; opengl: x right, y up, z backward"
+    )
+    extrinsics_unit: Literal["m", "mm"] = "m"
+    pose_unit: Literal["m", "mm"] = Field(default="m", description="of recorded tool poses")
+    quaternion: Literal["xyzw", "wxyz"] = Field(default="xyzw", description="order in recorded tool poses")
+    euler: Literal["fixed_xyz", "moving_xyz"] = Field(
+        default="fixed_xyz", description="what roll, pitch, yaw turn about: R = Rz Ry Rx (fixed) or Rx Ry Rz (moving)"
+    )
+    angle_unit: Literal["rad", "deg"] = Field(default="rad", description="of recorded joint positions")
+    arms: Literal["as_written", "exchanged"] = Field(
+        default="as_written", description="exchanged: the state's left block is the right arm's, and the reverse"
+    )
+    tool_offset_z_m: float = Field(
+        default=0.0, ge=-1, le=1, description="from the recorded tool poses to the fingertips, along the tool's +z"
+    )
+    intrinsics_size: tuple[int, int] | None = Field(
+        default=None, description="(height, width) of the image that K belongs to; null: the recorded image's"
+    )
+    camera_lag_frames: int = Field(
+        default=0, ge=-100, le=100, description="camera poses trail the states by so many frames"
+    )
+    image_lag_frames: int = Field(default=0, ge=-100, le=100, description="images trail the states by so many frames")
+    gripper: Literal["as_written", "inverted"] = Field(default="as_written", description="inverted: 1 means closed")
+    views: tuple[str, ...] | None = Field(
+        default=None,
+        description="views that extrinsics, camera_axes, extrinsics_unit and intrinsics_size speak of; null: all",
+    )
+
+    @model_validator(mode="after")
+    def _positive_size(self) -> RecordedConventions:
+        if self.intrinsics_size is not None and min(self.intrinsics_size) < 1:
+            raise ValueError(f"intrinsics_size {self.intrinsics_size} is no image size")
+        return self
+
+    @property
+    def departures(self) -> tuple[str, ...]:
+        """Names of the fields that differ from the contract, without `views`."""
+        default = RecordedConventions()
+        return tuple(
+            name
+            for name in type(self).model_fields
+            if name != "views" and getattr(self, name) != getattr(default, name)
+        )
+
+    def config_lines(self, prefix: str = "curate.sources[].conventions") -> tuple[str, ...]:
+        """The lines that a configuration needs for a source which writes like this."""
+        lines = []
+        for name in (*self.departures, *(("views",) if self.views is not None and self.departures else ())):
+            value = getattr(self, name)
+            text = f"[{', '.join(str(v) for v in value)}]" if isinstance(value, tuple) else str(value)
+            lines.append(f"{prefix}.{name}: {text}")
+        return tuple(lines)
+
+
+def image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
+    """Which recorded images belong to the frames of the repaired episode, in order."""
+    first, last = _kept(num_frames, conventions)
+    return slice(first + conventions.image_lag_frames, last + conventions.image_lag_frames)
+
+
+def corrupted_image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
+    """Which images of a healthy episode belong to the frames of `corrupt(episode, conventions)`, in order."""
+    first, last = _kept(num_frames, _backwards(conventions))
+    return slice(first - conventions.image_lag_frames, last - conventions.image_lag_frames)
+
+
+def apply_conventions(episode: Episode, conventions: RecordedConventions) -> Episode:
+    """The episode in the contract's conventions, from one whose numbers were read as they were written.
+
+    A lag of k frames loses k frames: of state i the camera pose is read at i + camera_lag_frames and the image at i +
+    image_lag_frames (`image_frames` says which images remain).
+
+    Raises:
+        RejectedInputError (convention_not_applicable): the episode has nothing that a departing field speaks of, for
+            example a quaternion order where no tool poses are recorded; (too_short): a lag leaves fewer than two frames.
+    """
+    check_applicable(episode, conventions.departures)
+    episode = _shift(episode, conventions)
+    episode = replace(episode, cameras={v: _repair_camera(c, conventions) for v, c in episode.cameras.items()})
+    if conventions.angle_unit == "deg":
+        episode = _scale_joints(episode, np.pi / 180)
+    offset = _source_offset(episode)
+    poses = episode.T_base_ee
+    if poses is not None:
+        poses = along_tool_z(poses, -offset)
+        poses = _scaled(poses, 1e-3 if conventions.pose_unit == "mm" else 1.0)
+        if conventions.quaternion == "wxyz":
+            poses = _rotated(poses, reread_as_wxyz(poses[..., :3, :3]))
+        if conventions.euler == "moving_xyz":
+            poses = _rotated(poses, reread_as_moving(poses[..., :3, :3]))
+        poses = along_tool_z(poses, offset + conventions.tool_offset_z_m)
+        episode = replace(episode, T_base_ee=poses)
+    episode = _pose_columns(episode, conventions, undo=True)
+    if conventions.arms == "exchanged":
+        episode = _exchange_arms(episode)
+    return _invert_gripper(episode) if conventions.gripper == "inverted" else episode
+
+
+def corrupt(episode: Episode, conventions: RecordedConventions) -> Episode:
+    """The reverse: a healthy episode as a source with these conventions would hand it over, read as the contract.
+
+    `apply_conventions(corrupt(e, c), c)` is e, up to rounding and to the frames that a lag loses at the ends;
+    `corrupted_image_frames` says which images go with it.
+
+    Raises: RejectedInputError as `apply_conventions`.
+    """
+    check_applicable(episode, conventions.departures)
+    if conventions.gripper == "inverted":
+        episode = _invert_gripper(episode)
+    if conventions.arms == "exchanged":
+        episode = _exchange_arms(episode)
+    episode = _pose_columns(episode, conventions, undo=False)
+    offset = _source_offset(episode)
+    poses = episode.T_base_ee
+    if poses is not None:
+        poses = along_tool_z(poses, -offset - conventions.tool_offset_z_m)
+        if conventions.euler == "moving_xyz":
+            poses = _rotated(poses, written_as_moving(poses[..., :3, :3]))
+        if conventions.quaternion == "wxyz":
+            poses = _rotated(poses, written_as_wxyz(poses[..., :3, :3]))
+        poses = _scaled(poses, 1e3 if conventions.pose_unit == "mm" else 1.0)
+        episode = replace(episode, T_base_ee=along_tool_z(poses, offset))
+    if conventions.angle_unit == "deg":
+        episode = _scale_joints(episode, 180 / np.pi)
+    episode = replace(episode, cameras={v: _corrupt_camera(c, conventions) for v, c in episode.cameras.items()})
+    return _shift(episode, _backwards(conventions))
+
+
+def along_tool_z(poses: np.ndarray, offset_m: float) -> np.ndarray:
+    """Poses (..., 4, 4) moved along their own +z."""
+    moved = poses.copy()
+    moved[..., :3, 3] += offset_m * poses[..., :3, 2]
+    return moved
+
+
+def _repair_camera(camera: CameraTrack, conventions: RecordedConventions) -> CameraTrack:
+    if conventions.views is not None and camera.view not in conventions.views:
+        return camera
+    poses = _scaled(camera.T_base_camera, 1e-3 if conventions.extrinsics_unit == "mm" else 1.0)
+    poses = rigid_inverse(poses) if conventions.extrinsics == "base_to_camera" else poses
+    poses = poses @ _OPENGL if conventions.camera_axes == "opengl" else poses
+    K = camera.K
+    if conventions.intrinsics_size is not None:
+        height, width = conventions.intrinsics_size
+        K = replace(camera, width=width, height=height).resized(camera.width, camera.height).K
+    return replace(camera, K=K, T_base_camera=poses)
+
+
+def _corrupt_camera(camera: CameraTrack, conventions: RecordedConventions) -> CameraTrack:
+    if conventions.views is not None and camera.view not in conventions.views:
+        return camera
+    K = camera.K
+    if conventions.intrinsics_size is not None:
+        height, width = conventions.intrinsics_size
+        K = camera.resized(width, height).K
+    poses = camera.T_base_camera
+    poses = poses @ _OPENGL if conventions.camera_axes == "opengl" else poses
+    poses = rigid_inverse(poses) if conventions.extrinsics == "base_to_camera" else poses
+    poses = _scaled(poses, 1e3 if conventions.extrinsics_unit == "mm" else 1.0)
+    return replace(camera, K=K, T_base_camera=poses)
+
+
+def _backwards(conventions: RecordedConventions) -> RecordedConventions:
+    return RecordedConventions(
+        camera_lag_frames=-conventions.camera_lag_frames, image_lag_frames=-conventions.image_lag_frames
+    )
+
+
+def _kept(num_frames: int, conventions: RecordedConventions) -> tuple[int, int]:
+    """First and end (exclusive) of the state frames for which camera pose and image exist."""
+    lags = (0, conventions.camera_lag_frames, conventions.image_lag_frames)
+    return max(0, -min(lags)), num_frames - max(0, *lags)
+
+
+def _shift(episode: Episode, conventions: RecordedConventions) -> Episode:
+    """State i with the camera pose of i + camera_lag_frames; frames without one are cut."""
+    if conventions.camera_lag_frames == 0 and conventions.image_lag_frames == 0:
+        return episode
+    first, last = _kept(episode.num_frames, conventions)
+    if last - first < 2:
+        raise RejectedInputError(
+            "too_short",
+            "A lag leaves fewer than two frames",
+            where=f"episode {episode.episode_id}",
+            expected="an episode longer than its lag",
+            got=f"{episode.num_frames} frames, lags {conventions.camera_lag_frames}, {conventions.image_lag_frames}",
+        )
+    lag = conventions.camera_lag_frames
+    cameras = {view: camera.cut(first + lag, last + lag) for view, camera in episode.cameras.items()}
+    cut = episode.cut(first, last)
+    with_images = None
+    if episode.video_frames is not None:
+        images = image_frames(episode.num_frames, conventions)
+        with_images = max(0, min(episode.video_frames, images.stop) - images.start)
+    return replace(cut, cameras=cameras, video_frames=with_images)
+
+
+def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+    if scale == 1.0:
+        return poses
+    result = poses.copy()
+    result[..., :3, 3] *= scale
+    return result
+
+
+def _rotated(poses: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    result = poses.copy()
+    result[..., :3, :3] = rotation
+    return result
+
+
+def _source_offset(episode: Episode) -> float:
+    """Offset along z that the source's reader already added to the recorded poses [m]."""
+    value = episode.conventions.get("tool_offset_m", 0.0)
+    return float(value)
+
+
+def _scale_joints(episode: Episode, scale: float) -> Episode:
+    grippers = {block[-1] for block in arm_blocks(episode)}
+    joints = [i for i in range(episode.state.shape[1]) if i not in grippers]
+    state, action = episode.state.copy(), episode.action.copy()
+    state[:, joints] *= scale
+    action[:, joints] *= scale
+    return replace(episode, state=state, action=action)
+
+
+def _exchange_arms(episode: Episode) -> Episode:
+    first, second = arm_blocks(episode)
+    order = [*second, *first]
+    return replace(
+        episode,
+        state=episode.state[:, order],
+        action=episode.action[:, order],
+        T_base_ee=None if episode.T_base_ee is None else episode.T_base_ee[:, ::-1],
+        gripper=None if episode.gripper is None else episode.gripper[:, ::-1],
+    )
+
+
+def _invert_gripper(episode: Episode) -> Episode:
+    columns = [block[-1] for block in arm_blocks(episode)]
+    state, action = episode.state.copy(), episode.action.copy()
+    state[:, columns] = 1 - state[:, columns]
+    action[:, columns] = 1 - action[:, columns]
+    return replace(
+        episode, state=state, action=action, gripper=None if episode.gripper is None else 1 - episode.gripper
+    )
+
+
+def _pose_columns(episode: Episode, conventions: RecordedConventions, *, undo: bool) -> Episode:
+    """The same for the pose columns (x y z qx qy qz qw a block) of a state of tool poses."""
+    changes = (conventions.pose_unit == "mm", conventions.quaternion == "wxyz", conventions.euler == "moving_xyz")
+    if episode.state_kind != "ee_pose" or not any(changes):
+        return episode
+    names = episode.state_names or ()
+    arrays = []
+    for values in (episode.state, episode.action):
+        result = values.astype(np.float64)
+        for block in arm_blocks(episode):
+            column = {names[i].rsplit("/", 1)[-1]: i for i in block}
+            if changes[0]:
+                result[:, [column[axis] for axis in "xyz" if axis in column]] *= 1e-3 if undo else 1e3
+            if all(name in column for name in ("qx", "qy", "qz", "qw")):
+                xyzw = [column[name] for name in ("qx", "qy", "qz", "qw")]
+                result[:, xyzw] = _requaternion(result[:, xyzw], changes[1], changes[2], undo=undo)
+        arrays.append(result.astype(values.dtype))
+    return replace(episode, state=arrays[0], action=arrays[1])
+
+
+def _requaternion(xyzw: np.ndarray, reorder: bool, moving: bool, *, undo: bool) -> np.ndarray:
+    if moving and not undo:
+        xyzw = _turned(xyzw, written_as_moving)
+    if reorder:
+        xyzw = np.roll(xyzw, -1 if undo else 1, axis=-1)
+    return _turned(xyzw, reread_as_moving) if moving and undo else xyzw
+
+
+def _turned(xyzw: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    rotation = rotation_from_quaternion_wxyz(np.roll(xyzw, 1, axis=-1))
+    return np.roll(quaternion_wxyz_from_rotation(change(rotation)), -1, axis=-1)

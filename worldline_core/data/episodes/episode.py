@@ -1,0 +1,239 @@
+"""One recorded episode: what the robot did, when, and where its cameras were.
+
+Frames of reference: `base` is the robot base of the embodiment; camera frames follow OpenCV (x right, y down, z
+forward). Units: metres, radians, seconds, pixels. Gripper opening: 0 closed .. 1 open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.errors import DataError
+from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.geometry.image_transforms import ImageTransform
+
+VIEWS = ("head", "left_wrist", "right_wrist")
+TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
+Outcome = Literal["success", "failure", "unknown"]
+Split = Literal["train", "validation", "test", "ood_test", "bank"]
+StateKind = Literal["joints", "ee_pose", "none"]
+
+
+@dataclass(frozen=True)
+class CameraTrack:
+    """Pinhole camera of one view.
+
+    Attributes:
+        K: (3, 3) float64, pixels at width x height.
+        T_base_camera: (N, 4, 4) float64 for a moving camera or (1, 4, 4) for a fixed one; maps camera points to base.
+    """
+
+    view: str
+    K: np.ndarray
+    T_base_camera: np.ndarray
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.K.shape != (3, 3):
+            raise DataError(
+                "Camera matrix has a wrong shape", where=self.view, expected="(3, 3)", got=str(self.K.shape)
+            )
+        shape = self.T_base_camera.shape
+        if len(shape) != 3 or shape[1:] != (4, 4) or shape[0] < 1:
+            raise DataError(
+                "Camera poses have a wrong shape", where=self.view, expected="(N or 1, 4, 4)", got=str(shape)
+            )
+
+    @classmethod
+    def from_pose(cls, view: str, K: np.ndarray, pose: CameraPose, *, width: int, height: int) -> CameraTrack:
+        """From a pose that says its convention; what every reader of foreign calibration uses."""
+        return cls(view, K, pose.T_base_camera, width, height)
+
+    @property
+    def moving(self) -> bool:
+        return self.T_base_camera.shape[0] > 1
+
+    def poses(self, frames: Sequence[int] | np.ndarray | slice) -> np.ndarray:
+        """T_base_camera (len, 4, 4) at frame numbers; a fixed camera repeats its pose.
+
+        Raises: DataError for a frame past the end of a moving camera's track.
+        """
+        if isinstance(frames, slice):
+            if not self.moving:
+                raise DataError(
+                    "A slice of frames needs a moving camera", where=self.view, next_step="pass frame numbers"
+                )
+            return self.T_base_camera[frames]
+        index = np.asarray(frames, dtype=np.int64)
+        if not self.moving:
+            return np.repeat(self.T_base_camera, len(index), axis=0)
+        if len(index) and (index.min() < 0 or index.max() >= len(self.T_base_camera)):
+            raise DataError(
+                "Frame outside of the camera track",
+                where=self.view,
+                expected=f"0..{len(self.T_base_camera) - 1}",
+                got=f"{index.min()}..{index.max()}",
+            )
+        return self.T_base_camera[index]
+
+    def resized(self, width: int, height: int) -> CameraTrack:
+        """The same camera at another image size; K follows the resize.
+
+        Pixel centres lie at integer coordinates, so u' = (u + 1/2) s - 1/2.
+        """
+        return self.transformed(ImageTransform.of((self.height, self.width)).resize((height, width)))
+
+    def transformed(self, transform: ImageTransform) -> CameraTrack:
+        """The same camera with its image resized, cropped, padded or letterboxed; K follows."""
+        height, width = transform.image_size
+        return replace(self, K=transform.intrinsics(self.K), width=width, height=height)
+
+    def cut(self, start: int, stop: int, step: int = 1) -> CameraTrack:
+        """The camera over frames start..stop (exclusive), every `step`-th."""
+        return replace(self, T_base_camera=self.T_base_camera[start:stop:step]) if self.moving else self
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Arrays and description of one episode; images live apart.
+
+    Attributes:
+        state, action: (N, J) float32. With state_kind "joints": for each arm in order (left, right; a single arm is
+            right) joint positions [rad] then gripper opening. With "ee_pose": xyz [m], quaternion xyzw, gripper. With
+            "none" (plain videos, for Stage I alone): no columns, (N, 0).
+        action: commanded targets, same layout.
+        timestamps: (N,) float64 seconds from the first frame.
+        cameras: by view; empty when a source publishes no calibration.
+        T_base_ee: (N, A, 4, 4) tool poses (between the fingertips, +z out of the gripper) where a source records
+            them; None where they come from kinematics.
+        gripper: (N, A) opening, given together with T_base_ee.
+        state_names: (J,) names of the state columns.
+        video_frames: number of leading frames with images (None: all N). Some samples publish more states than images.
+        conventions: units and frames as the source declares them, and notes such as counted gripper overshoot.
+    """
+
+    episode_id: str
+    source: str
+    embodiment: str
+    scene: str
+    task_family: str
+    instruction: str
+    outcome: str
+    split: str
+    fps: float
+    state: np.ndarray
+    action: np.ndarray
+    timestamps: np.ndarray
+    cameras: dict[str, CameraTrack] = field(default_factory=dict)
+    bank: str | None = None
+    candidate: int | None = None
+    T_base_ee: np.ndarray | None = None
+    gripper: np.ndarray | None = None
+    primary_view: str = "head"
+    state_names: tuple[str, ...] | None = None
+    state_kind: str = "joints"
+    video_frames: int | None = None
+    conventions: Mapping[str, str | float | int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        where = f"episode {self.episode_id}"
+        num_frames = len(self.timestamps)
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise RejectedInputError(
+                "wrong_fps", "Frame rate is no rate", where=where, expected="frames a second", got=repr(self.fps)
+            )
+        if self.state.ndim != 2 or len(self.state) != num_frames or num_frames == 0:
+            raise DataError(
+                "State has a wrong shape",
+                where=where,
+                expected=f"({num_frames} > 0, J)",
+                got=str(self.state.shape),
+            )
+        if self.action.shape != self.state.shape:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Action and state differ in shape",
+                where=where,
+                expected=str(self.state.shape),
+                got=str(self.action.shape),
+            )
+        if self.state_names is not None and len(self.state_names) != self.state.shape[1]:
+            raise DataError(
+                "State names do not match the state",
+                where=where,
+                expected=str(self.state.shape[1]),
+                got=str(len(self.state_names)),
+            )
+        for view, camera in self.cameras.items():
+            if camera.moving and len(camera.T_base_camera) != num_frames:
+                raise RejectedInputError(
+                    "length_mismatch",
+                    "Camera track and states differ in length",
+                    where=f"{where}, view {view}",
+                    expected=f"{num_frames} (or 1) poses",
+                    got=f"{len(camera.T_base_camera)} poses",
+                )
+        if self.video_frames is not None and not 0 <= self.video_frames <= num_frames:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Images and states differ in number",
+                where=where,
+                expected=f"0..{num_frames} images",
+                got=self.video_frames,
+            )
+        if self.T_base_ee is not None and (self.T_base_ee.ndim != 4 or self.T_base_ee.shape[0] != num_frames):
+            raise DataError(
+                "Tool poses have a wrong shape",
+                where=where,
+                expected=f"({num_frames}, A, 4, 4)",
+                got=str(self.T_base_ee.shape),
+            )
+        for name, value, allowed in (
+            ("task_family", self.task_family, get_args(TaskFamily)),
+            ("outcome", self.outcome, get_args(Outcome)),
+            ("split", self.split, get_args(Split)),
+            ("state_kind", self.state_kind, get_args(StateKind)),
+        ):
+            if value not in allowed:
+                raise DataError(f"Unknown {name}", where=where, expected=" | ".join(allowed), got=repr(value))
+
+        if (self.state_kind == "none") != (self.state.shape[1] == 0):
+            raise DataError(
+                "State has no columns" if self.state.shape[1] == 0 else "State has columns, but is said to be none",
+                where=where,
+                expected="state_kind none for an episode without states, and only for one",
+                got=f"state_kind {self.state_kind}, state {self.state.shape}",
+            )
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def num_video_frames(self) -> int:
+        return self.num_frames if self.video_frames is None else self.video_frames
+
+    def cut(self, start: int, stop: int, step: int = 1) -> Episode:
+        """The episode over frames start..stop (exclusive), every `step`-th; time starts at 0 again."""
+        times = self.timestamps[start:stop:step]
+        with_images = max(0, min(stop, self.num_video_frames) - start)
+        return replace(
+            self,
+            fps=self.fps / step,
+            state=self.state[start:stop:step],
+            action=self.action[start:stop:step],
+            timestamps=times - times[0],
+            cameras={view: camera.cut(start, stop, step) for view, camera in self.cameras.items()},
+            T_base_ee=None if self.T_base_ee is None else self.T_base_ee[start:stop:step],
+            gripper=None if self.gripper is None else self.gripper[start:stop:step],
+            video_frames=None if self.video_frames is None else -(-with_images // step),
+        )

@@ -1,0 +1,166 @@
+"""Rows of an EpisodeSet's index and quarantine tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import is_file
+from worldline_core.data.lerobot.v3 import write_table
+
+INDEX_FILE = "index.parquet"
+QUARANTINE_FILE = "quarantine.parquet"
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """One episode, or a kept segment of one.
+
+    Attributes:
+        dataset: folder of the LeRobot dataset, relative to the set; may lie in another artifact.
+        start, stop: frames of the stored episode that this row covers, stop exclusive.
+        num_frames: stop - start. video_frames: how many of them, from the first on, have images.
+        stage2_reason: why not stage2_ok.
+        stage1_ok, stage2_ok: whether the row may enter action-free, respectively three-view action-conditioned, training.
+        conventions: JSON of what the source declared.
+    """
+
+    episode_id: str
+    dataset: str
+    episode_index: int
+    start: int
+    stop: int
+    num_frames: int
+    video_frames: int
+    fps: float
+    source: str
+    embodiment: str
+    scene: str
+    task_family: str
+    instruction: str
+    outcome: str
+    split: str
+    views: tuple[str, ...]
+    bank: str | None
+    candidate: int | None
+    primary_view: str
+    stage1_ok: bool = True
+    stage2_ok: bool = True
+    stage2_reason: str | None = None
+    conventions: str = "{}"
+
+
+_INDEX = pa.schema(
+    [
+        ("episode_id", pa.string()),
+        ("dataset", pa.string()),
+        ("episode_index", pa.int64()),
+        ("start", pa.int64()),
+        ("stop", pa.int64()),
+        ("num_frames", pa.int64()),
+        ("video_frames", pa.int64()),
+        ("fps", pa.float64()),
+        ("source", pa.string()),
+        ("embodiment", pa.string()),
+        ("scene", pa.string()),
+        ("task_family", pa.string()),
+        ("instruction", pa.string()),
+        ("outcome", pa.string()),
+        ("split", pa.string()),
+        ("views", pa.list_(pa.string())),
+        ("bank", pa.string()),
+        ("candidate", pa.int64()),
+        ("primary_view", pa.string()),
+        ("stage1_ok", pa.bool_()),
+        ("stage2_ok", pa.bool_()),
+        ("stage2_reason", pa.string()),
+        ("conventions", pa.string()),
+    ]
+)
+_OPTIONAL = ("stage1_ok", "stage2_ok", "stage2_reason", "conventions")
+_NULLABLE = ("bank", "candidate", "stage2_reason")
+_QUARANTINE = pa.schema([(name, pa.string()) for name in ("episode_id", "source", "reason", "detail", "evidence")])
+
+
+@dataclass(frozen=True)
+class QuarantineRow:
+    """An input that did not get through, why, and the numbers that show it (`evidence` is JSON)."""
+
+    episode_id: str
+    source: str
+    reason: str
+    detail: str
+    evidence: str = "{}"
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        return json.loads(self.evidence)
+
+
+def write_index(root: Path, rows: Iterable[EpisodeRow]) -> None:
+    """Write index.parquet."""
+    listed = [asdict(row) | {"views": list(row.views)} for row in rows]
+    write_table(root / INDEX_FILE, pa.Table.from_pylist(listed, schema=_INDEX))
+
+
+def read_index(root: Path) -> list[EpisodeRow]:
+    """Rows of index.parquet; equal texts are one object.
+
+    Raises: DataError when the file or a column is missing, or holds values of another kind.
+    """
+    path = root / INDEX_FILE
+    table = read_table(path)
+    missing = [name for name in _INDEX.names if name not in table.column_names and name not in _OPTIONAL]
+    if missing:
+        raise RejectedInputError(
+            "missing_column",
+            "Index lacks a column",
+            where=str(path),
+            expected=", ".join(missing),
+            got=", ".join(table.column_names),
+        )
+    names = [name for name in _INDEX.names if name in table.column_names]
+    try:
+        table = table.select(names).cast(pa.schema([_INDEX.field(name) for name in names]))
+    except (pa.ArrowException, ValueError) as error:
+        raise RejectedInputError(
+            "unreadable", "Index holds values of another kind", where=str(path), got=str(error)
+        ) from error
+    empty = [name for name in names if name not in _NULLABLE and table[name].null_count]
+    if empty:
+        raise RejectedInputError(
+            "unreadable", "Index has empty fields", where=str(path), expected="a value", got=", ".join(empty)
+        )
+    columns = {name: _shared_values(table[name]) for name in names}
+    return [EpisodeRow(**dict(zip(names, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+
+
+def _shared_values(column: pa.ChunkedArray) -> list[Any]:
+    """Python values of a column; equal texts, and equal lists of views, are one object each."""
+    if pa.types.is_string(column.type):
+        encoded = column.combine_chunks().dictionary_encode()
+        texts = encoded.dictionary.to_pylist()
+        return [None if index is None else texts[index] for index in encoded.indices.to_pylist()]
+    if pa.types.is_list(column.type):
+        known: dict[tuple[str, ...], tuple[str, ...]] = {}
+        return [known.setdefault(views, views) for views in map(tuple, column.to_pylist())]
+    return column.to_pylist()
+
+
+def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:
+    """Write quarantine.parquet, ordered by episode and reason."""
+    ordered = sorted(rows, key=lambda row: (row.episode_id, row.source, row.reason))
+    write_table(root / QUARANTINE_FILE, pa.Table.from_pylist([asdict(row) for row in ordered], schema=_QUARANTINE))
+
+
+def read_quarantine(root: Path) -> list[QuarantineRow]:
+    """Rows of quarantine.parquet; a set without the file has an empty quarantine."""
+    path = root / QUARANTINE_FILE
+    return [QuarantineRow(**row) for row in read_table(path, _QUARANTINE.names).to_pylist()] if is_file(path) else []

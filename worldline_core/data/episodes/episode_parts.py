@@ -1,0 +1,244 @@
+"""Episodes waiting to be assembled into a set: one folder each, complete or absent, so a killed run can continue."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldline_core.data.curation.fingerprint import fingerprint
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.thumbnail_cache import write_thumbnails
+from worldline_core.data.video.thumbnails import ViewThumbnails
+from worldline_core.errors import DataError
+
+
+def part_name(episode_id: str) -> str:
+    """Folder name of an episode: any id is allowed, the name is safe and unique."""
+    return sha256(episode_id.encode()).hexdigest()[:32]
+
+
+def ordered_views(views: Iterable[str]) -> list[str]:
+    """The project's fixed order, then any others by name."""
+    given = set(views)
+    return [view for view in VIEWS if view in given] + sorted(given - set(VIEWS))
+
+
+def write_part(
+    folder: Path,
+    episode: Episode,
+    views: Mapping[str, RecordedView],
+    robot_masks: Mapping[str, np.ndarray] | None,
+    video: VideoSettings,
+    described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
+) -> None:
+    """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
+
+    Args:
+        described: gives the episode as it is stored, where its description depends on what its views show.
+
+    Raises: RejectedInputError where the recordings cannot be read or do not belong to the states; DataError where images,
+        cameras and masks do not fit each other.
+    """
+    final = folder / part_name(episode.episode_id)
+    working = folder / f".{final.name}.{os.getpid()}"
+    shutil.rmtree(working, ignore_errors=True)
+    working.mkdir(parents=True)
+    try:
+        stored = {
+            view: store_view(recorded, working / f"{view}.mp4", episode.fps, video) for view, recorded in views.items()
+        }
+        _check_sizes(episode, stored, robot_masks)
+        if described is not None:
+            episode = described({view: kept.thumbnails for view, kept in stored.items()})
+        for view in stored:
+            if stored[view].copied:
+                write_thumbnails(working / f"{view}.arrow", stored[view].path, stored[view].thumbnails)
+        with (working / "arrays.npz").open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **_arrays(episode, stored, robot_masks))
+        description = json.dumps(_description(episode, stored, robot_masks), sort_keys=True)
+        (working / "part.json").write_text(description)
+        shutil.rmtree(final, ignore_errors=True)
+        working.rename(final)
+    finally:
+        shutil.rmtree(working, ignore_errors=True)
+
+
+def _arrays(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {
+        "state": episode.state.astype(np.float32),
+        "action": episode.action.astype(np.float32),
+    }
+    for view, camera in episode.cameras.items():
+        arrays[f"K.{view}"] = camera.K.astype(np.float64)
+        arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
+    if episode.T_base_ee is not None:
+        arrays["T_base_ee"] = episode.T_base_ee.astype(np.float64)
+    if episode.gripper is not None:
+        arrays["gripper"] = episode.gripper.astype(np.float64)
+    for view, mask in (robot_masks or {}).items():
+        arrays[f"mask.{view}"] = np.packbits(mask.astype(bool))
+    for view, kept in stored.items():
+        arrays[f"histogram.{view}"] = kept.histogram
+    return arrays
+
+
+def _description(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> dict[str, Any]:
+    return {
+        "episode_id": episode.episode_id,
+        "source": episode.source,
+        "embodiment": episode.embodiment,
+        "scene": episode.scene,
+        "task_family": episode.task_family,
+        "instruction": episode.instruction,
+        "outcome": episode.outcome,
+        "split": episode.split,
+        "fps": float(episode.fps),
+        "bank": episode.bank,
+        "candidate": episode.candidate,
+        "primary_view": episode.primary_view,
+        "state_names": None if episode.state_names is None else list(episode.state_names),
+        "state_kind": episode.state_kind,
+        "conventions": dict(episode.conventions),
+        "num_frames": episode.num_frames,
+        "video_frames": episode.num_video_frames,
+        "views": [[view, *stored[view].size] for view in ordered_views(stored)],
+        "videos": {
+            view: {"codec": kept.codec, "pixel_format": kept.pixel_format, "copied": kept.copied}
+            for view, kept in stored.items()
+        },
+        "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
+        "masks": {view: list(mask.shape) for view, mask in (robot_masks or {}).items()},
+        "fingerprint": fingerprint(episode, {view: kept.thumbnails for view, kept in stored.items()}),
+    }
+
+
+class Part:
+    """One waiting episode, read lazily."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.description: dict[str, Any] = json.loads((folder / "part.json").read_text())
+
+    def __getitem__(self, key: str) -> Any:
+        return self.description[key]
+
+    @cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        with np.load(self.folder / "arrays.npz", allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
+    @property
+    def views(self) -> list[str]:
+        return [view for view, _, _ in self["views"]]
+
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """(height, width) by view."""
+        return {view: (height, width) for view, height, width in self["views"]}
+
+    def video(self, view: str) -> Path:
+        return self.folder / f"{view}.mp4"
+
+    def copied(self, view: str) -> bool:
+        """Whether a view's video holds the packets of the recording, and so shares no file with other episodes."""
+        return bool(self["videos"][view]["copied"])
+
+    def thumbnails(self, view: str) -> Path:
+        """Where the thumbnails of a copied video lie (`thumbnail_cache`)."""
+        return self.folder / f"{view}.arrow"
+
+    def mask(self, view: str) -> np.ndarray:
+        """bool (N, H, W)."""
+        shape = self.description["masks"][view]
+        bits = np.unpackbits(self.arrays[f"mask.{view}"], count=int(np.prod(shape)))
+        return bits.reshape(shape).astype(bool)
+
+    def camera(self, view: str) -> CameraTrack:
+        width, height = self.description["cameras"][view]
+        return CameraTrack(view, self.arrays[f"K.{view}"], self.arrays[f"pose.{view}"], width, height)
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        """Episodes with equal signatures fit into one LeRobot dataset."""
+        names = self["state_names"]
+        return (
+            self["embodiment"],
+            self["fps"],
+            tuple(
+                (*item, self["videos"][item[0]]["codec"], self["videos"][item[0]]["pixel_format"])
+                for item in self["views"]
+            ),
+            self.arrays["state"].shape[1],
+            None if names is None else tuple(names),
+            self["state_kind"],
+        )
+
+
+def read_parts(folder: Path) -> list[Part]:
+    """Finished parts, by episode id."""
+    if not folder.is_dir():
+        return []
+    found = [Part(path) for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    return sorted(found, key=lambda part: part["episode_id"])
+
+
+def check_images(episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
+    """Raises: DataError when images in memory are none; RejectedInputError when they and the states differ in number."""
+    where = f"episode {episode.episode_id}"
+    for view, images in frames.items():
+        if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+            raise DataError(
+                "Images have a wrong type",
+                where=f"{where}, view {view}",
+                expected="uint8 (N, H, W, 3)",
+                got=f"{images.dtype} {images.shape}",
+            )
+        if len(images) != episode.num_video_frames:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Images and states differ in number",
+                where=f"{where}, view {view}",
+                expected=f"{episode.num_video_frames} frames",
+                got=f"{len(images)} frames",
+            )
+
+
+def _check_sizes(
+    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+) -> None:
+    where = f"episode {episode.episode_id}"
+    for view, kept in stored.items():
+        camera = episode.cameras.get(view)
+        if camera is not None and (camera.height, camera.width) != kept.size:
+            raise RejectedInputError(
+                "missing_calibration",
+                "Camera is calibrated for another image size",
+                where=f"{where}, view {view}",
+                expected=f"{kept.size[0]}x{kept.size[1]}",
+                got=f"{camera.height}x{camera.width}",
+                next_step="use CameraTrack.resized so that K follows the resize",
+                evidence={"view": view, "images": list(kept.size), "calibrated": [camera.height, camera.width]},
+            )
+    for view, mask in (robot_masks or {}).items():
+        expected = (episode.num_video_frames, *stored[view].size) if view in stored else None
+        if mask.shape != expected:
+            raise DataError(
+                "Robot masks do not match the images",
+                where=f"{where}, view {view}",
+                expected=expected or "a view with images",
+                got=mask.shape,
+            )

@@ -1,0 +1,241 @@
+"""EpisodeSet: an index over LeRobot v3 datasets with cameras, embodiment and outcome of each episode."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
+from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.sidecar import Sidecar
+from worldline_core.data.guards.json_file import parse_json
+from worldline_core.data.guards.source_paths import inside, is_remote
+from worldline_core.data.lerobot.v3 import IMAGE_PREFIX, LeRobotV3Dataset
+from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.thumbnail_cache import cache_path, read_thumbnails
+from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
+from worldline_core.errors import DataError
+
+__all__ = ["EpisodeRow", "EpisodeSet", "EpisodeSetWriter", "QuarantineRow"]
+
+
+class EpisodeSet:
+    """Read access to a set. Rows are ordered by episode id; positions 0..len-1 name them."""
+
+    def __init__(self, root: Path, rows: Sequence[EpisodeRow], *, allow_linked: bool = True) -> None:
+        self.root = root
+        self.rows = list(rows)
+        self._allow_linked = allow_linked
+        self._position = {row.episode_id: position for position, row in enumerate(self.rows)}
+        self._datasets: dict[str, tuple[LeRobotV3Dataset, Sidecar]] = {}
+
+    @classmethod
+    def open(cls, root: Path, *, allow_linked: bool = True) -> EpisodeSet:
+        """Open a set.
+
+        Args:
+            allow_linked: whether rows may point to datasets in another artifact (by a relative path).
+
+        Raises: DataError when the index is missing or incomplete.
+        """
+        return cls(root, read_index(root), allow_linked=allow_linked)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def position(self, episode_id: str) -> int:
+        """Position of an episode.
+
+        Raises: DataError when the set has no such episode.
+        """
+        if episode_id not in self._position:
+            raise DataError(
+                "No such episode in the set",
+                where=str(self.root),
+                got=episode_id,
+                expected=f"one of {len(self)} ids",
+            )
+        return self._position[episode_id]
+
+    def quarantine(self) -> list[QuarantineRow]:
+        """Inputs that did not get into this set."""
+        return read_quarantine(self.root)
+
+    def select(
+        self,
+        *,
+        split: str | Sequence[str] | None = None,
+        source: str | None = None,
+        embodiment: str | None = None,
+        bank: str | None = None,
+        stage1_ok: bool | None = None,
+        stage2_ok: bool | None = None,
+    ) -> list[int]:
+        """Positions of the rows that match every given value."""
+        splits = None if split is None else {split} if isinstance(split, str) else set(split)
+        return [
+            position
+            for position, row in enumerate(self.rows)
+            if (splits is None or row.split in splits)
+            and (source is None or row.source == source)
+            and (embodiment is None or row.embodiment == embodiment)
+            and (bank is None or row.bank == bank)
+            and (stage1_ok is None or row.stage1_ok == stage1_ok)
+            and (stage2_ok is None or row.stage2_ok == stage2_ok)
+        ]
+
+    def dataset_path(self, i: int) -> Path:
+        """Folder of the LeRobot dataset that holds row i.
+
+        Raises: DataError for an absolute path, or one outside of the set where links are not allowed.
+        """
+        relative = self.rows[i].dataset
+        if Path(relative).is_absolute():
+            raise DataError(
+                "Index row has an absolute path",
+                where=str(self.root),
+                expected="a relative path",
+                got=relative,
+            )
+        if not self._allow_linked or is_remote(self.root):  # a published set holds its datasets
+            return inside(self.root, relative)
+        return Path(os.path.normpath(self.root / relative))
+
+    def _open(self, i: int) -> tuple[LeRobotV3Dataset, Sidecar]:
+        key = self.rows[i].dataset
+        if key not in self._datasets:
+            path = self.dataset_path(i)
+            self._datasets[key] = LeRobotV3Dataset(path), Sidecar(path)
+        return self._datasets[key]
+
+    def episode(self, i: int) -> Episode:
+        """Arrays and description of row i, cut to its segment.
+
+        Raises: DataError when the stored data is incomplete.
+        """
+        row = self.rows[i]
+        dataset, sidecar = self._open(i)
+        stored = sidecar.trajectory(row.episode_index) or {}
+        state = stored.get("state")
+        action = stored.get("action")
+        length = int(dataset.row(row.episode_index)["length"])
+        if sidecar.contract["state_kind"] == "none":
+            state = action = np.zeros((length, 0), dtype=np.float32)
+        elif state is None or action is None:
+            state = dataset.column(row.episode_index, "observation.state").astype(np.float32, copy=False)
+            action = dataset.column(row.episode_index, "action").astype(np.float32, copy=False)
+        names = sidecar.contract.get("state_names")
+        whole = Episode(
+            episode_id=row.episode_id,
+            source=row.source,
+            embodiment=row.embodiment,
+            scene=row.scene,
+            task_family=row.task_family,
+            instruction=row.instruction,
+            outcome=row.outcome,
+            split=row.split,
+            fps=row.fps,
+            state=state,
+            action=action,
+            timestamps=np.arange(len(state), dtype=np.float64) / row.fps,
+            cameras=sidecar.cameras(row.episode_index),
+            bank=row.bank,
+            candidate=row.candidate,
+            T_base_ee=stored.get("T_base_ee"),
+            gripper=stored.get("gripper"),
+            primary_view=row.primary_view,
+            state_names=None if names is None else tuple(names),
+            state_kind=sidecar.contract["state_kind"],
+            video_frames=None if length == len(state) else length,
+            conventions=_conventions(row),
+        )
+        if not 0 <= row.start < row.stop <= whole.num_frames:
+            raise DataError(
+                "Index row lies outside of its episode",
+                where=f"{self.root}, episode {row.episode_id}",
+                expected=f"0 <= start < stop <= {whole.num_frames}",
+                got=f"{row.start}..{row.stop}",
+            )
+        return whole if (row.start, row.stop) == (0, whole.num_frames) else whole.cut(row.start, row.stop)
+
+    def frames(self, i: int, view: str, indices: Sequence[int] | None = None) -> np.ndarray:
+        """uint8 (len, H, W, 3) RGB frames of a view.
+
+        Args:
+            indices: frame numbers counted from the start of the row's segment; None for all that have images.
+
+        Raises: DataError when the view, the file or a frame is missing, or the video is truncated.
+        """
+        row = self.rows[i]
+        if view not in row.views:
+            raise DataError(
+                "Episode has no such view",
+                where=f"episode {row.episode_id}",
+                expected=", ".join(row.views),
+                got=view,
+            )
+        dataset, _ = self._open(i)
+        wanted = range(row.video_frames) if indices is None else [int(index) for index in indices]
+        if any(index < 0 or index >= row.video_frames for index in wanted):
+            raise DataError(
+                "Frame index outside of the episode",
+                where=f"episode {row.episode_id}",
+                expected=f"0 <= index < {row.video_frames}",
+                got=str(list(wanted)),
+            )
+        return dataset.frames(row.episode_index, IMAGE_PREFIX + view, [row.start + index for index in wanted])
+
+    def clip(self, i: int, view: str) -> VideoClip:
+        """Where the frames of a view of row i lie, cut to its segment, for those who decode themselves.
+
+        Raises: DataError when the view is missing.
+        """
+        row = self.rows[i]
+        if view not in row.views:
+            raise DataError(
+                "Episode has no such view",
+                where=f"episode {row.episode_id}",
+                expected=", ".join(row.views),
+                got=view,
+            )
+        dataset, _ = self._open(i)
+        place = dataset.video(row.episode_index, IMAGE_PREFIX + view)
+        return VideoClip(place.path, row.video_frames, dataset.fps, place.from_time, row.start)
+
+    def thumbnails(self, i: int, view: str) -> ViewThumbnails:
+        """Small grey images of a view of row i: those that curation left beside the set, else made from its video. They are
+        the same either way.
+
+        Raises: DataError when the view or the file is missing, or the video is truncated.
+        """
+        row = self.rows[i]
+        clip = self.clip(i, view)
+        whole = replace(clip, skip=0, num_frames=int(self._open(i)[0].row(row.episode_index)["length"]))
+        dataset = self.dataset_path(i)
+        stored = None
+        if isinstance(clip.path, Path) and clip.path.is_relative_to(dataset.parents[1]):
+            stored = read_thumbnails(cache_path(dataset.parents[1], clip.path), clip.path)
+        if stored is None or len(stored) != whole.num_frames:
+            maker = ThumbnailMaker(row.fps)
+            for picture in read_clip(whole):
+                maker.add(picture.luma, full_range=picture.full_range)
+            stored = maker.thumbnails()
+        return stored.cut(row.start, row.start + row.video_frames)
+
+    def robot_masks(self, i: int, view: str) -> np.ndarray | None:
+        """bool (N, H, W) masks of a view where the recording has them, else None."""
+        row = self.rows[i]
+        mask = self._open(i)[1].mask(row.episode_index, view)
+        return None if mask is None else mask[row.start : row.start + row.video_frames]
+
+
+def _conventions(row: EpisodeRow) -> dict[str, str | float | int]:
+    found = parse_json(row.conventions, f"index, conventions of episode {row.episode_id}")
+    if not isinstance(found, dict):
+        raise DataError("Conventions are no mapping", where=f"episode {row.episode_id}", got=row.conventions[:200])
+    return found

@@ -1,0 +1,268 @@
+"""Write an EpisodeSet episode by episode.
+
+Episodes are encoded into run/episodes/ as they come (whole or absent), and joined into datasets by `close`. Episodes may be
+added in any order, by several processes over the same folder, and again after a kill: the set depends on the
+episodes alone.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_index import (
+    INDEX_FILE,
+    EpisodeRow,
+    QuarantineRow,
+    write_index,
+    write_quarantine,
+)
+from worldline_core.data.episodes.episode_parts import (
+    Part,
+    check_images,
+    part_name,
+    read_parts,
+    write_part,
+)
+from worldline_core.data.episodes.sidecar import write_sidecar
+from worldline_core.data.episodes.view_recording import RecordedView, VideoMode, VideoSettings
+from worldline_core.data.guards.source_paths import safe_name
+from worldline_core.data.lerobot.v3_writer import write_dataset
+from worldline_core.data.video.encoder import PixelFormat
+from worldline_core.data.video.thumbnails import ViewThumbnails
+from worldline_core.errors import DataError
+from worldline_core.store.atomic import write_json_atomic
+
+VIDEOS_FILE = "videos.json"
+"""How many of the set's videos were copied as they were recorded, how many encoded, and in which codecs they are."""
+
+
+class EpisodeSetWriter:
+    """Collects episodes and quarantined inputs below `root`.
+
+    Args:
+        root: the set's folder; work in progress lies in root/run/.
+        fps: frame rate every episode must have; None accepts several (each rate becomes a dataset of its own).
+        image_size: (H, W) every image must have; None accepts several.
+        video_crf: x264 quality; 18 is visually exact, 28 small.
+        video_mode: "auto" copies encoded videos in which nothing changes, "encode" encodes every picture.
+
+    Raises: DataError when the folder already holds a finished set.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        fps: float | None = None,
+        image_size: tuple[int, int] | None = None,
+        video_crf: int = 18,
+        video_preset: str = "slow",
+        pixel_format: PixelFormat = "yuv420p",
+        video_megabytes: int = 200,
+        video_mode: VideoMode = "auto",
+    ) -> None:
+        if self.finished(root):
+            raise DataError(
+                "Folder already holds a finished EpisodeSet",
+                where=str(root),
+                next_step="write to a new folder",
+            )
+        self.root = root
+        self.fps = fps
+        self.image_size = image_size
+        self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode)
+        self.video_megabytes = video_megabytes
+        self._work = root / "run" / "episodes"
+        self._parts = self._work / "parts"
+        self._rejected = self._work / "rejected"
+        self._parts.mkdir(parents=True, exist_ok=True)
+        self._rejected.mkdir(parents=True, exist_ok=True)
+
+    @staticmethod
+    def finished(root: Path) -> bool:
+        """Whether `close` has completed in this folder."""
+        return (root / INDEX_FILE).exists() and not (root / "run" / "episodes").is_dir()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+
+    def has(self, episode_id: str) -> bool:
+        """Whether the episode was already added or quarantined, for example before a kill."""
+        name = part_name(episode_id)
+        return (self._parts / name).is_dir() or (self._rejected / f"{name}.json").is_file()
+
+    def add(
+        self,
+        episode: Episode,
+        frames: Mapping[str, np.ndarray | RecordedView],
+        robot_masks: Mapping[str, np.ndarray] | None = None,
+        described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
+    ) -> None:
+        """Add one episode.
+
+        Args:
+            frames: by view, uint8 (N, H, W, 3) RGB with N = episode.num_video_frames, or what is read, picture by
+                picture, while it is written.
+            robot_masks: by view, bool (N, H, W).
+            described: gives the episode as it is stored, where its description depends on what its views show.
+
+        Raises: DataError when frames, masks, cameras and states do not belong together; RejectedInputError for
+            recordings that cannot be read.
+        """
+        if not frames:
+            raise DataError(
+                "Episode has no images", where=f"episode {episode.episode_id}", expected="at least one view", got="none"
+            )
+        in_memory = {view: images for view, images in frames.items() if isinstance(images, np.ndarray)}
+        check_images(episode, in_memory)
+        self._check_image_size(episode, in_memory)
+        safe_name(episode.embodiment, "Embodiment")
+        for view in frames:
+            safe_name(view, "View")
+        if self.fps is not None and abs(episode.fps - self.fps) > 1e-6:
+            raise DataError(
+                "Episode has another frame rate than the set",
+                where=f"episode {episode.episode_id}",
+                expected=f"{self.fps} fps",
+                got=f"{episode.fps} fps",
+            )
+        views = {view: RecordedView.of(v) if isinstance(v, np.ndarray) else v for view, v in frames.items()}
+        write_part(self._parts, episode, views, robot_masks, self.video, described)
+
+    def _check_image_size(self, episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
+        for view, images in frames.items():
+            if self.image_size is not None and tuple(images.shape[1:3]) != tuple(self.image_size):
+                raise DataError(
+                    "Images have a wrong size",
+                    where=f"episode {episode.episode_id}, view {view}",
+                    expected=str(self.image_size),
+                    got=str(images.shape[1:3]),
+                )
+
+    def quarantine(
+        self,
+        episode_id: str,
+        source: str,
+        reason: str,
+        detail: str,
+        evidence: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Note an input that did not get through."""
+        row = QuarantineRow(episode_id, source, reason, detail, json.dumps(dict(evidence or {}), sort_keys=True))
+        write_json_atomic(self._rejected / f"{part_name(episode_id)}.json", asdict(row))
+
+    def recorded(self, episode_id: str) -> Part | QuarantineRow | None:
+        """What became of an episode so far; None when it was neither added nor quarantined."""
+        name = part_name(episode_id)
+        if (self._parts / name).is_dir():
+            return Part(self._parts / name)
+        rejected = self._rejected / f"{name}.json"
+        return QuarantineRow(**json.loads(rejected.read_text())) if rejected.is_file() else None
+
+    def kept(self) -> list[Part]:
+        """Episodes added so far, by id."""
+        return read_parts(self._parts)
+
+    def rejected(self) -> list[QuarantineRow]:
+        """Inputs quarantined so far, by id."""
+        files = sorted(path for path in self._rejected.glob("*.json") if not path.name.startswith("."))
+        rows = [QuarantineRow(**json.loads(path.read_text())) for path in files]
+        return sorted(rows, key=lambda row: row.episode_id)
+
+    def discard(self, episode_id: str) -> None:
+        """Take back an added episode (before it is quarantined instead)."""
+        shutil.rmtree(self._parts / part_name(episode_id), ignore_errors=True)
+
+    def close(self) -> dict[str, Any]:
+        """Assemble datasets, index and quarantine; returns the counts {"kept", "quarantined", "reasons"}.
+
+        Raises: DataError when nothing was kept.
+        """
+        parts, rejected = self.kept(), self.rejected()
+        if not parts:
+            named = sorted({row.reason for row in rejected})
+            raise DataError(
+                "No episode was kept",
+                where=str(self.root),
+                got=f"{len(rejected)} quarantined: {', '.join(named) or 'none'}",
+            )
+        groups: dict[tuple[Any, ...], list[Part]] = {}
+        for part in parts:
+            groups.setdefault(part.signature, []).append(part)
+        rows: list[EpisodeRow] = []
+        used: dict[str, int] = {}
+        for members in groups.values():
+            embodiment = members[0]["embodiment"]
+            used[embodiment] = used.get(embodiment, 0) + 1
+            name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
+            dataset = self.root / "datasets" / name
+            write_dataset(dataset, members, video_megabytes=self.video_megabytes)
+            write_sidecar(dataset, members)
+            rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
+        write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
+        write_quarantine(self.root, rejected)
+        write_index(self.root, sorted(rows, key=lambda row: row.episode_id))
+        # Renamed first: a kill while deleting must not leave a folder that looks like unfinished work.
+        leftovers = self._work.with_name("episodes.finished")
+        shutil.rmtree(leftovers, ignore_errors=True)
+        self._work.rename(leftovers)
+        shutil.rmtree(leftovers)
+        reasons: dict[str, int] = {}
+        for row in rejected:
+            reasons[row.reason] = reasons.get(row.reason, 0) + 1
+        return {"kept": len(parts), "quarantined": len(rejected), "reasons": dict(sorted(reasons.items()))}
+
+
+def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
+    videos = [video for part in parts for video in part["videos"].values()]
+    copied = sum(video["copied"] for video in videos)
+    codecs = Counter(f"{video['codec']} {video['pixel_format']}" for video in videos)
+    return {"copied": copied, "encoded": len(videos) - copied, "codecs": dict(sorted(codecs.items()))}
+
+
+def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
+    views = tuple(part.views)
+    uncalibrated = any(view not in part["cameras"] for view in views)
+    stage2_reason = "missing_view" if len(views) < 2 else "missing_calibration" if uncalibrated else None
+    if part["state_kind"] == "none":
+        stage2_reason = "missing_actions"
+    return EpisodeRow(
+        episode_id=part["episode_id"],
+        dataset=dataset,
+        episode_index=episode_index,
+        start=0,
+        stop=part["num_frames"],
+        num_frames=part["num_frames"],
+        video_frames=part["video_frames"],
+        fps=part["fps"],
+        source=part["source"],
+        embodiment=part["embodiment"],
+        scene=part["scene"],
+        task_family=part["task_family"],
+        instruction=part["instruction"],
+        outcome=part["outcome"],
+        split=part["split"],
+        views=views,
+        bank=part["bank"],
+        candidate=part["candidate"],
+        primary_view=part["primary_view"],
+        stage1_ok=part["primary_view"] in views,
+        stage2_ok=stage2_reason is None,
+        stage2_reason=stage2_reason,
+        conventions=json.dumps(part["conventions"], sort_keys=True),
+    )

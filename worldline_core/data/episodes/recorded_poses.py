@@ -1,0 +1,130 @@
+"""Poses as they were recorded, made rigid or refused at the door: the maths is in geometry, here it becomes reasons.
+
+A rotation up to 1e-3 off an orthonormal one is given the nearest rotation, and the episode's conventions say how many
+were and by how much; a worse one puts the episode into quarantine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.rejection import Reason, RejectedInputError
+from worldline_core.errors import CalibrationError
+from worldline_core.geometry.camera_pose import CameraAxes, CameraPose
+from worldline_core.geometry.pose_formats import rotation_from_quaternion_xyzw
+from worldline_core.geometry.rigid import (
+    MAX_ROTATION_DEVIATION,
+    RotationRepair,
+    repair_rotations,
+    rotation_deviation,
+)
+
+Extrinsics = Literal["camera_to_base", "base_to_camera"]
+REPAIRED = "rotations_repaired"
+
+
+@contextmanager
+def rejected_as(reason: Reason, where: object, evidence: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Turns a CalibrationError of the maths into the rejection of an episode."""
+    try:
+        yield
+    except CalibrationError as error:
+        raise RejectedInputError(
+            reason,
+            error.what,
+            where=where if error.where is None else f"{where}, {error.where}",
+            expected=error.expected,
+            got=error.got,
+            next_step=error.next_step,
+            evidence=evidence,
+        ) from error
+
+
+def camera_pose(
+    view: str,
+    matrices: np.ndarray,
+    *,
+    extrinsics: Extrinsics = "camera_to_base",
+    axes: CameraAxes = "opencv",
+    where: object,
+) -> CameraPose:
+    """A source's extrinsics (N or 1, 4, 4) as a pose that says its convention.
+
+    Raises: RejectedInputError (invalid_extrinsics) with the deviation, when one is not rigid.
+    """
+    build = CameraPose.from_camera_to_base if extrinsics == "camera_to_base" else CameraPose.from_base_to_camera
+    with rejected_as("invalid_extrinsics", where, {"view": view, **_deviation(matrices)}):
+        return build(matrices, axes=axes, where=f"view {view}")
+
+
+def repair_notes(repairs: Mapping[str, RotationRepair]) -> dict[str, str | int | float]:
+    """What an episode's conventions say about repaired rotations of its views or poses; nothing when none was."""
+    touched = {name: repair for name, repair in repairs.items() if repair.count}
+    if not touched:
+        return {}
+    return {
+        REPAIRED: sum(repair.count for repair in touched.values()),
+        f"{REPAIRED}_of": ", ".join(touched),
+        f"{REPAIRED}_largest_deviation": max(repair.largest for repair in touched.values()),
+    }
+
+
+def with_rigid_poses(episode: Episode) -> Episode:
+    """The episode with rigid camera and tool poses, the repaired ones counted in its conventions.
+
+    Raises: RejectedInputError (invalid_extrinsics, invalid_tool_pose, nan_state) for a pose that is beyond repair, or a
+        quaternion without direction in a state of tool poses.
+    """
+    where = f"episode {episode.episode_id}"
+    _check_quaternions(episode, where)
+    repairs: dict[str, RotationRepair] = {}
+    cameras = dict(episode.cameras)
+    for view, camera in cameras.items():
+        pose = camera_pose(view, camera.T_base_camera, where=where)
+        repairs[view] = pose.repair
+        if pose.repair.count:
+            cameras[view] = replace(camera, T_base_camera=pose.T_base_camera)
+    tools = episode.T_base_ee
+    # A pose that is not a number is the business of `check_values`, which says where it is.
+    if tools is not None and np.isfinite(tools).all():
+        with rejected_as("invalid_tool_pose", where, _deviation(tools)):
+            tools, repairs["tool poses"] = repair_rotations(tools, "tool poses")
+    notes = repair_notes(repairs)
+    if not notes:
+        return episode
+    return replace(episode, cameras=cameras, T_base_ee=tools, conventions={**episode.conventions, **notes})
+
+
+def _deviation(matrices: np.ndarray) -> dict[str, Any]:
+    """Numbers for the quarantine row: how far which poses are from rigid."""
+    if matrices.shape[-2:] != (4, 4):
+        return {"shape": list(matrices.shape)}
+    deviation = rotation_deviation(np.asarray(matrices, np.float64)[..., :3, :3]).reshape(len(matrices), -1).max(axis=1)
+    finite = deviation[np.isfinite(deviation)]
+    return {
+        "frame": int(np.argmax(deviation)),
+        "frames": int(np.count_nonzero(deviation > MAX_ROTATION_DEVIATION)),
+        "rotation_deviation": float(finite.max()) if len(finite) else None,
+        "largest_allowed": MAX_ROTATION_DEVIATION,
+    }
+
+
+def _check_quaternions(episode: Episode, where: str) -> None:
+    """Raises: RejectedInputError (nan_state) when a state or action of tool poses holds a quaternion of no length."""
+    names = episode.state_names
+    if episode.state_kind != "ee_pose" or names is None:
+        return
+    first = [i for i, name in enumerate(names) if name.endswith("qx") and i + 3 < len(names)]
+    for track, values in (("state", episode.state), ("action", episode.action)):
+        for column in first:
+            quaternions = values[:, column : column + 4]
+            if np.isfinite(quaternions).all():
+                evidence = {"track": track, "columns": list(names[column : column + 4])}
+                with rejected_as("nan_state", f"{where}, {track} {names[column]}", evidence):
+                    rotation_from_quaternion_xyzw(quaternions)

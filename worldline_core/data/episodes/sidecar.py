@@ -1,0 +1,225 @@
+"""What LeRobot has no place for, stored beside a dataset in meta/worldline/: cameras, tool poses, masks, conventions."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode_parts import Part
+from worldline_core.data.guards.json_file import read_json, well_formed
+from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, check_image_size, too_large
+from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import is_file
+from worldline_core.data.lerobot.v3 import write_table
+from worldline_core.errors import DataError
+from worldline_core.store.atomic import write_json_atomic
+
+FOLDER = Path("meta") / "worldline"
+CONTRACT_VERSION = 1
+
+_CAMERAS = pa.schema(
+    [
+        ("episode_index", pa.int64()),
+        ("view", pa.string()),
+        ("K", pa.list_(pa.float64())),
+        ("width", pa.int64()),
+        ("height", pa.int64()),
+        ("num_poses", pa.int64()),
+        ("T_base_camera", pa.list_(pa.float64())),
+    ]
+)
+_MASKS = pa.schema(
+    [
+        ("episode_index", pa.int64()),
+        ("view", pa.string()),
+        ("shape", pa.list_(pa.int64())),
+        ("bits", pa.binary()),
+    ]
+)
+_TRAJECTORIES = pa.schema(
+    [
+        ("episode_index", pa.int64()),
+        ("num_frames", pa.int64()),
+        ("state", pa.list_(pa.float32())),
+        ("action", pa.list_(pa.float32())),
+        ("num_arms", pa.int64()),
+        ("T_base_ee", pa.list_(pa.float64())),
+        ("gripper", pa.list_(pa.float64())),
+    ]
+)
+
+
+def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
+    """Write the sidecar of a dataset whose episode i is parts[i]."""
+    folder = root / FOLDER
+    cameras, masks, trajectories = [], [], []
+    for index, part in enumerate(parts):
+        for view in part["cameras"]:
+            camera = part.camera(view)
+            cameras.append(
+                {
+                    "episode_index": index,
+                    "view": view,
+                    "K": camera.K.reshape(-1).tolist(),
+                    "width": camera.width,
+                    "height": camera.height,
+                    "num_poses": len(camera.T_base_camera),
+                    "T_base_camera": camera.T_base_camera.reshape(-1).tolist(),
+                }
+            )
+        for view in part["masks"]:
+            mask = part.mask(view)
+            bits = zlib.compress(np.packbits(mask).tobytes(), 9)
+            masks.append({"episode_index": index, "view": view, "shape": list(mask.shape), "bits": bits})
+        tool = part.arrays.get("T_base_ee")
+        if tool is not None or part["video_frames"] != part["num_frames"]:
+            gripper = part.arrays.get("gripper")
+            trajectories.append(
+                {
+                    "episode_index": index,
+                    "num_frames": part["num_frames"],
+                    "state": part.arrays["state"].reshape(-1).tolist(),
+                    "action": part.arrays["action"].reshape(-1).tolist(),
+                    "num_arms": 0 if tool is None else tool.shape[1],
+                    "T_base_ee": None if tool is None else tool.reshape(-1).tolist(),
+                    "gripper": None if gripper is None else gripper.reshape(-1).tolist(),
+                }
+            )
+    write_table(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
+    if masks:
+        write_table(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
+    if trajectories:
+        write_table(folder / "trajectories.parquet", pa.Table.from_pylist(trajectories, schema=_TRAJECTORIES))
+    write_json_atomic(folder / "contract.json", contract(parts[0]))
+
+
+def contract(part: Part) -> dict[str, Any]:
+    """Units and conventions of a dataset, stated once."""
+    return {
+        "version": CONTRACT_VERSION,
+        "embodiment": part["embodiment"],
+        "fps": part["fps"],
+        "views": {view: {"height": size[0], "width": size[1]} for view, size in part.image_sizes.items()},
+        "state_kind": part["state_kind"],
+        "state_names": part["state_names"],
+        "action": "none" if part["state_kind"] == "none" else "commanded targets, same layout as the state",
+        "units": {"angle": "rad", "length": "m", "time": "s", "image": "px"},
+        "gripper": "0 closed .. 1 open",
+        "camera_axes": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
+        "extrinsics": "T_base_camera maps camera points to the robot base",
+        "tool_axes": "origin between the fingertips, +z out of the gripper",
+    }
+
+
+class Sidecar:
+    """Read access; tables are loaded once."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root / FOLDER
+        self.contract: dict[str, Any] = read_json(self.root / "contract.json")
+        if not isinstance(self.contract, dict):
+            raise DataError("Sidecar's contract is no mapping", where=str(self.root), got=type(self.contract).__name__)
+        if self.contract.get("version") != CONTRACT_VERSION:
+            raise DataError(
+                "Sidecar has another version",
+                where=str(self.root),
+                expected=CONTRACT_VERSION,
+                got=self.contract.get("version"),
+            )
+        names = self.contract.get("state_names")
+        kind = self.contract.get("state_kind")
+        if not isinstance(kind, str) or not (names is None or isinstance(names, list)):
+            raise DataError(
+                "Sidecar does not say what the state is",
+                where=str(self.root),
+                expected="state_kind (a text) and state_names (a list or null)",
+                got=f"{kind!r} and {str(names)[:100]}",
+            )
+        self._rows: dict[str, dict[int, list[dict[str, Any]]]] = {}
+
+    def _of(self, name: str, schema: pa.Schema, episode_index: int, *, optional: bool) -> list[dict[str, Any]]:
+        if name not in self._rows:
+            path = self.root / name
+            grouped: dict[int, list[dict[str, Any]]] = {}
+            if is_file(path) or not optional:
+                for row in read_table(path, schema.names).to_pylist():
+                    grouped.setdefault(row["episode_index"], []).append(row)
+            self._rows[name] = grouped
+        return self._rows[name].get(episode_index, [])
+
+    def cameras(self, episode_index: int) -> dict[str, CameraTrack]:
+        """Calibrated cameras of an episode by view."""
+        result: dict[str, CameraTrack] = {}
+        for row in self._of("cameras.parquet", _CAMERAS, episode_index, optional=False):
+            K, poses = np.asarray(row["K"], np.float64), np.asarray(row["T_base_camera"], np.float64)
+            if K.size != 9 or poses.size != 16 * row["num_poses"]:
+                raise RejectedInputError(
+                    "invalid_extrinsics",
+                    "Camera row has a wrong length",
+                    where=f"{self.root}, episode {episode_index}, view {row['view']}",
+                    expected=f"9 and {16 * row['num_poses']} numbers",
+                    got=f"{K.size} and {poses.size}",
+                )
+            result[row["view"]] = CameraTrack(
+                row["view"], K.reshape(3, 3), poses.reshape(-1, 4, 4), row["width"], row["height"]
+            )
+        return result
+
+    def mask(self, episode_index: int, view: str) -> np.ndarray | None:
+        """bool (N, H, W) robot mask, or None where the recording has none.
+
+        Raises: RejectedInputError (unreadable, too_large) for bits that are no mask of their shape.
+        """
+        where = f"{self.root}, episode {episode_index}, view {view}, robot mask"
+        for row in self._of("robot_masks.parquet", _MASKS, episode_index, optional=True):
+            if row["view"] == view:
+                with well_formed(where, "packed bits of (N, H, W), compressed with zlib"):
+                    count, height, width = (int(size) for size in row["shape"])
+                    check_image_size(width, height, where)
+                    bits = count * height * width
+                    if not 0 < bits <= 8 * MAX_ARRAY_BYTES:
+                        raise too_large(
+                            "Mask is too large", where=where, limit=8 * MAX_ARRAY_BYTES, got=bits, unit="bits"
+                        )
+                    packed = np.frombuffer(_unpacked(row["bits"], -(-bits // 8)), np.uint8)
+                    return np.unpackbits(packed, count=bits).reshape(count, height, width).astype(bool)
+        return None
+
+    def trajectory(self, episode_index: int) -> dict[str, np.ndarray] | None:
+        """Full-length state, action and tool poses where they go beyond what the dataset holds, else None.
+
+        Raises: RejectedInputError (unreadable) for numbers that do not fit their counts.
+        """
+        rows = self._of("trajectories.parquet", _TRAJECTORIES, episode_index, optional=True)
+        if not rows:
+            return None
+        with well_formed(f"{self.root}, episode {episode_index}, trajectory", "numbers of N frames and A arms"):
+            row = rows[0]
+            num_frames, num_arms = row["num_frames"], row["num_arms"]
+            result: dict[str, np.ndarray] = {
+                "state": np.asarray(row["state"], np.float32).reshape(num_frames, -1),
+                "action": np.asarray(row["action"], np.float32).reshape(num_frames, -1),
+            }
+            if row["T_base_ee"] is not None:
+                result["T_base_ee"] = np.asarray(row["T_base_ee"], np.float64).reshape(num_frames, num_arms, 4, 4)
+            if row["gripper"] is not None:
+                result["gripper"] = np.asarray(row["gripper"], np.float64).reshape(num_frames, num_arms)
+            return result
+
+
+def _unpacked(packed: bytes, length: int) -> bytes:
+    """Exactly `length` bytes: a compressed kilobyte could become a gigabyte."""
+    try:
+        content = zlib.decompressobj().decompress(packed, length + 1)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if len(content) != length:
+        raise ValueError(f"{len(content)} bytes or more instead of {length}")
+    return content

@@ -1,0 +1,270 @@
+"""Reading arrays of HDF5 files that are not to be trusted: every fault is the rejection of an episode.
+
+A file may point outside of itself (external links, external storage, virtual datasets) or declare a huge array in a few
+bytes; both are refused before anything is read.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldline_core.data.guards.hdf5_heap import check_entries
+from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, MAX_FRAMES, regular_file, too_large
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.errors import UnavailableError
+
+_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
+_MAX_TEXT = 1 << 20
+# Encoded images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
+_BLOCK_IMAGES = 16
+_BLOCK_BYTES = 64 << 20
+
+
+def require_h5py() -> Any:
+    """The module h5py.
+
+    Raises: UnavailableError where it is not installed.
+    """
+    if importlib.util.find_spec("h5py") is None:
+        raise UnavailableError(
+            "Sources of HDF5 files need h5py, which is not installed",
+            expected="the extra `hdf5`",
+            next_step="uv sync --extra hdf5 (or pip install 'worldline[hdf5]')",
+        )
+    return importlib.import_module("h5py")
+
+
+class Hdf5File:
+    """An open file; made by `open_hdf5`."""
+
+    def __init__(self, path: AnyPath, local: Path, handle: Any) -> None:
+        self._h5py = require_h5py()
+        self._path = path
+        self._local = local
+        self._handle = handle
+
+    def names(self, group: str) -> list[str]:
+        """Names in a group, sorted; empty where there is no such group.
+
+        Raises: RejectedInputError (unreadable, path_traversal).
+        """
+        with self._reading(group):
+            node = self._node(group)
+            return sorted(node) if isinstance(node, self._h5py.Group) else []
+
+    def has(self, key: str) -> bool:
+        """Whether `key` is a dataset that holds something: recorders write unused fields as empty ones.
+
+        Raises: RejectedInputError (unreadable, path_traversal).
+        """
+        with self._reading(key):
+            node = self._node(key)
+            return isinstance(node, self._h5py.Dataset) and bool(node.size)
+
+    def array(self, key: str, shape: Sequence[int | None]) -> np.ndarray:
+        """A numeric dataset as float64.
+
+        Args:
+            shape: wanted sizes; None for any (but not 0).
+
+        Raises: RejectedInputError: missing_column (no such dataset), length_mismatch (another shape), nan_state (values
+            that are not finite), unreadable (damaged, not numeric, or too large), path_traversal.
+        """
+        dataset = self._dataset(key)
+        if dataset.dtype.kind not in "fiu":
+            raise self._rejected("unreadable", "Dataset is not numeric", key, "numbers", dataset.dtype)
+        self._check_shape(key, dataset.shape, shape)
+        with self._reading(key):
+            values = np.asarray(dataset[()], dtype=np.float64)
+        bad = ~np.isfinite(values)
+        if bad.any():
+            raise RejectedInputError(
+                "nan_state",
+                "Dataset holds values that are not finite",
+                where=f"{self._path}, {key}",
+                expected="finite numbers",
+                got=f"{int(bad.sum())} that are not",
+                evidence={"track": key, "first_frame": int(np.argwhere(bad)[0][0]), "values": int(bad.sum())},
+            )
+        return values
+
+    def times_ns(self, key: str, length: int) -> np.ndarray:
+        """A dataset (length,) of nanoseconds as seconds from its first entry.
+
+        The difference is taken before the conversion: float64 rounds nanoseconds since 1970 to 256.
+
+        Raises: as `array`.
+        """
+        seconds = 1e-9 * self.array(key, (length,))
+        raw = self._dataset(key)[()]
+        exact = raw.dtype.kind != "f"
+        return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
+
+    def width(self, key: str) -> int:
+        """Columns of a dataset (N, columns); 1 for (N,).
+
+        Raises: RejectedInputError: missing_column, length_mismatch (another number of axes), unreadable, too_large,
+            path_traversal.
+        """
+        shape = self._dataset(key).shape
+        if len(shape) not in (1, 2):
+            self._check_shape(key, shape, (None, None))
+        return int(shape[1]) if len(shape) == 2 else 1
+
+    def is_flat(self, key: str) -> bool:
+        """Whether a dataset has one axis.
+
+        Raises: RejectedInputError as `width`.
+        """
+        return self._dataset(key).ndim == 1
+
+    def text(self, key: str) -> str | None:
+        """A text stored as a dataset of one entry; None where there is none.
+
+        Raises: RejectedInputError: unreadable (no text), too_large, path_traversal.
+        """
+        if not self.has(key):
+            return None
+        dataset = self._dataset(key)
+        if dataset.size != 1:
+            raise self._rejected("unreadable", "Dataset is no single text", key, "one entry", dataset.shape)
+        with self._reading(key):
+            if dataset.dtype.kind == "O" and (dataset.chunks is None or dataset.ndim == 1):
+                check_entries(dataset, 0, 1, self._local, f"{self._path}, {key}")
+            value = dataset[()] if dataset.shape == () else dataset[(0,) * dataset.ndim]
+        return self._as_text(value, key)
+
+    def attribute(self, group: str, name: str) -> str | None:
+        """An attribute of a group ("/" for the file's own) as text; None where there is none.
+
+        Raises: RejectedInputError: unreadable, too_large, path_traversal.
+        """
+        with self._reading(f"{group}, attribute {name}"):
+            node = self._handle if group == "/" else self._node(group)
+            value = None if node is None else node.attrs.get(name)
+        return None if value is None else self._as_text(value, f"{group}, attribute {name}")
+
+    def _as_text(self, value: Any, where: str) -> str:
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
+        if isinstance(value, bytes):
+            value = value.decode("utf-8", "replace")
+        if not isinstance(value, str | int | float | np.number | np.bool_):
+            raise self._rejected("unreadable", "Entry is no text", where, "a text or a number", type(value).__name__)
+        text = str(value)
+        if len(text) > _MAX_TEXT:
+            raise too_large(
+                "Text is too long", where=f"{self._path}, {where}", limit=_MAX_TEXT, got=len(text), unit="letters"
+            )
+        return text
+
+    def image_files(self, key: str, length: int) -> Iterator[bytes]:
+        """A dataset (length,) of encoded images, as bytes each, a few in memory at a time.
+
+        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, too_large, path_traversal.
+        """
+        dataset = self._dataset(key, whole=False)
+        fixed = dataset.dtype.kind == "S"
+        variable = self._h5py.check_vlen_dtype(dataset.dtype) == np.dtype(np.uint8)
+        if dataset.ndim != 1 or not (fixed or variable):
+            raise self._rejected(
+                "unreadable", "Images are not stored as encoded bytes", key, "(N,) byte strings", dataset.dtype
+            )
+        self._check_shape(key, dataset.shape, (length,))
+        rows = dataset.chunks[0] if dataset.chunks else _BLOCK_IMAGES
+        rows = max(1, min(rows, _BLOCK_BYTES // max(dataset.dtype.itemsize, 1)))
+        for start in range(0, length, rows):
+            with self._reading(key):
+                if variable:
+                    check_entries(dataset, start, min(start + rows, length), self._local, f"{self._path}, {key}")
+                block = [bytes(item) for item in dataset[start : start + rows]]
+            yield from block
+
+    def _node(self, key: str) -> Any:
+        """The object at `key`, or None. Links are refused unfollowed: a soft one may lead to one out of the file."""
+        node: Any = self._handle
+        for part in key.strip("/").split("/"):
+            if not isinstance(node, self._h5py.Group) or not node.id.links.exists(part.encode()):
+                return None
+            if node.id.links.get_info(part.encode()).type != self._h5py.h5l.TYPE_HARD:
+                raise self._rejected("path_traversal", "Entry is a link", key, "data in this file", f"a link at {part}")
+            node = node[part]
+        return node
+
+    def _dataset(self, key: str, *, whole: bool = True) -> Any:
+        """The dataset at `key`; with `whole` it is small enough to be read at once."""
+        with self._reading(key):
+            node = self._node(key)
+            if not isinstance(node, self._h5py.Dataset):
+                got = ", ".join(self._handle) or "nothing"
+                raise self._rejected("missing_column", "File lacks a dataset", key, key, f"top level: {got}")
+            if node.external or node.is_virtual:
+                raise self._rejected(
+                    "path_traversal", "Dataset lies in other files", key, "data in this file", "external storage"
+                )
+            # A chunk is unpacked as a whole, whatever little of it is wanted.
+            chunk = int(np.prod(node.chunks or (), dtype=np.float64)) * node.dtype.itemsize if node.chunks else 0
+            largest = max(int(node.nbytes) if whole else 0, chunk)
+            where = f"{self._path}, {key}"
+            if largest > MAX_ARRAY_BYTES:
+                raise too_large("Dataset is too large", where=where, limit=MAX_ARRAY_BYTES, got=largest, unit="bytes")
+            if not whole and node.size > MAX_FRAMES:
+                raise too_large(
+                    "Dataset claims too many images", where=where, limit=MAX_FRAMES, got=node.size, unit="images"
+                )
+            return node
+
+    def _check_shape(self, key: str, found: tuple[int, ...], wanted: Sequence[int | None]) -> None:
+        fits = len(found) == len(wanted) and all(
+            size > 0 if want is None else size == want for size, want in zip(found, wanted, strict=True)
+        )
+        if not fits:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Dataset has a wrong shape",
+                where=f"{self._path}, {key}",
+                expected=tuple("N" if want is None else want for want in wanted),
+                got=found,
+                evidence={"dataset": key, "shape": list(found)},
+            )
+
+    def _rejected(self, reason: Any, what: str, key: str, expected: object, got: object) -> RejectedInputError:
+        return RejectedInputError(reason, what, where=f"{self._path}, {key}", expected=expected, got=got)
+
+    @contextmanager
+    def _reading(self, key: str) -> Iterator[None]:
+        try:
+            yield
+        except _DAMAGED as error:
+            raise self._rejected("unreadable", "Dataset cannot be read", key, "an intact file", str(error)) from error
+
+
+@contextmanager
+def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
+    """A file, open for reading while the context lasts.
+
+    Raises: RejectedInputError (missing_file, special_file, unreadable); UnavailableError without h5py.
+    """
+    h5py = require_h5py()
+    local = regular_file(path)
+    try:
+        handle = h5py.File(local, "r", locking=False)
+    except _DAMAGED as error:
+        raise RejectedInputError(
+            "unreadable",
+            "HDF5 file cannot be opened",
+            where=str(path),
+            expected="a complete HDF5 file",
+            got=str(error),
+            next_step="copy the file again; it may be truncated",
+        ) from error
+    with handle:
+        yield Hdf5File(path, local, handle)

@@ -1,0 +1,1 @@
+"""MCAP recordings: this project's own topics, and those of ROS 2 and Foxglove (`topics`)."""

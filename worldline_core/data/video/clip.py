@@ -1,0 +1,265 @@
+"""The encoded video of one view of an episode: where it lies, and its pictures one after the other.
+
+A picture keeps the decoder's frame: grey values cost nothing, colours only where they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import av
+import av.error
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.reformatter import ColorRange
+from av.video.stream import VideoStream
+
+from worldline_core.data.guards.limits import MAX_PIXELS, check_image_size
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, local_file
+from worldline_core.data.video.header import check_video_header
+
+_LUMA_FIRST = frozenset(
+    ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
+)
+_FULL_RANGE = frozenset(("yuvj420p", "yuvj422p", "yuvj444p", "yuvj440p"))
+# Further from the place of a frame than this share of a frame is not that frame.
+FRAME_TOLERANCE = 0.25
+_BOUNDED = {"max_pixels": str(MAX_PIXELS)}
+_MAX_STREAMS = 16
+
+
+@dataclass(frozen=True)
+class VideoClip:
+    """One view's frames inside of a video file.
+
+    Attributes:
+        path: of the file, local or remote.
+        num_frames: of the clip.
+        fps: rate of the clip.
+        from_time: presentation time [s] of the first frame where several episodes share a file; frames are then found by
+            time. None: frames are counted from the file's first one, whatever times they carry.
+        skip: frames between that first one and the clip's.
+        file_frames: how many frames the whole file must have (from_time None); None: not known.
+    """
+
+    path: AnyPath
+    num_frames: int
+    fps: float
+    from_time: float | None = None
+    skip: int = 0
+    file_frames: int | None = None
+
+    @classmethod
+    def whole_file(cls, path: AnyPath, num_frames: int, fps: float) -> VideoClip:
+        """A file that holds this episode's view and nothing else; another number of frames in it is an error."""
+        return cls(path, num_frames, fps, file_frames=num_frames)
+
+    def cut(self, start: int, stop: int) -> VideoClip:
+        """Frames start..stop (exclusive) of the clip."""
+        return replace(self, skip=self.skip + start, num_frames=stop - start)
+
+    @property
+    def start_time(self) -> float:
+        """Presentation time [s] of the clip's frame 0, where frames are found by time."""
+        return (self.from_time or 0.0) + self.skip / self.fps
+
+
+class Picture:
+    """One decoded frame."""
+
+    def __init__(self, frame: VideoFrame) -> None:
+        self._frame = frame
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self._frame.height, self._frame.width
+
+    @property
+    def full_range(self) -> bool:
+        """Whether black is 0 and white 255 in `luma`, instead of 16 and 235."""
+        return self._frame.format.name in _FULL_RANGE or self._frame.color_range == ColorRange.JPEG
+
+    @property
+    def luma(self) -> np.ndarray:
+        """uint8 (H, W), a view into the decoder's memory where the format allows it."""
+        frame = self._frame
+        if frame.format.name not in _LUMA_FIRST:  # more than 8 bits, or no YUV at all
+            frame = frame.reformat(format="yuv420p", dst_color_range=self._frame.color_range)
+        plane = frame.planes[0]
+        rows = np.frombuffer(plane, dtype=np.uint8, count=plane.line_size * plane.height)
+        return rows.reshape(plane.height, plane.line_size)[:, : plane.width]
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """uint8 (H, W, 3)."""
+        return self._frame.to_ndarray(format="rgb24")
+
+    @property
+    def damaged(self) -> bool:
+        """Whether the decoder had to make up parts of it."""
+        return bool(self._frame.is_corrupt)
+
+    def seconds(self, time_base: Fraction) -> float | None:
+        """Presentation time."""
+        return None if self._frame.pts is None else float(self._frame.pts * time_base)
+
+
+@contextmanager
+def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """A video file and its first video stream, once what its header claims has been checked.
+
+    FFmpeg's errors inside of the block become RejectedInputErrors as well.
+
+    Raises: RejectedInputError (missing_file, unreadable, truncated_video, too_large, special_file).
+    """
+    file = local_file(path)
+    check_video_header(file)
+    try:
+        # The streams' own headers may claim what the container's did not, and no other file may be drawn in.
+        with av.open(  # pyright: ignore[reportCallIssue] - the stubs take stream_options for a list of str
+            str(file),
+            options={"protocol_whitelist": "file"},
+            stream_options=[_BOUNDED] * _MAX_STREAMS,  # pyright: ignore[reportArgumentType]
+            metadata_errors="replace",
+        ) as container:
+            if not container.streams.video:
+                raise RejectedInputError(
+                    "unreadable",
+                    "File holds no video stream",
+                    where=str(path),
+                    expected="one video stream",
+                    got="none",
+                )
+            stream = container.streams.video[0]
+            if stream.codec_context is None:  # the type stubs know no such stream
+                raise undecodable(path, "a codec that this FFmpeg does not know")
+            check_image_size(stream.width, stream.height, str(path))
+            stream.codec_context.options = _BOUNDED
+            stream.thread_type = "NONE"  # small pictures decode faster than threads start
+            yield container, stream
+    except av.error.FFmpegError as error:
+        raise undecodable(path, error) from error
+
+
+def undecodable(path: AnyPath, error: object) -> RejectedInputError:
+    """The rejection of a video that breaks off."""
+    return RejectedInputError(
+        "truncated_video",
+        "Video cannot be decoded",
+        where=str(path),
+        expected="a complete video file",
+        got=str(error),
+        next_step="copy the file again; it may be truncated",
+    )
+
+
+def seek_before(container: InputContainer, stream: VideoStream, time: float) -> Iterator[VideoFrame]:
+    """Decoded frames from a key frame at or before a presentation time [s].
+
+    Where frames are stored in another order than shown, a container may seek to a key frame shown after the wanted
+    time (it is stored before it): then again, from further back.
+    """
+    time_base = stream.time_base or Fraction(1, 1000)
+    tolerance = FRAME_TOLERANCE / float(stream.average_rate or 30)
+    margin = 0.0
+    while time - margin > 0:
+        container.seek(max(round((time - margin) / time_base), 0), stream=stream, backward=True, any_frame=False)
+        frames = container.decode(stream)
+        first = next((frame for frame in frames if frame.pts is not None), None)
+        if first is not None and first.pts is not None and float(first.pts * time_base) <= time + tolerance:
+            yield first
+            yield from frames
+            return
+        margin = max(2 * margin, 0.25)
+    container.seek(0, stream=stream, backward=True, any_frame=False)
+    yield from container.decode(stream)
+
+
+def read_clip(clip: VideoClip) -> Iterator[Picture]:
+    """The pictures of a clip in order, num_frames of them.
+
+    Raises: RejectedInputError (missing_file, unreadable, too_large; truncated_video when frames are missing,
+        length_mismatch when the file has too many).
+    """
+    if clip.from_time is None:
+        yield from _counted(clip)
+    else:
+        yield from _timed(clip)
+
+
+def _counted(clip: VideoClip) -> Iterator[Picture]:
+    seen = 0
+    expected = clip.file_frames if clip.file_frames is not None else clip.skip + clip.num_frames
+    with named_break(clip, lambda: seen), open_video(clip.path) as (container, stream):
+        for frame in container.decode(stream):
+            if frame.pts is None:
+                continue
+            if clip.skip <= seen < clip.skip + clip.num_frames:
+                yield Picture(frame)
+            seen += 1
+            if clip.file_frames is None and seen == expected:
+                return
+    if seen != expected:
+        raise wrong_count(clip.path, expected, seen)
+
+
+def _timed(clip: VideoClip) -> Iterator[Picture]:
+    found = 0
+    with named_break(clip, lambda: found), open_video(clip.path) as (container, stream):
+        time_base = stream.time_base or Fraction(1, 1000)
+        for frame in seek_before(container, stream, clip.start_time):
+            if frame.pts is None:
+                continue
+            number = (float(frame.pts * time_base) - clip.start_time) * clip.fps
+            if round(number) == found and abs(number - found) < FRAME_TOLERANCE:
+                yield Picture(frame)
+                found += 1
+            if found == clip.num_frames:
+                return
+            if number > found + 1:
+                break
+    raise wrong_count(clip.path, clip.num_frames, found)
+
+
+@contextmanager
+def named_break(clip: VideoClip, seen: Callable[[], int]) -> Iterator[None]:
+    """A stream that breaks while it is read: the error names how many frames there were and should be."""
+    try:
+        yield
+    except RejectedInputError as error:
+        if error.reason != "truncated_video" or "decoded_frames" in error.evidence:
+            raise
+        raise wrong_count(clip.path, clip.file_frames or clip.num_frames, seen(), str(error.got)) from error
+
+
+def damaged_frame(clip: VideoClip, picture: Picture, number: int) -> RejectedInputError:
+    """The rejection of a video with a frame that is not whole, or of another size than the video."""
+    return RejectedInputError(
+        "truncated_video",
+        "Frame is damaged" if picture.damaged else "Frame has another size than its video",
+        where=f"{clip.path}, frame {number}",
+        expected="a whole frame of the video's size",
+        got="one that the decoder had to make up in part" if picture.damaged else str(picture.size),
+        next_step="copy the file again; it may be damaged",
+        evidence={"frame": number, "decoded_frames": number, "expected_frames": clip.num_frames},
+    )
+
+
+def wrong_count(path: AnyPath, expected: int | None, got: int, cause: str | None = None) -> RejectedInputError:
+    """The rejection of a video with another number of frames than it should have."""
+    too_few = cause is not None or (expected or 1) > got
+    return RejectedInputError(
+        "truncated_video" if too_few else "length_mismatch",
+        "Video is truncated or undecodable" if too_few else "Video has too many frames",
+        where=str(path),
+        expected="at least 1 frame" if expected is None else f"{expected} frames",
+        got=f"{got} frames" + (f" ({cause})" if cause else ""),
+        next_step="copy the file again, or leave the episode in quarantine",
+        evidence={"expected_frames": expected, "decoded_frames": got},
+    )

@@ -1,0 +1,226 @@
+"""Writing video with PyAV, reproducibly and frame by frame; joining videos without encoding.
+
+Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
+
+Encoding is single-threaded libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key frame, and
+presentation order equals file order: clips can be joined without encoding again and found by frame number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import av
+import cv2
+import numpy as np
+from av.bitstream import BitStreamFilterContext
+from av.codec.context import Flags
+
+from worldline_core.data.video.nal_units import length_prefixed
+from worldline_core.errors import DataError
+
+PixelFormat = Literal["yuv420p", "yuv444p"]
+
+# BT.601, limited range: what FFmpeg assumes for untagged video of standard definition, hence what every reader
+# of these files will invert. Rows give Y, U, V of an RGB value in 0..255.
+_RGB_TO_YUV = np.array(
+    [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]], dtype=np.float32
+) / np.float32(255.0)
+_YUV_OFFSET = (16.0, 128.0, 128.0)
+_KEY_FRAME_INTERVAL = 250
+BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
+"""How an mp4 is opened for writing, so that its bytes hold no times and no versions."""
+X264_PARAMETERS = "cpu-independent=1"
+"""Without this x264 chooses other algorithms on other processors, and with AVX-512 about one clip in a hundred came out
+differently from run to run."""
+
+
+def frame_rate(fps: float) -> Fraction:
+    """Frames per second as an exact fraction (29.97 becomes 30000/1001).
+
+    Raises: DataError when fps is not a positive number.
+    """
+    if not np.isfinite(fps) or fps <= 0:
+        raise DataError("Frame rate must be a positive number", expected="fps > 0", got=str(fps))
+    return Fraction(fps).limit_denominator(1001)
+
+
+def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
+    """One RGB frame (H, W, 3) as the stacked planes that `VideoFrame.from_ndarray` expects."""
+    rgb = frame.astype(np.float32)
+    luma = rgb @ _RGB_TO_YUV[0] + _YUV_OFFSET[0]
+    height, width = frame.shape[:2]
+    if pixel_format == "yuv420p":
+        # Chroma from the mean of each 2x2 block, not from one of its pixels: small coloured objects keep their hue.
+        rgb = cv2.resize(rgb, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    planes = [luma, rgb @ _RGB_TO_YUV[1] + _YUV_OFFSET[1], rgb @ _RGB_TO_YUV[2] + _YUV_OFFSET[2]]
+    quantised = [np.clip(np.rint(plane), 0, 255).astype(np.uint8) for plane in planes]
+    if pixel_format == "yuv444p":
+        return np.stack(quantised)
+    flat = np.concatenate([plane.reshape(-1) for plane in quantised])
+    return flat.reshape(height * 3 // 2, width)
+
+
+class VideoEncoder:
+    """Writes an H.264 mp4 picture by picture; use as a context manager. Its bytes depend on the arguments alone.
+
+    Args:
+        size: (height, width); both even for yuv420p.
+        crf: quality, 0 (exact up to the colour conversion) .. 51.
+
+    Raises: DataError for a size or rate that cannot be encoded.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        size: tuple[int, int],
+        fps: float,
+        *,
+        crf: int = 18,
+        preset: str = "slow",
+        pixel_format: PixelFormat = "yuv420p",
+    ) -> None:
+        height, width = size
+        if pixel_format == "yuv420p" and (height % 2 or width % 2):
+            raise DataError(
+                "yuv420p needs even image sides",
+                where=str(path),
+                expected="even height and width",
+                got=f"{height}x{width}",
+                next_step="choose another image size, or pixel_format yuv444p",
+            )
+        self.path = path
+        self.size = size
+        self.count = 0
+        self._rate = frame_rate(fps)
+        self._pixel_format: PixelFormat = pixel_format
+        self._out = av.open(str(path), "w", format="mp4", options=BITEXACT)
+        stream = self._out.add_stream("libx264", rate=self._rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
+        context = stream.codec_context
+        context.thread_count = 1
+        context.time_base = 1 / self._rate
+        context.flags |= int(Flags.bitexact)
+        stream.options = {
+            "crf": str(crf),
+            "preset": preset,
+            "bf": "0",
+            "g": str(_KEY_FRAME_INTERVAL),
+            "threads": "1",
+            "x264-params": X264_PARAMETERS,
+            "colorspace": "smpte170m",
+            "color_range": "tv",
+        }
+        self._stream = stream
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write what the encoder still holds. Of a picture that was refused nothing is in the file."""
+        if self.count:
+            self._out.mux(self._stream.encode(None))
+        self._out.close()
+
+    def add(self, image: np.ndarray) -> None:
+        """The next picture, uint8 (H, W, 3) RGB.
+
+        Raises: DataError when it has another size or type.
+        """
+        if image.dtype != np.uint8 or image.shape != (*self.size, 3):
+            raise DataError(
+                "Pictures of a video differ",
+                where=f"{self.path}, frame {self.count}",
+                expected=f"uint8 {(*self.size, 3)}",
+                got=f"{image.dtype} {image.shape}",
+            )
+        picture = av.VideoFrame.from_ndarray(_planar(image, self._pixel_format), format=self._pixel_format)
+        picture.pts = self.count
+        picture.time_base = 1 / self._rate
+        self._out.mux(self._stream.encode(picture))
+        self.count += 1
+
+
+def encode_video(
+    path: Path,
+    frames: np.ndarray,
+    fps: float,
+    *,
+    crf: int = 18,
+    preset: str = "slow",
+    pixel_format: PixelFormat = "yuv420p",
+) -> None:
+    """Write frames as an H.264 mp4 whose bytes depend on the arguments alone.
+
+    Args:
+        frames: uint8 (N, H, W, 3) RGB; H and W even for yuv420p.
+        crf: quality, 0 (exact up to the colour conversion) .. 51.
+
+    Raises: DataError for empty, wrongly shaped or wrongly typed frames.
+    """
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or frames.shape[0] == 0:
+        raise DataError(
+            "Cannot encode these frames as video",
+            where=str(path),
+            expected="uint8 (N > 0, H, W, 3)",
+            got=f"{frames.dtype} {frames.shape}",
+        )
+    size = frames.shape[1], frames.shape[2]
+    with VideoEncoder(path, size, fps, crf=crf, preset=preset, pixel_format=pixel_format) as encoder:
+        for frame in frames:
+            encoder.add(frame)
+
+
+def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float) -> None:
+    """Join clips of one encoder setting into one mp4 without encoding again.
+
+    Args:
+        parts: (clip written by `encode_video`, its frame count), in order.
+
+    Raises: DataError when a part holds another number of frames than stated.
+    """
+    rate = frame_rate(fps)
+    with av.open(str(path), "w", format="mp4", options=BITEXACT) as out:
+        stream = None
+        first_frame = 0
+        for part, expected in parts:
+            count = 0
+            with av.open(str(part)) as source:
+                template = source.streams.video[0]
+                if stream is None:
+                    stream = out.add_stream_from_template(template)
+                    stream.time_base = template.time_base
+                ticks = 1 / (rate * (template.time_base or 1 / rate))
+                # The encoder's own message (a kilobyte of settings) would otherwise repeat for each clip.
+                without_message = BitStreamFilterContext("filter_units=remove_types=6", template)
+                for filtered in _filtered(source.demux(template), without_message):
+                    packet = length_prefixed(filtered, template)
+                    packet.pts = packet.dts = round((first_frame + count) * ticks)
+                    packet.stream = stream
+                    out.mux(packet)
+                    count += 1
+            if count != expected:
+                raise DataError(
+                    "Video part has another length than its episode",
+                    where=str(part),
+                    expected=f"{expected} frames",
+                    got=f"{count} frames",
+                )
+            first_frame += count
+
+
+def _filtered(packets: Iterator[av.Packet], context: BitStreamFilterContext) -> Iterator[av.Packet]:
+    for packet in packets:
+        if packet.size:  # the demuxer ends with an empty flushing packet
+            yield from context.filter(packet)
+    yield from context.filter(None)
