@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 from object_store import ObjectStore
+from upath import UPath
 
 from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
@@ -19,7 +22,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
 from worldline_core.scale import transient
 from worldline_core.scale.mapping import SerialMapper
-from worldline_core.scale.remote import RemoteCache, process_cache
+from worldline_core.scale.remote import RemoteCache, list_files, process_cache
 from worldline_core.scale.shard_manifest import read_merged_manifest
 from worldline_core.scale.transient import UnreachableInputError
 from worldline_core.store.digest import digest_folder
@@ -104,6 +107,33 @@ def test_a_store_that_stays_away_is_no_reason_to_quarantine(
     store.misbehave = lambda method, path: None
     assert curated_digest(config(url), tmp_path / "out") == curated_digest(config(recordings), tmp_path / "local")
     assert {row.status for row in read_merged_manifest(tmp_path / "out")} == {"kept"}
+
+
+class Forgetful(MemoryFileSystem):
+    """Lists folder by folder, and every second listing fails."""
+
+    protocol = "forgetful"
+    store: ClassVar[dict[str, Any]] = {}
+    asked = 0
+
+    def ls(self, path: str, detail: bool = True, **options: Any) -> Any:
+        type(self).asked += 1
+        if self.asked % 2 == 0:
+            raise OSError(errno.EIO, "try again")
+        return super().ls(path, detail=detail, **options)
+
+
+def test_a_folder_that_could_not_be_listed_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    fs = Forgetful()
+    for name in ("a.txt", "one/b.txt"):
+        fs.pipe_file(f"/bucket/{name}", b"x")
+    location = UPath("memory://bucket")
+    monkeypatch.setattr(type(location), "fs", fs)
+    with pytest.raises(UnreachableInputError):  # every attempt fails in the second folder
+        list_files(location)
+    monkeypatch.setattr(Forgetful, "ls", MemoryFileSystem.ls)
+    assert list(list_files(location)) == ["a.txt", "one/b.txt"]
+    assert list_files(UPath("memory://bucket/none")) == {}
 
 
 @pytest.mark.parametrize("relative", ["../other/x.mp4", "a/../../x", "/etc/passwd", "s3://other/x", "a\0b"])

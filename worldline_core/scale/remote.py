@@ -16,6 +16,8 @@ from collections import OrderedDict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
+from fsspec import AbstractFileSystem
+from fsspec.asyn import AsyncFileSystem
 from upath import UPath
 from upath.implementations.local import FilePath
 
@@ -78,9 +80,50 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
     """
     fs = file_system(root)
     base = fs._strip_protocol(str(root)).rstrip("/")
-    found = with_retries(lambda: fs.find(base, detail=True), str(root))
+    found = with_retries(lambda: _find(fs, base), str(root))
     relative = {name.removeprefix(base).lstrip("/"): about for name, about in found.items()}
     return {name: relative[name] for name in sorted(relative) if name}
+
+
+def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:
+    lists_all = getattr(type(fs), "_find", AsyncFileSystem._find) is not AsyncFileSystem._find
+    if lists_all or (not isinstance(fs, AsyncFileSystem) and type(fs).find is not AbstractFileSystem.find):
+        return fs.find(base, detail=True)
+    # fsspec's own walk leaves out the folders that it could not list, below the first one even when told not to.
+    found: dict[str, dict[str, Any]] = {}
+    folders = [base]
+    try:
+        while folders:
+            folder = folders.pop()
+            for about in fs.ls(folder, detail=True):
+                name = about["name"].rstrip("/")
+                if about["type"] != "directory":
+                    found[name] = about
+                elif name != folder.rstrip("/"):
+                    folders.append(name)
+    except FileNotFoundError:
+        if _kind_at(fs, base) is not None:
+            raise  # it vanished meanwhile
+    return found
+
+
+def remote_kind(path: AnyPath) -> str | None:
+    """What is at a location: "file", "directory", or None for nothing.
+
+    fsspec's `isfile` takes an answer that did not come for a no; then an optional file would be left out silently.
+
+    Raises: PermissionError where the store does not say; UnreachableInputError when it does not answer.
+    """
+    fs = file_system(path)
+    return with_retries(lambda: _kind_at(fs, fs._strip_protocol(str(path))), str(path))
+
+
+def _kind_at(fs: Any, name: str) -> str | None:
+    """`remote_kind` of a name in a file system, asked once."""
+    try:
+        return fs.info(name)["type"]
+    except FileNotFoundError:
+        return None
 
 
 _CHANGE_MARKS = (

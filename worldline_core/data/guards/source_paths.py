@@ -17,8 +17,15 @@ from upath import UPath
 from worldline_core.data.guards.file_watch import note_file
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.scale.remote import AnyPath, is_remote, list_files, matching, parse_location, process_cache
-from worldline_core.scale.transient import with_retries
+from worldline_core.scale.remote import (
+    AnyPath,
+    is_remote,
+    list_files,
+    matching,
+    parse_location,
+    process_cache,
+    remote_kind,
+)
 
 __all__ = [
     "AnyPath",
@@ -110,27 +117,38 @@ def local_file(path: AnyPath) -> Path:
     except (FileNotFoundError, IsADirectoryError) as error:
         raise RejectedInputError("missing_file", "File is missing", where=str(path)) from error
     except PermissionError as error:
-        raise RejectedInputError(
-            "unreadable", "File may not be read", where=str(path), next_step="check the rights of the account"
-        ) from error
+        raise _not_allowed(path) from error
 
 
 def is_file(path: AnyPath) -> bool:
     """Whether there is a file.
 
-    Raises: UnreachableInputError when the store does not answer.
+    Raises: RejectedInputError (unreadable) where the store does not say; UnreachableInputError when it does not answer.
     """
     if isinstance(path, Path):
         return path.is_file()
-    return process_cache().has(path) or with_retries(path.is_file, str(path))
+    return process_cache().has(path) or _remote_kind(path) == "file"
 
 
 def exists(path: AnyPath) -> bool:
     """Whether there is a file or a folder.
 
-    Raises: UnreachableInputError when the store does not answer.
+    Raises: RejectedInputError (unreadable) where the store does not say; UnreachableInputError when it does not answer.
     """
-    return path.exists() if isinstance(path, Path) else with_retries(path.exists, str(path))
+    return path.exists() if isinstance(path, Path) else _remote_kind(path) is not None
+
+
+def _remote_kind(path: AnyPath) -> str | None:
+    try:
+        return remote_kind(path)
+    except PermissionError as error:
+        raise _not_allowed(path) from error
+
+
+def _not_allowed(path: AnyPath) -> RejectedInputError:
+    return RejectedInputError(
+        "unreadable", "File may not be read", where=str(path), next_step="check the rights of the account"
+    )
 
 
 def find_files[P: AnyPath](root: P, pattern: str) -> list[P]:
