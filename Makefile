@@ -31,7 +31,7 @@ install-scale: install
 	$(UV) sync --frozen --inexact --extra sim --group scale
 
 .bootstrap/bin/uv:
-	python3 -m venv .bootstrap
+	python3 -m venv .bootstrap || { echo "Install Python's venv (Debian: apt-get install python3-venv), or uv (https://docs.astral.sh/uv)"; rm -rf .bootstrap; exit 1; }
 	.bootstrap/bin/pip install --quiet uv
 
 # The recordings that the demo uses, made again from their seeds (needs software GL, see README).
