@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import pytest
+from pydantic import Field
 
 from worldline_core.config import StrictModel, load_config
-from worldline_core.config.loader import apply_overrides, preset_names, preset_path, read_yaml
+from worldline_core.config.loader import apply_overrides, preset_names, preset_path, read_yaml, validate
 from worldline_core.errors import ConfigError
 
 
@@ -90,3 +92,38 @@ def test_unknown_preset_lists_those_there_are() -> None:
 def test_anchors_and_merges_work(tmp_path: Path) -> None:
     text = "a: &one {steps: 1, rate: 2.0}\nb: {<<: *one, rate: 3.0}\n"
     assert read_yaml(_write(tmp_path, text)) == {"a": {"steps": 1, "rate": 2.0}, "b": {"steps": 1, "rate": 3.0}}
+
+
+class Apple(StrictModel):
+    kind: Literal["apple"]
+    colour: str = "red"
+
+
+class Pear(StrictModel):
+    kind: Literal["pear"]
+    weight: float = 0.2
+
+
+type Fruit = Annotated[Apple | Pear, Field(discriminator="kind")]
+
+
+class Basket(StrictModel):
+    fruits: tuple[Fruit, ...] = Field(min_length=1)
+    named: dict[str, Inner | None] = Field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"fruits": [{"kind": "apple", "color": "red"}]},
+            r"fruits\.0\.apple\.color: unknown key; did you mean 'colour'",
+        ),
+        ({"fruits": [{"kind": "pear", "x": 1}]}, r"fruits\.0\.pear\.x: unknown key; known keys: kind, weight$"),
+        ({"fruits": [{"kind": "pear"}], "named": {"a": {"stepz": 1}}}, r"stepz: unknown key; did you mean 'steps'"),
+    ],
+)
+def test_keys_inside_of_unions_lists_and_mappings_are_known(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        validate(Basket, values, where="here")
+    assert "at least 1 item" not in str(caught.value)

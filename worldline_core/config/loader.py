@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -128,7 +129,10 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
         return model.model_validate(dict(values))
     except ValidationError as error:
         lines = []
-        for problem in error.errors():
+        problems = error.errors()
+        for problem in problems:
+            if problem["type"] == "too_short" and any(_inside(other["loc"], problem["loc"]) for other in problems):
+                continue  # it is short because of an item that is wrong itself
             dotted = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
                 known = _known_keys(model, problem["loc"][:-1])
@@ -140,14 +144,43 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
         raise ConfigError("The configuration is not valid", where=where, got="\n    " + "\n    ".join(lines)) from error
 
 
+def _inside(location: Sequence[int | str], outer: Sequence[int | str]) -> bool:
+    return len(location) > len(outer) and tuple(location[: len(outer)]) == tuple(outer)
+
+
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
-    current: Any = model
+    """The keys that a place in the configuration takes, through lists, mappings and unions."""
+    types: list[Any] = [model]
     for part in location:
-        field = getattr(current, "model_fields", {}).get(part)
-        if field is None:
-            return []
-        current = field.annotation
-    return sorted(getattr(current, "model_fields", {}))
+        found: list[Any] = []
+        for current in types:
+            field = getattr(current, "model_fields", {}).get(part)
+            if field is not None:
+                found += _alternatives(field.annotation)
+            elif issubclass(get_origin(current) or object, list | tuple | Mapping):
+                found += [member for item in get_args(current) if item is not ... for member in _alternatives(item)]
+        # No field, no item: the tag that says which member of a union was meant.
+        types = found or [current for current in types if part in _tags(current)] or types
+    return sorted({key for current in types for key in getattr(current, "model_fields", {})})
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    """The members of a union, or what is annotated, by itself."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if isinstance(annotation, TypeAliasType):
+        return _alternatives(annotation.__value__)
+    if origin in (Union, UnionType):
+        return [member for item in get_args(annotation) for member in _alternatives(item)]
+    return [annotation]
+
+
+def _tags(model: Any) -> set[str]:
+    """What a model answers to in a union: its name, and the literals of its fields (`kind`)."""
+    fields = getattr(model, "model_fields", {}).values()
+    literals = {str(value) for f in fields if get_origin(f.annotation) is Literal for value in get_args(f.annotation)}
+    return literals | {getattr(model, "__name__", "")}
 
 
 def load_config[Model: BaseModel](
