@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from worldline_core.data.video.decode import decode_segment, decode_video, video_size
-from worldline_core.data.video.encoder import X264_PARAMETERS, concatenate_videos, encode_video
+from worldline_core.data.video.encoder import X264_PARAMETERS, VideoEncoder, concatenate_videos, encode_video
 from worldline_core.errors import DataError
 
 
@@ -50,6 +50,15 @@ def test_bytes_do_not_depend_on_the_processor(
     monkeypatch.setattr("worldline_core.data.video.encoder.X264_PARAMETERS", X264_PARAMETERS + ":asm=0")
     encode_video(tmp_path / "plain.mp4", frames, 8, crf=8, pixel_format=pixel_format)  # type: ignore[arg-type]
     assert (tmp_path / "here.mp4").read_bytes() == (tmp_path / "plain.mp4").read_bytes()
+
+
+def test_key_frames_are_where_they_are_wanted(tmp_path: Path) -> None:
+    with VideoEncoder(tmp_path / "k.mp4", (32, 48), 30, key_frame_interval=32) as encoder:
+        for frame in np.tile(picture(0, 1), (70, 1, 1, 1)):
+            encoder.add(frame)
+    with av.open(str(tmp_path / "k.mp4")) as container:
+        keys = [number for number, packet in enumerate(container.demux(video=0)) if packet.size and packet.is_keyframe]
+    assert keys == [0, 32, 64]
 
 
 @pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (200, 100, 50), (0, 0, 0), (255, 255, 255)])

@@ -98,6 +98,7 @@ def open_writer(config: CurateConfig, output: Path) -> EpisodeSetWriter:
         video_preset=config.video_preset,
         pixel_format=config.pixel_format,
         video_mode=config.video_mode,
+        key_frame_interval=config.key_frame_interval,
     )
 
 

@@ -37,7 +37,7 @@ from worldline_core.data.episodes.sidecar import write_sidecar
 from worldline_core.data.episodes.view_recording import RecordedView, VideoMode, VideoSettings
 from worldline_core.data.guards.source_paths import safe_name
 from worldline_core.data.lerobot.v3_writer import write_dataset
-from worldline_core.data.video.encoder import PixelFormat
+from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
@@ -55,6 +55,7 @@ class EpisodeSetWriter:
         image_size: (H, W) every image must have; None accepts several.
         video_crf: x264 quality; 18 is visually exact, 28 small.
         video_mode: "auto" copies encoded videos in which nothing changes, "encode" encodes every picture.
+        key_frame_interval: frames from one key frame of an encoded video to the next.
 
     Raises: DataError when the folder already holds a finished set.
     """
@@ -69,6 +70,7 @@ class EpisodeSetWriter:
         pixel_format: PixelFormat = "yuv420p",
         video_megabytes: int = 200,
         video_mode: VideoMode = "auto",
+        key_frame_interval: int = KEY_FRAME_INTERVAL,
     ) -> None:
         if self.finished(root):
             raise DataError(
@@ -79,7 +81,7 @@ class EpisodeSetWriter:
         self.root = root
         self.fps = fps
         self.image_size = image_size
-        self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode)
+        self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode, key_frame_interval)
         self.video_megabytes = video_megabytes
         self._work = root / "run" / "episodes"
         self._parts = self._work / "parts"

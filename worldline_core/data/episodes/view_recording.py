@@ -18,7 +18,7 @@ from worldline_core.data.episodes.statistics import ImageSampler
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, damaged_frame, open_video, read_clip
 from worldline_core.data.video.copy import clip_copy
-from worldline_core.data.video.encoder import PixelFormat, VideoEncoder
+from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat, VideoEncoder
 from worldline_core.data.video.resize import Fit, fitted
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
 
@@ -33,6 +33,7 @@ class VideoSettings:
     preset: str = "slow"
     pixel_format: PixelFormat = "yuv420p"
     mode: VideoMode = "auto"
+    key_frame_interval: int = KEY_FRAME_INTERVAL
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ def _encoded(recorded: RecordedView, path: Path, fps: float, video: VideoSetting
                         crf=video.crf,
                         preset=video.preset,
                         pixel_format=video.pixel_format,
+                        key_frame_interval=video.key_frame_interval,
                     )
                 image = transform.frames(image[None])[0]
                 if sampler.wants(encoder.count):

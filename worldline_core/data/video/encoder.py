@@ -31,7 +31,7 @@ _RGB_TO_YUV = np.array(
     [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]], dtype=np.float32
 ) / np.float32(255.0)
 _YUV_OFFSET = (16.0, 128.0, 128.0)
-_KEY_FRAME_INTERVAL = 250
+KEY_FRAME_INTERVAL = 250
 BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
 """How an mp4 is opened for writing, so that its bytes hold no times and no versions."""
 X264_PARAMETERS = "cpu-independent=1"
@@ -71,6 +71,7 @@ class VideoEncoder:
     Args:
         size: (height, width); both even for yuv420p.
         crf: quality, 0 (exact up to the colour conversion) .. 51.
+        key_frame_interval: frames from one key frame to the next at most.
 
     Raises: DataError for a size or rate that cannot be encoded.
     """
@@ -84,6 +85,7 @@ class VideoEncoder:
         crf: int = 18,
         preset: str = "slow",
         pixel_format: PixelFormat = "yuv420p",
+        key_frame_interval: int = KEY_FRAME_INTERVAL,
     ) -> None:
         height, width = size
         if pixel_format == "yuv420p" and (height % 2 or width % 2):
@@ -110,7 +112,7 @@ class VideoEncoder:
             "crf": str(crf),
             "preset": preset,
             "bf": "0",
-            "g": str(_KEY_FRAME_INTERVAL),
+            "g": str(key_frame_interval),
             "threads": "1",
             "x264-params": X264_PARAMETERS,
             "colorspace": "smpte170m",
