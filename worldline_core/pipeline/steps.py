@@ -79,7 +79,7 @@ _STEPS = (
     ),
     Step(
         "filter",
-        3,
+        4,
         "worldline_core.filters.filter",
         "filter_episodes",
         "FilterConfig",

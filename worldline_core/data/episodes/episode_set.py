@@ -163,14 +163,7 @@ class EpisodeSet:
             )
         return whole if (row.start, row.stop) == (0, whole.num_frames) else whole.cut(row.start, row.stop)
 
-    def frames(self, i: int, view: str, indices: Sequence[int] | None = None) -> np.ndarray:
-        """uint8 (len, H, W, 3) RGB frames of a view.
-
-        Args:
-            indices: frame numbers counted from the start of the row's segment; None for all that have images.
-
-        Raises: DataError when the view, the file or a frame is missing, or the video is truncated.
-        """
+    def _row_with(self, i: int, view: str) -> EpisodeRow:
         row = self.rows[i]
         if view not in row.views:
             raise DataError(
@@ -179,6 +172,17 @@ class EpisodeSet:
                 expected=", ".join(row.views),
                 got=view,
             )
+        return row
+
+    def frames(self, i: int, view: str, indices: Sequence[int] | None = None) -> np.ndarray:
+        """uint8 (len, H, W, 3) RGB frames of a view.
+
+        Args:
+            indices: frame numbers counted from the start of the row's segment; None for all that have images.
+
+        Raises: DataError when the view, the file or a frame is missing, or the video is truncated.
+        """
+        row = self._row_with(i, view)
         dataset, _ = self._open(i)
         wanted = range(row.video_frames) if indices is None else [int(index) for index in indices]
         if any(index < 0 or index >= row.video_frames for index in wanted):
@@ -195,14 +199,7 @@ class EpisodeSet:
 
         Raises: DataError when the view is missing.
         """
-        row = self.rows[i]
-        if view not in row.views:
-            raise DataError(
-                "Episode has no such view",
-                where=f"episode {row.episode_id}",
-                expected=", ".join(row.views),
-                got=view,
-            )
+        row = self._row_with(i, view)
         dataset, _ = self._open(i)
         place = dataset.video(row.episode_index, IMAGE_PREFIX + view)
         return VideoClip(place.path, row.video_frames, dataset.fps, place.from_time, row.start)

@@ -39,3 +39,25 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> dict[str
     if not isinstance(size, int) or isinstance(size, bool) or size < 1:
         raise DataError("Chunk size is no count", where=where, expected="a whole number from 1 on", got=repr(size))
     return info
+
+
+class DescribedDataset:
+    """What `info.json` says of a dataset, whatever its version.
+
+    Attributes:
+        info: its content, checked by `read_info`.
+    """
+
+    info: dict[str, Any]
+
+    @property
+    def fps(self) -> float:
+        return float(self.info["fps"])
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        return self.info["features"]
+
+    @property
+    def video_keys(self) -> list[str]:
+        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]

@@ -15,7 +15,7 @@ from worldline_core.data.guards.parquet_file import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import fill_template, inside
 from worldline_core.data.lerobot.episode_table import EpisodeTable, whole_number
-from worldline_core.data.lerobot.info import read_info
+from worldline_core.data.lerobot.info import DescribedDataset, read_info
 from worldline_core.data.lerobot.v3 import column_to_numpy
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_video, video_size
@@ -24,7 +24,7 @@ from worldline_core.errors import DataError
 VERSION = "v2.1"
 
 
-class LeRobotV21Dataset:
+class LeRobotV21Dataset(DescribedDataset):
     """Read access to one dataset folder; the same methods as `LeRobotV3Dataset`.
 
     Raises: DataError on opening when the folder is not a LeRobotDataset v2.1.
@@ -33,18 +33,6 @@ class LeRobotV21Dataset:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.info = read_info(root, VERSION, ("data_path", "video_path", "chunks_size"))
-
-    @property
-    def fps(self) -> float:
-        return float(self.info["fps"])
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        return self.info["features"]
-
-    @property
-    def video_keys(self) -> list[str]:
-        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     @cached_property
     def episodes(self) -> EpisodeTable:

@@ -24,7 +24,7 @@ from worldline_core.data.guards.parquet_file import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import fill_template, find_files, inside
 from worldline_core.data.lerobot.episode_table import EpisodeTable, whole_number
-from worldline_core.data.lerobot.info import read_info
+from worldline_core.data.lerobot.info import DescribedDataset, read_info
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_segment, video_size
 from worldline_core.errors import DataError
@@ -46,7 +46,7 @@ class VideoPlace:
     from_time: float
 
 
-class LeRobotV3Dataset:
+class LeRobotV3Dataset(DescribedDataset):
     """Read access to one dataset folder.
 
     Raises: DataError on opening when the folder is not a LeRobotDataset v3.
@@ -56,18 +56,6 @@ class LeRobotV3Dataset:
         self.root = root
         self.info = read_info(root, VERSION)
         self._data: dict[Path, pa.Table] = {}
-
-    @property
-    def fps(self) -> float:
-        return float(self.info["fps"])
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        return self.info["features"]
-
-    @property
-    def video_keys(self) -> list[str]:
-        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     @cached_property
     def episodes(self) -> EpisodeTable:

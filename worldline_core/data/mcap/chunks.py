@@ -12,10 +12,24 @@ from typing import BinaryIO
 
 import lz4.frame
 import zstandard
+from mcap.exceptions import McapError
 
 from worldline_core.data.guards.limits import MAX_CHUNK_BYTES, too_large
 from worldline_core.data.guards.rejection import RejectedInputError
 
+# What the reader raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
+DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    EOFError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    IndexError,
+    struct.error,
+    OverflowError,
+    MemoryError,
+)
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK = 0x06
 _DATA_END = 0x0F

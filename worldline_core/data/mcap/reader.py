@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import base64
 import binascii
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zstandard
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -21,25 +18,11 @@ from worldline_core.data.guards.json_file import parse_json, well_formed
 from worldline_core.data.guards.limits import regular_file
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import local_file
-from worldline_core.data.mcap.chunks import check_chunks
+from worldline_core.data.mcap.chunks import DAMAGE, check_chunks
 from worldline_core.data.mcap.io import EPISODE_METADATA, READABLE_VERSIONS
 from worldline_core.geometry.distortion import Distortion, distortion_from_ros
 from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
 
-# What the reader raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
-_DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    EOFError,
-    ValueError,
-    RuntimeError,
-    KeyError,
-    IndexError,
-    OSError,
-    struct.error,
-    OverflowError,
-    MemoryError,
-)
 _TEXTS = (
     "episode_id",
     "source",
@@ -79,7 +62,7 @@ def _metadata(path: Path) -> dict[str, Any]:
     try:
         with file.open("rb") as stream:
             found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-    except _DAMAGE as error:
+    except (*DAMAGE, OSError) as error:
         raise RejectedInputError("unreadable", "MCAP file is damaged", where=path, got=repr(error)) from error
     if EPISODE_METADATA not in found:
         raise RejectedInputError(
@@ -113,7 +96,7 @@ def read_episode_mcap(path: Path) -> McapEpisode:
             for _, channel, message in make_reader(stream).iter_messages():
                 content = parse_json(message.data, f"{path}, topic {channel.topic}")
                 messages.setdefault(channel.topic, []).append((message.log_time, content))
-    except _DAMAGE as error:
+    except (*DAMAGE, OSError) as error:
         raise RejectedInputError("unreadable", "MCAP file is damaged", where=path, got=repr(error)) from error
     with well_formed(path, "an episode as mcap_io writes it"):
         return _assembled(about, messages, path)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
-import zstandard
-from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 from mcap.records import Channel, Schema
 from mcap.records import Message as Record
@@ -18,23 +15,9 @@ from mcap.summary import Summary
 from worldline_core.data.guards.limits import MAX_CHUNK_BYTES, regular_file
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.mcap.chunks import check_chunks
+from worldline_core.data.mcap.chunks import DAMAGE, check_chunks
 from worldline_core.data.mcap.topics.decoder import MessageDecoder
 from worldline_core.data.mcap.topics.messages import Kind, Message
-
-# What the reader raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
-_DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    EOFError,
-    ValueError,
-    RuntimeError,
-    KeyError,
-    IndexError,
-    struct.error,
-    OverflowError,
-    MemoryError,
-)
 
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * 8 + 29
@@ -145,7 +128,7 @@ class McapFile:
                     raise EOFError(f"{path.stat().st_size} bytes")
                 kind = SeekingReader if indexed else NonSeekingReader
                 yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise RejectedInputError(
                 "unreadable",
                 "MCAP file is damaged or was not finished",
