@@ -14,7 +14,9 @@ from safetensors.torch import load_file, save_file
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, TrainingError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.training import stage as stage_module
 from worldline_core.training import trainer as trainer_module
+from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.metrics_log import read_metrics
 from worldline_core.training.objective import FlowMatchingObjective
 from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
@@ -119,8 +121,20 @@ def test_a_killed_run_ends_with_the_same_bytes(
 def test_a_state_of_another_run_is_refused(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
     inputs = {**world.inputs, "stage1": stage1_folder}
     train_stage2(stage2(2), inputs, tmp_path)
-    with pytest.raises(ArtifactError, match="belongs to another run"):
+    with pytest.raises(ArtifactError, match="belongs to another run") as refused:
         train_stage2(stage2(3), inputs, tmp_path)
+    assert "give it the config that it began with" in str(refused.value)
+
+
+def test_a_state_that_was_trained_on_other_episodes_is_refused(
+    world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2), inputs, tmp_path)
+    monkeypatch.setattr(stage_module, "training_rows", lambda *args, **kwargs: list(training_rows(*args, **kwargs))[1:])
+    with pytest.raises(ArtifactError, match="belongs to another run") as refused:
+        train_stage2(stage2(2), inputs, tmp_path)
+    assert "give it the episodes that it began with" in str(refused.value)
 
 
 def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeConfig, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_source import named_rows
 from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.latent_store import TEMPORAL_COMPRESSION, LatentRow, LatentStore
 from worldline_core.training.processes import join_processes, wait_for_all
@@ -159,6 +160,7 @@ class DistillationStage:
                 "config": self.config.model_dump(mode="json"),
                 "parent": parent.weights_sha256,
                 "stage2": self.stage2_info.weights_sha256,
+                "episodes": named_rows(self.rows),
             },
             title=step.replace("_", " "),
             rank=self.rank,

@@ -36,6 +36,11 @@ class ClipRow(Protocol):
     def primary_view(self) -> str: ...
 
 
+def named_rows(rows: Sequence[ClipRow]) -> list[list[Any]]:
+    """What clips are drawn by, as JSON: two runs whose rows differ here train on other clips."""
+    return [[row.episode_id, row.num_frames, list(row.views), row.source, row.split, row.instruction] for row in rows]
+
+
 @dataclass(frozen=True)
 class Clip:
     """``num_frames`` frames at ``start``, ``start + stride``, ... of an episode."""

@@ -21,7 +21,7 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_reader import BatchReader, ClipReader, SkipLog
 from worldline_core.training.clip_sampler import PRIMARY, ClipSampler, ClipSampling, source_counts
-from worldline_core.training.clip_source import ClipRow, ClipSource
+from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows
 from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
 from worldline_core.training.frame_source import FrameSource
@@ -137,6 +137,7 @@ class Stage:
                     "config": config.model_dump(mode="json"),
                     "start": start,
                     "tokenizer": self.store.description["tokenizer"],
+                    "episodes": named_rows(self.rows),
                 },
                 title=self.title,
                 rank=self.rank,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,12 @@ from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.metrics_log import MetricsLog
 from worldline_core.training.processes import average_gradients, average_values
-from worldline_core.training.training_state import STATE_FILE, load_training_state, save_training_state
+from worldline_core.training.training_state import (
+    STATE_FILE,
+    identity_digests,
+    load_training_state,
+    save_training_state,
+)
 
 
 class OptimizerConfig(StrictModel):
@@ -128,7 +132,8 @@ def train[BatchT: NamedClips](
     Args:
         load: micro-step index to batch (a pure function).
         validate: called with the averaged weights in the model.
-        identity: JSON values that name this run (config, inputs); a state of another run is refused.
+        identity: JSON values that name this run (config, weights it starts from, clips); a state of another run is
+            refused.
 
     Raises:
         TrainingError: if the loss or the gradient is not finite.
@@ -142,12 +147,11 @@ def train[BatchT: NamedClips](
     optimizer = _optimizer(config.optimizer, groups)
     average = ExponentialAverage(parameters, config.ema_decay)
     # Another number of processes takes other batches: that is another run.
-    identity = {**identity, **({"processes": world_size} if world_size > 1 else {})}
-    fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    digests = identity_digests({**identity, "processes": world_size})
     state_path = output / STATE_FILE
     first, sums, count, last = 0, {}, 0, {}
     if state_path.is_file():
-        facts = load_training_state(state_path, parameters, average, optimizer, fingerprint)
+        facts = load_training_state(state_path, parameters, average, optimizer, digests)
         first, sums, count, last = facts["step"], facts["sums"], facts["count"], facts["last"]
         objective.load_state(facts["objective"])
     log = MetricsLog(output / "metrics.jsonl", first) if rank == 0 else None
@@ -187,7 +191,7 @@ def train[BatchT: NamedClips](
         if rank == 0 and (by_steps or time.monotonic() - saved_at >= config.save_every_seconds or done == config.steps):
             facts = {
                 "step": done,
-                "fingerprint": fingerprint,
+                "identity": digests,
                 "sums": sums,
                 "count": count,
                 "last": last,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,6 +42,14 @@ def save_training_state(
         )
 
 
+def identity_digests(identity: Mapping[str, Any]) -> dict[str, str]:
+    """Short digests of the JSON values that name a run, by name."""
+    return {
+        name: hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        for name, value in identity.items()
+    }
+
+
 def read_training_facts(path: Path) -> dict[str, Any]:
     """The JSON facts of a state file.
 
@@ -65,21 +74,27 @@ def load_training_state(
     parameters: Mapping[str, nn.Parameter],
     average: ExponentialAverage,
     optimizer: torch.optim.Optimizer,
-    fingerprint: str,
+    identity: Mapping[str, str],
 ) -> dict[str, Any]:
     """Fill everything from a state file and return its facts.
 
+    Args:
+        identity: digest of each thing that makes a run what it is (see `identity_digests`); the file's are compared.
+
     Raises:
-        ArtifactError: if it is damaged, or belongs to a run with another configuration or model.
+        ArtifactError: if it is damaged, or belongs to a run with another configuration, model or other clips.
     """
     facts = read_training_facts(path)
-    if facts["fingerprint"] != fingerprint:
+    found = facts.get("identity", {})
+    different = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
+    if different:
         raise ArtifactError(
             "The training state belongs to another run.",
             where=path,
-            expected=fingerprint,
-            got=facts["fingerprint"],
-            next_step="use another output folder, or delete this training state",
+            expected={name: identity.get(name) for name in different},
+            got={name: found.get(name) for name in different},
+            next_step=f"give it the {', '.join(different)} that it began with, use another output folder, or delete "
+            "this training state",
         )
     with safe_open(path, framework="pt") as stored:
         names = set(stored.keys())
