@@ -55,14 +55,14 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     overrides = [*arguments.overrides, *([f"runner.kind={arguments.runner}"] if arguments.runner else [])]
     runner = load_config(RunnerConfig, preset=preset, path=arguments.config, overrides=overrides, section="runner")
     mapper = shard_mapper(runner)
-    if arguments.inputs or step_name == "curate":
+    given = dict(_parse_input(text) for text in arguments.inputs)
+    if arguments.node is None and (given or step_name == "curate"):
+        # The step's own section is enough: a file for one's own data need not describe a whole run.
         config = load_config(
             step.load_config(), preset=preset, path=arguments.config, overrides=overrides, section=step_name
         )
         inputs = source_inputs(config, Path.cwd()) if step_name == "curate" else {}
-        return run_step(
-            store, step_name, config, inputs | dict(_parse_input(text) for text in arguments.inputs), mapper
-        )
+        return run_step(store, step_name, config, inputs | given, mapper)
 
     from worldline_core.pipeline.config import PipelineConfig
     from worldline_core.pipeline.plan import plan, run_node
@@ -73,7 +73,9 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     name = arguments.node or (step_name if step_name in candidates or not candidates else "")
     if not name:
         raise ConfigError(f"{step_name} occurs more than once in this run", expected=f"--node with one of {candidates}")
-    return run_node(name, nodes, store, mapper)
+    if name not in candidates:
+        raise ConfigError(f"This run has no such node of {step_name}", expected=f"one of {candidates}", got=name)
+    return run_node(name, nodes, store, mapper, given)
 
 
 def _parse_input(text: str) -> tuple[str, Path]:

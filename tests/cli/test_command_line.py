@@ -65,6 +65,38 @@ def test_missing_upstream_names_the_step_to_run(tmp_path: Path, capsys: pytest.C
     assert "worldline task curate" in error
 
 
+def test_the_named_step_to_run_is_a_command_that_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        main(["task", "render_actions", "--node", "render_actions.banks", "--artifacts", str(tmp_path)])
+    assert "run `worldline task curate --node curate.banks` with" in capsys.readouterr().err
+
+
+def test_a_node_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a step that a run has twice, `--node` chose the first one without a word: banks were never curated."""
+    missing = tmp_path / "no_such_banks"
+    changed = ["--set", f"curate_banks.sources=[{{kind: episode_set, path: {missing}, name: banks}}]"]
+    with pytest.raises(SystemExit, match="1"):
+        main(["task", "curate", "--node", "curate.banks", "--artifacts", str(tmp_path), *changed])
+    assert str(missing) in capsys.readouterr().err
+
+
+def test_a_node_of_another_step_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        main(["task", "curate", "--node", "filter", "--artifacts", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert "This run has no such node of curate" in error
+    assert "curate.banks" in error
+
+
+def test_an_input_is_fed_to_the_node_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        arguments = ["--artifacts", str(tmp_path / "store"), "--input", f"episodes={tmp_path}"]
+        main(["task", "render_actions", "--node", "render_actions.banks", *arguments])
+    error = capsys.readouterr().err
+    assert "not finished" not in error
+    assert str(tmp_path) in error
+
+
 def test_wrong_input_name_lists_the_right_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["task", "filter", "--preset", "tiny", "--artifacts", str(tmp_path), "--input", f"episode={tmp_path}"])

@@ -6,7 +6,7 @@ The flow runs the nodes as Prefect tasks, a standalone task finds its inputs her
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from worldline_core.config.base import StrictModel
@@ -148,8 +148,17 @@ def find_artifacts(nodes: list[Node], store: ArtifactStore) -> dict[str, Artifac
     return found
 
 
-def run_node(name: str, nodes: list[Node], store: ArtifactStore, mapper: ShardMapper | None = None) -> Artifact:
+def run_node(
+    name: str,
+    nodes: list[Node],
+    store: ArtifactStore,
+    mapper: ShardMapper | None = None,
+    given: Mapping[str, Path] | None = None,
+) -> Artifact:
     """Run one node on the finished artifacts of those before it.
+
+    Args:
+        given: folders by input name, taken instead of the artifacts that the run would use.
 
     Raises:
         ConfigError: there is no such node.
@@ -158,8 +167,8 @@ def run_node(name: str, nodes: list[Node], store: ArtifactStore, mapper: ShardMa
     by_name = {node.name: node for node in nodes}
     if name not in by_name:
         raise ConfigError("Unknown node", expected=f"one of {', '.join(by_name)}", got=name)
-    node = by_name[name]
-    found = find_artifacts(nodes[: nodes.index(node)], store)
+    found = find_artifacts(nodes[: list(by_name).index(name)], store)
+    node = replace(by_name[name], inputs={**by_name[name].inputs, **(given or {})})
     inputs = _resolve(node, found)
     if inputs is None:
         missing = [source for source in node.inputs.values() if isinstance(source, str) and source not in found]
@@ -167,9 +176,13 @@ def run_node(name: str, nodes: list[Node], store: ArtifactStore, mapper: ShardMa
             f"{name} needs artifacts that are not finished",
             where=store.root,
             got=f"missing: {', '.join(missing)}",
-            next_step=f"run `worldline task {missing[0]}` with the same preset first, or `worldline pipeline`",
+            next_step=f"run `{_command(by_name[missing[0]])}` with the same preset first, or `worldline pipeline`",
         )
     return run_step(store, node.step, node.config, inputs, mapper)
+
+
+def _command(node: Node) -> str:
+    return f"worldline task {node.step}" + ("" if node.name == node.step else f" --node {node.name}")
 
 
 def _resolve(node: Node, found: Mapping[str, Artifact]) -> dict[str, Path] | None:
