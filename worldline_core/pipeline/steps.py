@@ -197,7 +197,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_policy",
-        1,
+        2,
         "worldline_core.evaluation.policy.evaluate_policy",
         "evaluate_policy",
         "PolicyEvaluationConfig",
@@ -207,7 +207,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_planning",
-        1,
+        2,
         "worldline_core.evaluation.planning.evaluate_planning",
         "evaluate_planning",
         "PlanningConfig",

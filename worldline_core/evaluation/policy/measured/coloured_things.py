@@ -15,6 +15,12 @@ _HUE_FULL_DEG, _HUE_NONE_DEG = 9.0, 14.0
 # keeps its share of the area.
 _SATURATION_NONE, _SATURATION_FULL = 0.50, 0.75
 _VALUE_NONE, _VALUE_FULL = 0.12, 0.25
+# A thing's own colour is taken from one of the first frames: observed, or predicted from little motion.
+_SEEN_EARLY = 8
+_SEEN_PIXELS = 3.0
+# Of a thing's own colourfulness: below the first nothing of it is there, above the second all of it; another hue counts
+# against it twice. In predicted videos moving things fade; held to a fixed saturation they would be lost.
+_LIKENESS_NONE, _LIKENESS_FULL, _OTHER_HUE = 0.20, 0.50, 2.0
 
 _THING = re.compile(rf"\b({'|'.join(HUES_DEG)})\s+(\w+)")
 
@@ -43,3 +49,38 @@ def colour_share(frames: np.ndarray, colour: str) -> np.ndarray:
         * np.clip((value - _VALUE_NONE) / (_VALUE_FULL - _VALUE_NONE), 0, 1)
     )
     return share.reshape(frames.shape[:3]).astype(np.float32)
+
+
+def own_colour(frames: np.ndarray, colour: str) -> np.ndarray | None:
+    """Mean RGB (3,) float32 of what shows the colour, in that of the first of frames (n, h, w, 3) that shows most of it.
+
+    None where less than three pixels do.
+    """
+    early = frames[:_SEEN_EARLY]
+    shares = colour_share(early, colour)
+    areas = shares.sum(axis=(1, 2))
+    best = int(np.argmax(areas))
+    if areas[best] < _SEEN_PIXELS:
+        return None
+    return np.einsum("hw,hwc->c", shares[best], early[best].astype(np.float32)) / areas[best]
+
+
+def likeness(frames: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """How much of each pixel is of a thing of RGB ``own`` (3,), 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3).
+
+    The pixel's chroma is projected on that of the thing; what it has beside that line is another hue.
+    """
+    axis = own - own.mean()
+    strength = float(np.linalg.norm(axis))
+    axis = axis / max(strength, 1e-6)
+    chroma = frames.astype(np.float32)
+    chroma -= chroma.mean(axis=-1, keepdims=True)
+    along = chroma @ axis
+    beside = np.linalg.norm(chroma - along[..., None] * axis, axis=-1)
+    share = (along - _OTHER_HUE * beside) / max(strength, 1e-6)
+    return np.clip((share - _LIKENESS_NONE) / (_LIKENESS_FULL - _LIKENESS_NONE), 0, 1).astype(np.float32)
+
+
+def thing_share(frames: np.ndarray, colour: str, own: np.ndarray | None) -> np.ndarray:
+    """How much of each pixel is of the thing: by its own colour where that was seen, else by the colour's word."""
+    return colour_share(frames, colour) if own is None else likeness(frames, own)

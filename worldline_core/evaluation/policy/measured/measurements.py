@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from worldline_core.evaluation.policy.measured.coloured_things import ColouredThing, colour_share
+from worldline_core.evaluation.policy.measured.coloured_things import ColouredThing, own_colour, thing_share
 
 LATE_COUNT = 3
 _HEAD = "head"
@@ -25,12 +25,13 @@ HELD_WRIST_SHARE = 0.065  # of a wrist frame
 
 @dataclass(frozen=True)
 class Sighting:
-    """A thing in the head view of n frames: area [px], centre u, v [px], and its shares (n, h, w)."""
+    """A thing in the head view of n frames: area [px], centre u, v [px], its shares (n, h, w), its own RGB if seen."""
 
     shares: np.ndarray
     area: np.ndarray
     u: np.ndarray
     v: np.ndarray
+    own: np.ndarray | None
 
     @property
     def full_area(self) -> float:
@@ -82,12 +83,13 @@ class PushMeasurement:
 
 def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
     """Find a thing in head frames (n, h, w, 3)."""
-    shares = colour_share(frames, thing.colour)
+    own = own_colour(frames, thing.colour)
+    shares = thing_share(frames, thing.colour, own)
     rows, columns = np.mgrid[: frames.shape[1], : frames.shape[2]]
     area = shares.sum(axis=(1, 2))
     safe = np.maximum(area, 1e-6)
     u, v = ((shares * grid).sum(axis=(1, 2)) / safe for grid in (columns, rows))
-    return Sighting(shares, area, u, v)
+    return Sighting(shares, area, u, v, own)
 
 
 def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> LiftMeasurement:
@@ -170,7 +172,9 @@ def _held(
             near = cv2.dilate(robot_late[slot].astype(np.uint8), kernel)
             touching[slot] = float((near * head.shares[index]).sum()) / float(head.area[index])
     wrists = [
-        colour_share(frames[view][-LATE_COUNT:], thing.colour).mean(axis=(1, 2)) for view in frames if view != _HEAD
+        thing_share(frames[view][-LATE_COUNT:], thing.colour, head.own).mean(axis=(1, 2))
+        for view in frames
+        if view != _HEAD
     ]
     in_hand = np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
     signs = [np.minimum(values, 1.0) for values in (touching / HELD_TOUCH, in_hand) if not np.isnan(values).all()]
