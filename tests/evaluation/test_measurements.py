@@ -8,6 +8,7 @@ import pytest
 from tests.evaluation.conftest import make_film
 from worldline_core.evaluation.policy.measured.coloured_things import (
     ColouredThing,
+    OwnColour,
     colour_share,
     likeness,
     named_things,
@@ -41,7 +42,7 @@ def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour() -
     pale = faded(frames["head"], 0.45)
     own = own_colour(pale, "red")
     assert own is not None
-    assert own == pytest.approx([220, 20, 20], abs=6)
+    assert own.rgb == pytest.approx([220, 20, 20], abs=6)
     assert colour_share(pale, "red")[-1].sum() < 0.3 * colour_share(pale, "red")[0].sum()
     areas = likeness(pale, own).sum(axis=(1, 2))
     assert areas[-1] == pytest.approx(areas[0], rel=0.2)
@@ -49,7 +50,7 @@ def test_what_has_faded_is_lost_to_the_colour_word_but_not_to_its_own_colour() -
 
 @pytest.mark.parametrize("other", [(20, 20, 220), (20, 200, 20), (120, 120, 120), (230, 130, 20)])
 def test_other_hues_and_grey_are_not_the_thing(other: tuple[int, int, int]) -> None:
-    own = np.array([220, 20, 20], np.float32)
+    own = OwnColour(np.array([220, 20, 20], np.float32), 0.2)
     assert likeness(np.full((1, 4, 4, 3), other, np.uint8), own).max() == 0
 
 
@@ -57,3 +58,12 @@ def test_a_thing_that_is_not_seen_early_has_no_colour_of_its_own() -> None:
     frames, _, _ = make_film(True, seed=1)
     assert named_things("lift the green cube") == (ColouredThing("green", "cube"),)
     assert own_colour(frames["head"], "green") is None
+
+
+def test_a_table_with_a_tint_of_the_hue_is_not_the_thing() -> None:
+    frames = np.full((9, 48, 72, 3), (172, 140, 110), np.uint8)  # orange, but pale
+    frames[:, 20:27, 30:37] = (235, 130, 20)
+    own = own_colour(frames, "orange")
+    assert own is not None
+    share = likeness(frames, own)
+    assert share[0].sum() == pytest.approx(49, rel=0.02)

@@ -19,8 +19,10 @@ _VALUE_NONE, _VALUE_FULL = 0.12, 0.25
 _SEEN_EARLY = 8
 _SEEN_PIXELS = 3.0
 # Of a thing's own colourfulness: below the first nothing of it is there, above the second all of it; another hue counts
-# against it twice. In predicted videos moving things fade; held to a fixed saturation they would be lost.
-_LIKENESS_NONE, _LIKENESS_FULL, _OTHER_HUE = 0.20, 0.50, 2.0
+# against it twice. In predicted videos moving things fade; held to a fixed saturation they would be lost. What surrounds
+# it may have a tint of its hue: nothing of it is there below what nearly all of the surroundings have.
+_LIKENESS_NONE, _LIKENESS_RANGE, _OTHER_HUE = 0.20, 0.30, 2.0
+_SURROUNDINGS, _MARGIN = 0.98, 0.05
 
 _THING = re.compile(rf"\b({'|'.join(HUES_DEG)})\s+(\w+)")
 
@@ -51,10 +53,18 @@ def colour_share(frames: np.ndarray, colour: str) -> np.ndarray:
     return share.reshape(frames.shape[:3]).astype(np.float32)
 
 
-def own_colour(frames: np.ndarray, colour: str) -> np.ndarray | None:
-    """Mean RGB (3,) float32 of what shows the colour, in that of the first of frames (n, h, w, 3) that shows most of it.
+@dataclass(frozen=True)
+class OwnColour:
+    """A thing's mean RGB (3,) float32, and the likeness of its surroundings, below which nothing of it is there."""
 
-    None where less than three pixels do.
+    rgb: np.ndarray
+    none: float
+
+
+def own_colour(frames: np.ndarray, colour: str) -> OwnColour | None:
+    """Colour of what the colour's word finds, in that of the first of frames (n, h, w, 3) that shows most of it.
+
+    None where less than three pixels show it.
     """
     early = frames[:_SEEN_EARLY]
     shares = colour_share(early, colour)
@@ -62,25 +72,29 @@ def own_colour(frames: np.ndarray, colour: str) -> np.ndarray | None:
     best = int(np.argmax(areas))
     if areas[best] < _SEEN_PIXELS:
         return None
-    return np.einsum("hw,hwc->c", shares[best], early[best].astype(np.float32)) / areas[best]
+    rgb = np.einsum("hw,hwc->c", shares[best], early[best].astype(np.float32)) / areas[best]
+    others = _projection(early[best], rgb)[shares[best] == 0]
+    none = float(np.quantile(others, _SURROUNDINGS)) + _MARGIN if others.size else 0.0
+    return OwnColour(rgb, max(none, _LIKENESS_NONE))
 
 
-def likeness(frames: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """How much of each pixel is of a thing of RGB ``own`` (3,), 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3).
+def likeness(frames: np.ndarray, own: OwnColour) -> np.ndarray:
+    """How much of each pixel is of the thing, 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3)."""
+    return np.clip((_projection(frames, own.rgb) - own.none) / _LIKENESS_RANGE, 0, 1).astype(np.float32)
 
-    The pixel's chroma is projected on that of the thing; what it has beside that line is another hue.
-    """
-    axis = own - own.mean()
-    strength = float(np.linalg.norm(axis))
-    axis = axis / max(strength, 1e-6)
+
+def thing_share(frames: np.ndarray, colour: str, own: OwnColour | None) -> np.ndarray:
+    """How much of each pixel is of the thing: by its own colour where that was seen, else by the colour's word."""
+    return colour_share(frames, colour) if own is None else likeness(frames, own)
+
+
+def _projection(frames: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """Chroma (..., h, w) along that of ``rgb``, in its units, less what lies beside that line: another hue."""
+    axis = rgb - rgb.mean()
+    strength = max(float(np.linalg.norm(axis)), 1e-6)
+    axis = axis / strength
     chroma = frames.astype(np.float32)
     chroma -= chroma.mean(axis=-1, keepdims=True)
     along = chroma @ axis
     beside = np.linalg.norm(chroma - along[..., None] * axis, axis=-1)
-    share = (along - _OTHER_HUE * beside) / max(strength, 1e-6)
-    return np.clip((share - _LIKENESS_NONE) / (_LIKENESS_FULL - _LIKENESS_NONE), 0, 1).astype(np.float32)
-
-
-def thing_share(frames: np.ndarray, colour: str, own: np.ndarray | None) -> np.ndarray:
-    """How much of each pixel is of the thing: by its own colour where that was seen, else by the colour's word."""
-    return colour_share(frames, colour) if own is None else likeness(frames, own)
+    return (along - _OTHER_HUE * beside) / strength

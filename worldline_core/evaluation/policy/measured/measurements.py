@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from worldline_core.evaluation.policy.measured.coloured_things import ColouredThing, own_colour, thing_share
+from worldline_core.evaluation.policy.measured.coloured_things import ColouredThing, OwnColour, own_colour, thing_share
 
 LATE_COUNT = 3
 _HEAD = "head"
@@ -25,13 +25,13 @@ HELD_WRIST_SHARE = 0.065  # of a wrist frame
 
 @dataclass(frozen=True)
 class Sighting:
-    """A thing in the head view of n frames: area [px], centre u, v [px], its shares (n, h, w), its own RGB if seen."""
+    """A thing in the head view of n frames: area [px], centre u, v [px], its shares (n, h, w), its own colour if seen."""
 
     shares: np.ndarray
     area: np.ndarray
     u: np.ndarray
     v: np.ndarray
-    own: np.ndarray | None
+    own: OwnColour | None
 
     @property
     def full_area(self) -> float:
