@@ -217,7 +217,7 @@ def write_planning_scores(folder: Path) -> None:
 
     def budgets(top: float) -> dict[str, object]:
         means = {n: 0.45 + (top - 0.45) * i / 5 for i, n in enumerate((2, 4, 8, 16, 24, 32))}
-        banks = {"bank_0": 1.0, "bank_1": 0.0, "bank_2": 1.0}
+        banks = {"bank_0": 1.0, "bank_1": 0.0, "bank_2": 0.4}
         return {
             str(n): {"success": interval(m) | {"std_over_banks": 0.2}, "gain": interval(m - 0.45), "banks": banks}
             for n, m in means.items()
@@ -236,7 +236,11 @@ def write_planning_scores(folder: Path) -> None:
         for i in range(3)
     }
     methods = {
-        name: {"budgets": budgets(top), "by_family": {}, "malformed_answers": 0}
+        name: {
+            "budgets": budgets(top),
+            "by_family": {"lift": {"2": {"success": 0.5, "gain": 0.05}, "32": {"success": top, "gain": top - 0.45}}},
+            "malformed_answers": 0,
+        }
         for name, top in (("true", 0.95), ("banks_shipped_causal", 0.8))
     }
     write_json_atomic(

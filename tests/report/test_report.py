@@ -159,6 +159,11 @@ def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:
     assert "0.930" in section(text, "video")  # the segmenter's own accuracy
     assert "by a second segmenter, colour" in section(text, "video")
     assert "selector&#x27;s ceiling" in section(text, "planning")
+    # A choice that succeeds in two of five runs is neither a success nor a failure.
+    assert re.search(r"bank_2.*?<td[^>]*>0\.40</td>", section(text, "planning"), re.DOTALL)
+    assert re.search(
+        r"<th[^>]*>lift</th><td[^>]*>3</td><td[^>]*>0\.45</td><td[^>]*>0\.95</td>", section(text, "planning")
+    )
     assert "median of 3 on held-out scenes" in section(text, "videos")
     assert "truncated_video" in section(text, "filters")
     assert "refused_static.jpg" in section(text, "filters")

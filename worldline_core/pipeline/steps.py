@@ -217,7 +217,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        3,
+        4,
         "worldline_core.report.report",
         "report",
         "ReportConfig",

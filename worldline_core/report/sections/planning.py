@@ -36,7 +36,7 @@ def evaluation(summary: JsonObject) -> Html:
         f"{len(summary['banks'])} banks, selector: {summary.get('selector', 'unknown')}. Direct execution succeeds in ",
         interval(direct["mean"], direct["low"], direct["high"]), " of the cases on average over the banks.", reach,
     )  # fmt: skip
-    return join(note, charts, budget_table(summary, order), bank_table(summary))
+    return join(note, charts, budget_table(summary, order), family_table(summary, order), bank_table(summary))
 
 
 def success_chart(summary: JsonObject, order: list[Method]) -> Html:
@@ -101,8 +101,28 @@ def budget_table(summary: JsonObject, order: list[Method]) -> Html:
     )
 
 
+def family_table(summary: JsonObject, order: list[Method]) -> Html:
+    """Success among the most candidates by task family, beside direct execution."""
+    methods = summary["methods"]
+    shown = [(TRUE_METHOD, "recorded videos")] if TRUE_METHOD in methods else []
+    shown += [(method.name, method.long_label) for method in order]
+    direct: dict[str, list[float]] = {}
+    for bank in summary["banks"].values():
+        direct.setdefault(bank["task_family"], []).append(float(bank["direct_success"]))
+    rows: list[list[object]] = []
+    for family, values in sorted(direct.items()):
+        cells = []
+        for name, _ in shown:
+            by_budget = methods[name]["by_family"].get(family, {})
+            cells.append(number(float(by_budget[max(by_budget, key=int)]["success"]), 2) if by_budget else None)
+        rows.append([family.replace("_", " "), len(values), number(sum(values) / len(values), 2), *cells])
+    columns = [Column("Task"), Column("Banks", numeric=True), Column("Direct", numeric=True)]
+    columns += [Column(label, numeric=True) for _, label in shown]
+    return table(columns, rows, caption="Success of the choice among the most candidates, by task")
+
+
 def bank_table(summary: JsonObject) -> Html:
-    """Every bank, folded away."""
+    """Every bank, folded away: the share of runs (orders of its candidates) whose choice succeeds."""
     methods = summary["methods"]
     order = [name for name in (TRUE_METHOD, *[m.name for m in without_truth(methods)]) if name in methods]
     rows: list[list[object]] = []
@@ -111,7 +131,7 @@ def bank_table(summary: JsonObject) -> Html:
         for name in order:
             by_budget = methods[name]["budgets"]
             value = by_budget[max(by_budget, key=int)].get("banks", {}).get(bank)
-            chosen.append(None if value is None else "success" if value else "failure")
+            chosen.append(None if value is None else number(float(value), 2))
         rows.append(
             [
                 bank,
@@ -130,9 +150,13 @@ def bank_table(summary: JsonObject) -> Html:
         Column("Direct", numeric=True),
     ]
     labels = {m.name: m.long_label for m in in_order(order)} | {TRUE_METHOD: "recorded videos"}
-    columns += [Column(labels[name]) for name in order]
+    columns += [Column(labels[name], numeric=True) for name in order]
     return element(
-        "details", element("summary", f"All {len(rows)} banks, choice among the largest N"), table(columns, rows)
+        "details",
+        element(
+            "summary", f"All {len(rows)} banks: share of runs in which the choice among the most candidates succeeds"
+        ),
+        table(columns, rows),
     )
 
 
