@@ -274,7 +274,10 @@ def _doctor(arguments: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command."""
     from tasks.command_line import exit_with_clear_errors
+    from worldline_core.pipeline.freed_memory import keep_freed_memory
 
+    # Early: threads that have allocated keep the arena that they have.
+    keep_freed_memory()
     # Threads that spin at barriers take the cores from the video decoders beside them. Read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = build_parser().parse_args(argv)

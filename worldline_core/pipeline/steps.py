@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from worldline_core.config.base import StrictModel
 from worldline_core.errors import ConfigError
+from worldline_core.pipeline.freed_memory import keep_freed_memory
 from worldline_core.store.store import Artifact, ArtifactStore
 
 if TYPE_CHECKING:
@@ -250,6 +251,7 @@ def run_step(
     """
     step = get_step(name)
     step.check_inputs(inputs)
+    keep_freed_memory()
     options = {"mapper": mapper} if step.mapped else {}
     return store.run(
         step.name,
