@@ -7,6 +7,7 @@ from worldline_core.evaluation.planning.selector import (
     CandidateScore,
     CandidateVideo,
     Comparison,
+    ShownFrames,
     planning_indices,
 )
 from worldline_core.evaluation.planning.vlm_selector import VLMSelector
@@ -14,7 +15,7 @@ from worldline_core.evaluation.planning.vlm_selector import VLMSelector
 
 def load(candidate: int) -> CandidateVideo:
     """The candidate's number is all that its video shows."""
-    return CandidateVideo("", {"head": np.full((1, 1, 1, 3), candidate, np.uint8)}, (0,), 8.0, 1)
+    return CandidateVideo("", ShownFrames({"head": np.full((1, 1, 1, 3), candidate, np.uint8)}), (0,), 8.0, 1)
 
 
 class PerfectSelector:

@@ -164,7 +164,7 @@ class _Loader:
                 )
 
     def __call__(self, candidate: int) -> CandidateVideo:
-        from worldline_core.evaluation.planning.selector import CandidateVideo, planning_indices
+        from worldline_core.evaluation.planning.selector import CandidateVideo, ShownFrames, planning_indices
         from worldline_core.evaluation.recordings import tool_points
 
         if candidate not in self.kept:
@@ -182,7 +182,7 @@ class _Loader:
             points = None if self.tracks is None else tool_points(self.tracks, row.episode_id, "head", count)
             self.kept[candidate] = CandidateVideo(
                 label="",
-                frames={view: video[list(indices)] for view, video in videos.items()},
+                shown=ShownFrames({view: video[list(indices)] for view, video in videos.items()}),
                 indices=indices,
                 fps=row.fps,
                 total_frames=count,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 from worldline_core.evaluation.planning.selector import CandidateScore, CandidateVideo, Comparison
@@ -21,7 +20,7 @@ class MeasuredSelector:
     def __init__(self, segmenter: Segmenter) -> None:
         self.segmenter = segmenter
         # Smaller budgets show the same videos again; the key is what was shown, so identities stay hidden.
-        self._seen: dict[str, CandidateScore] = {}
+        self._seen: dict[tuple[str, str], CandidateScore] = {}
 
     def compare(self, instruction: str, candidates: Sequence[CandidateVideo], select_count: int) -> Comparison:
         """The highest scores; of equals, those shown first."""
@@ -30,10 +29,7 @@ class MeasuredSelector:
 
     def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
         """0..100."""
-        digest = hashlib.sha256(instruction.encode())
-        for view in sorted(candidate.frames):
-            digest.update(candidate.frames[view].tobytes())
-        key = digest.hexdigest()
+        key = (instruction, candidate.shown.digest)
         if key not in self._seen:
             family = route(instruction)
             measured = measure(self.segmenter, instruction, family, candidate.frames, candidate.points)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -14,20 +16,40 @@ _LATE_FROM = 0.6
 
 
 @dataclass(frozen=True)
+class ShownFrames:
+    """The chosen frames by view, uint8 (n, h, w, 3). They are shown many times, under one letter or another."""
+
+    by_view: Mapping[str, np.ndarray]
+
+    @cached_property
+    def digest(self) -> str:
+        """Names what is seen, and nothing else."""
+        digest = hashlib.sha256()
+        for view in sorted(self.by_view):
+            digest.update(view.encode())
+            digest.update(self.by_view[view].tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
 class CandidateVideo:
     """One candidate under a temporary letter.
 
     Attributes:
-        frames: by view, uint8 (n, h, w, 3), the chosen frames; indices: their numbers in the video.
+        shown: the chosen frames; indices: their numbers in the video.
         points: (n, arms, 2) projected tool centres at these frames in the head view [px], to start a segmenter.
     """
 
     label: str
-    frames: Mapping[str, np.ndarray]
+    shown: ShownFrames
     indices: tuple[int, ...]
     fps: float
     total_frames: int
     points: np.ndarray | None = None
+
+    @property
+    def frames(self) -> Mapping[str, np.ndarray]:
+        return self.shown.by_view
 
 
 @dataclass(frozen=True)
