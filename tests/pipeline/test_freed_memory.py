@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -34,12 +35,11 @@ def run(argument: str, **environment: str) -> tuple[bool, int]:
     return kept == "True", int(faults)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of glibc")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
 def test_freed_blocks_are_taken_again_without_page_faults() -> None:
     plain = run("leave")[1]
     kept, faults = run("keep")
-    if not kept:
-        pytest.skip("this C library has no mallopt")
+    assert kept
     assert plain > 8 * 2**26 // os.sysconf("SC_PAGE_SIZE") // 2  # the test sees what it is about
     assert faults < plain / 20
 

@@ -1,7 +1,7 @@
 """Freed memory stays with the process.
 
 glibc gives large freed blocks back to the kernel at once; the next tensor of that size has every page mapped and zeroed
-anew. Models on a CPU make such tensors all the time: a quarter to a half of their time went there.
+anew. Models on a CPU make such tensors all the time: benchmarks/freed_memory.py measures what that costs.
 """
 
 from __future__ import annotations
