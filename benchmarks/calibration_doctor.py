@@ -19,12 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
+from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.diagnosis import Diagnosis
-from worldline_core.calibration.doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.observation import small_gray
-from worldline_core.data.episodes.convention_needs import applicable
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
+    applicable,
     apply_conventions,
     corrupt,
     corrupted_image_frames,
@@ -34,7 +34,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
 from worldline_core.store.atomic import write_json_atomic
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "recordings"

@@ -21,10 +21,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from worldline_core.data.curation.curate import curate
-from worldline_core.filters.filter import filter_episodes
-from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.recorder.corrupted.corpus import (
+from tools.corrupted.corpus import (
     Outcome,
     confusion,
     kinds_per_layout,
@@ -33,7 +30,10 @@ from worldline_core.recorder.corrupted.corpus import (
     shares_right,
     write_corpus,
 )
-from worldline_core.recorder.corrupted.labels import Label
+from tools.corrupted.labels import Label
+from worldline_core.data.curation.curate import curate
+from worldline_core.filters.filter import filter_episodes
+from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.store.atomic import remove_unfinished
 from worldline_core.store.digest import digest_folder
 

@@ -12,20 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.labelled_clips import FAULTS, Clip
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.overlays import draw_overlay
 from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import view_thumbnails
-from worldline_core.exports.clip_strip import ClipStrip, clip_strip
-from worldline_core.exports.contact_sheet import evenly_spaced
-from worldline_core.exports.overlays import draw_overlay
-from worldline_core.exports.pictures import jpeg_bytes
+from worldline_core.filters.examine import Finding, inspect
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.inspect_episode import Finding, inspect
-from worldline_core.filters.labelled_clips import FAULTS, Clip
 from worldline_core.filters.signals import measure
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.pictures.clip_strip import ClipStrip, clip_strip
+from worldline_core.pictures.contact_sheet import evenly_spaced
+from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from tools.labelled_clips import FAULTS, HARMLESS, Clip
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.thumbnails import view_thumbnails
+from worldline_core.filters.examine import Finding, inspect
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.inspect_episode import Finding, inspect
-from worldline_core.filters.labelled_clips import FAULTS, HARMLESS, Clip
 from worldline_core.filters.signals import measure
 from worldline_core.store.atomic import write_json_atomic
 

@@ -23,8 +23,8 @@ def measure(way: str, clips: int, threads: int) -> dict[str, float]:
 
     import torch
 
-    from worldline_core.model.tokenizer.base import load_tokenizer
-    from worldline_core.pipeline.freed_memory import keep_freed_memory
+    from worldline_core.model.tokenizer.tokenizer import load_tokenizer
+    from worldline_core.pipeline.steps import keep_freed_memory
 
     if way == "kept" and not keep_freed_memory():
         raise SystemExit("this C library, or a choice in the environment, does not let freed memory be kept")

@@ -32,10 +32,10 @@ import numpy as np
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.frame_decoder import torchcodec_fault
-from worldline_core.training.clip_input import FrameInput
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_reader import ClipReader
 from worldline_core.training.clip_sampler import Clip, ClipSampler, ClipSampling
+from worldline_core.training.clip_source import FrameInput
 from worldline_core.training.frame_source import FrameSource, frame_rows
 
 TICK = os.sysconf("SC_CLK_TCK")

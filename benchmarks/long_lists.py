@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, write_index
 from worldline_core.data.sources.lerobot import LeRobotSource
-from worldline_core.data.sources.lerobot_config import LeRobotSourceConfig
+from worldline_core.data.sources.lerobot_columns import LeRobotSourceConfig
 
 KINDS = ("lerobot_v21", "lerobot_v3", "index")
 _INFO = {

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
+from tools.corrupted.mutations import attack
+from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.sources.open import SourceConfig
-from worldline_core.recorder.corrupted.mutations import attack
-from worldline_core.recorder.corrupted.one_of_each import write_one_of_each
 
 
 def main() -> None:

@@ -30,8 +30,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.thumbnails import view_thumbnails
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.pictures import jpeg_bytes
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic
 
 Frames = Mapping[str, np.ndarray]

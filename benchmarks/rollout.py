@@ -18,13 +18,12 @@ import torch
 from einops import rearrange
 
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.config import WorldModelConfig
-from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
 from worldline_core.model.tokenizer.patch import PatchTokenizer
+from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.block_causal import BLOCK_SIZE, BlockCausalSimulator
-from worldline_core.rollout.euler import Noise
-from worldline_core.rollout.full_clip import rollout_full_clip
+from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.rollout.causal_simulator import BLOCK_SIZE, BlockCausalSimulator
+from worldline_core.rollout.full_clip import Noise, rollout_full_clip
 
 GRID = (8, 12)
 

@@ -205,7 +205,7 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
     from worldline_core.errors import WorldLineError
 
     try:
-        from worldline_core.calibration.check_command import check_command
+        from worldline_core.calibration.check import check_command
         from worldline_core.calibration.check_report import as_json, table_text
 
         found = check_command(
@@ -225,7 +225,7 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
 
 
 def _embodiment_list(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment_report import format_list, list_embodiments
+    from worldline_core.geometry.embodiment_check import format_list, list_embodiments
 
     rows = list_embodiments()
     if arguments.json:
@@ -238,15 +238,14 @@ def _embodiment_list(arguments: argparse.Namespace) -> None:
 
 def _embodiment_show(arguments: argparse.Namespace) -> None:
     from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_report import describe_embodiment
+    from worldline_core.geometry.embodiment_check import describe_embodiment
 
     print(describe_embodiment(load_embodiment(arguments.name, arguments.description)))
 
 
 def _embodiment_check(arguments: argparse.Namespace) -> None:
     from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_check import check_embodiment
-    from worldline_core.geometry.embodiment_report import check_as_json, format_check
+    from worldline_core.geometry.embodiment_check import check_as_json, check_embodiment, format_check
 
     check = check_embodiment(load_embodiment(arguments.name, arguments.description), arguments.samples, arguments.seed)
     if arguments.json:
@@ -274,7 +273,7 @@ def _doctor(arguments: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command."""
     from tasks.command_line import exit_with_clear_errors
-    from worldline_core.pipeline.freed_memory import keep_freed_memory
+    from worldline_core.pipeline.steps import keep_freed_memory
 
     # Early: threads that have allocated keep the arena that they have.
     keep_freed_memory()

@@ -55,7 +55,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _push(arguments: argparse.Namespace) -> None:
-    from worldline_core.exports.publish import push
+    from worldline_core.publishing.publish import push
 
     pushed = push(
         arguments.artifact,
@@ -68,7 +68,7 @@ def _push(arguments: argparse.Namespace) -> None:
 
 
 def _pull(arguments: argparse.Namespace) -> None:
-    from worldline_core.exports.publish import pull
+    from worldline_core.publishing.publish import pull
 
     pulled = pull(arguments.where, arguments.folder)
     print(f"{arguments.folder}  {pulled.files} files  {pulled.num_bytes / 2**20:.1f} MiB")

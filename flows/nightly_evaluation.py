@@ -8,7 +8,7 @@ from prefect import flow, task
 
 from tasks.artifact_task import ArtifactReference, artifact_task
 from worldline_core.config import load_config
-from worldline_core.pipeline.config import PipelineConfig
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
 from worldline_core.report.nightly import compare_with_history
 

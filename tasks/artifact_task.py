@@ -11,10 +11,11 @@ from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
 
 from tasks.shard_mapper import shard_mapper
-from worldline_core.config.base import StrictModel
-from worldline_core.data.guards.source_paths import SourceFolder, is_remote, parse_location
+from worldline_core.config import StrictModel
+from worldline_core.data.guards.source_paths import SourceFolder, parse_location
 from worldline_core.pipeline.steps import Step, get_step, run_step
-from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.store.remote import is_remote
 from worldline_core.store.store import ArtifactStore
 
 

@@ -49,8 +49,8 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     store = ArtifactStore(arguments.artifacts)
     preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "tiny"
     from tasks.shard_mapper import shard_mapper
-    from worldline_core.pipeline.sources import source_inputs
-    from worldline_core.scale.runner_config import RunnerConfig
+    from worldline_core.pipeline.pipeline_config import source_inputs
+    from worldline_core.scale.mapping import RunnerConfig
 
     overrides = [*arguments.overrides, *([f"runner.kind={arguments.runner}"] if arguments.runner else [])]
     runner = load_config(RunnerConfig, preset=preset, path=arguments.config, overrides=overrides, section="runner")
@@ -64,7 +64,7 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
         inputs = source_inputs(config, Path.cwd()) if step_name == "curate" else {}
         return run_step(store, step_name, config, inputs | given, mapper)
 
-    from worldline_core.pipeline.config import PipelineConfig
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.pipeline.plan import plan, run_node
 
     whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=overrides)

@@ -17,9 +17,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from worldline_core.errors import UnavailableError
-from worldline_core.scale.mapping import Job, Outcome, SerialMapper, ShardMapper, WorkerDiedError, retry_pauses
-from worldline_core.scale.runner_config import RunnerConfig
-from worldline_core.scale.transient import is_transient
+from worldline_core.scale.mapping import (
+    Job,
+    Outcome,
+    RunnerConfig,
+    SerialMapper,
+    ShardMapper,
+    WorkerDiedError,
+    retry_pauses,
+)
+from worldline_core.store.remote import is_transient
 
 _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
@@ -162,7 +169,7 @@ def do_shard(payload: bytes, remote_cache_bytes: int) -> Any:
     """The body of every shard's task, in a worker: one thread for each worker, since there is one worker for each core."""
     import cv2
 
-    from worldline_core.scale.remote import process_cache
+    from worldline_core.store.remote import process_cache
 
     cv2.setNumThreads(1)
     process_cache().max_bytes = remote_cache_bytes

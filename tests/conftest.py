@@ -36,8 +36,8 @@ def make_model() -> Callable[..., WorldModel]:
     def make(seed: int = 0, *, scale: float = 0.2, **changes: object) -> WorldModel:
         import torch
 
-        from worldline_core.model.config import WorldModelConfig
         from worldline_core.model.world_model import WorldModel
+        from worldline_core.model.world_model_config import WorldModelConfig
 
         values: dict[str, object] = {
             "latent_channels": 4,

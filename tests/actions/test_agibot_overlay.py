@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.overlays import ARM_COLOURS, OverlayStyle, draw_overlay
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
-from worldline_core.actions.tracks import ActionTracks
-from worldline_core.data.curation.config import CurateConfig
+from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
-from worldline_core.exports.overlays import ARM_COLOURS, OverlayStyle, draw_overlay
 
 # Tool centres at frame 0, read off overlay_sample_0.png, overlay_sample_1.png and overlay_demo_000.png (circles; in
 # pixels of the recorded frames, sheet scale undone): view, arm, (u, v). To within the reading of a drawn circle.

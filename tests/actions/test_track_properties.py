@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.episode_tracks import CAUSES, TrackBatch, project_tools
-from worldline_core.actions.tool_projection import FRAMES_AT_ONCE
-from worldline_core.actions.track_counts import count_samples
+from worldline_core.actions.tool_projection import FRAMES_AT_ONCE, count_samples
 
 SEEDS = st.integers(0, 2**32 - 1)
 VALUES = ("uv", "depth", "rot6d", "gripper")

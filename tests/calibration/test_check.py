@@ -11,16 +11,21 @@ import pytest
 import yaml
 
 from flows.command_line import main
-from worldline_core.calibration.check import check_calibration
-from worldline_core.calibration.check_page import page
-from worldline_core.calibration.check_report import as_json, cautions, plain, table_text
-from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, ViewMeasures
-from worldline_core.calibration.findings import CalibrationCheck, Finding, SetFinding
-from worldline_core.calibration.listing import ListedEpisode, combined_conventions, repairing_lines
+from worldline_core.calibration.check import ListedEpisode, check_calibration, combined_conventions, repairing_lines
+from worldline_core.calibration.check_report import as_json, cautions, page, plain, table_text
+from worldline_core.calibration.diagnosis import (
+    CalibrationCheck,
+    Diagnosis,
+    Explanation,
+    Finding,
+    SetDiagnosis,
+    SetFinding,
+    ViewMeasures,
+)
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, corrupt
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.base import LoadedEpisode, no_masks
+from worldline_core.data.sources.source import LoadedEpisode, no_masks
 from worldline_core.errors import ConfigError, DataError
 
 CLEAN, INVERTED = "ur5e_pair-test-s1-00000", "ur5e_pair-train-s1-00002"

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.episodes.convention_needs import arm_blocks
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
+    arm_blocks,
     corrupt,
     corrupted_image_frames,
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.base import LoadedEpisode, no_masks
 from worldline_core.data.sources.repaired import repair
+from worldline_core.data.sources.source import LoadedEpisode, no_masks
 
 COUNT = 12
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])

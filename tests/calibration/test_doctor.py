@@ -12,8 +12,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.diagnosis import Diagnosis
-from worldline_core.calibration.doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError

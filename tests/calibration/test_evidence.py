@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.calibration.config import CalibrationDoctorConfig, Typical
 from worldline_core.calibration.gripper_evidence import finger_flow, stopped_share
 from worldline_core.calibration.hypotheses import camera_lags, intrinsics_sizes, tool_offset
 from worldline_core.calibration.image_evidence import (
@@ -21,9 +20,10 @@ from worldline_core.calibration.measures import refined_peak
 from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
 from worldline_core.calibration.pose_evidence import pose_terms, rms_hand_eye, unrest_log_likelihood
 from worldline_core.calibration.reading import read
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.geometry.rigid import project_points, rigid_inverse
+from worldline_core.geometry.transforms import project_points, rigid_inverse
 
 CONFIG = CalibrationDoctorConfig()
 COUNT, HEIGHT, WIDTH = 30, 64, 96

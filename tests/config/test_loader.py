@@ -8,8 +8,15 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from worldline_core.config import StrictModel, load_config
-from worldline_core.config.loader import apply_overrides, preset_names, preset_path, read_yaml, validate
+from worldline_core.config import (
+    StrictModel,
+    apply_overrides,
+    load_config,
+    preset_names,
+    preset_path,
+    read_yaml,
+    validate,
+)
 from worldline_core.errors import ConfigError
 
 

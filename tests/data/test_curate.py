@@ -15,12 +15,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.video.decode import resize_masks
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.data.video.resize import resize_masks
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]
@@ -282,7 +282,7 @@ def test_a_killed_curation_continues_to_the_same_bytes(tmp_path: Path, sample: M
     settings = config(raw)
     curate(settings, {}, tmp_path / "undisturbed")
     script = (
-        "import sys; from pathlib import Path; from worldline_core.data.curation.curate import curate; from worldline_core.data.curation.config import CurateConfig;"
+        "import sys; from pathlib import Path; from worldline_core.data.curation.curate import curate; from worldline_core.data.curation.curate_config import CurateConfig;"
         "curate(CurateConfig.model_validate_json(sys.argv[1]), {}, Path(sys.argv[2]))"
     )
     killed = tmp_path / "killed"

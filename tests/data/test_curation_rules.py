@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from worldline_core.config import validate
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.description import described
-from worldline_core.data.curation.primary_view import PRIMARY_VIEW_REASON, with_primary_view
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON, described, with_primary_view
 from worldline_core.data.curation.rules import curation_findings
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.data.curation.source_weights import (

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.video.clip import VideoClip

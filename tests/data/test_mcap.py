@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.mcap.io import write_episode_mcap, write_rollout_mcap
 from worldline_core.data.mcap.reader import read_episode_mcap

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
-from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 
 def run(tmp_path: Path, **source: Any) -> tuple[dict[str, Any], EpisodeSet]:

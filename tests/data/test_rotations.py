@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.pose_formats import (
+from worldline_core.geometry.transforms import (
     pose_from_euler_fixed_xyz,
     pose_from_euler_moving_xyz,
     pose_from_quaternion_wxyz,
@@ -25,11 +25,11 @@ from worldline_core.geometry.pose_formats import (
     quaternion_wxyz_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
+    rotation_deviation,
     rotation_from_quaternion_wxyz,
     written_as_moving,
     written_as_wxyz,
 )
-from worldline_core.geometry.rigid import rotation_deviation
 
 Make = Callable[..., tuple]
 

@@ -10,9 +10,15 @@ import pytest
 from pydantic import ValidationError
 
 from worldline_core.config import validate
-from worldline_core.data.curation.config import CurateConfig
-from worldline_core.data.curation.scene_leaks import LeakageConfig, SceneView, find_scene_leaks
-from worldline_core.data.curation.scene_splits import SceneSplits, drawn_split, with_split
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.scenes import (
+    LeakageConfig,
+    SceneSplits,
+    SceneView,
+    drawn_split,
+    find_scene_leaks,
+    with_split,
+)
 from worldline_core.errors import ConfigError
 
 Make = Callable[..., tuple]

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.agibot_world import AgibotWorldSourceConfig

@@ -23,8 +23,8 @@ from published_lerobot import (
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 

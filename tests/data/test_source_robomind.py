@@ -29,8 +29,8 @@ from published_robomind import (
     write_version_2,
 )
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.hdf5 import open_hdf5
 from worldline_core.data.sources.robomind import LayoutName, RobomindSource, RobomindSourceConfig

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.sources.captions import caption_table
-from worldline_core.data.video.times import frame_times
+from worldline_core.data.sources.video_folder import caption_table
+from worldline_core.data.video.decode import frame_times
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
@@ -203,8 +203,8 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
     import torch
 
     from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+    from worldline_core.training.clip_source import training_rows
     from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
-    from worldline_core.training.episode_rows import training_rows
     from worldline_core.training.latent_store import LatentStore
     from worldline_core.training.stage1 import Stage1Config, train_stage1
 

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from published_lerobot import HEIGHT, WIDTH, write_galaxea, write_robocoin, write_video
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.store.digest import digest_folder
 
 POSE = [[1.0, 0, 0, 0.1], [0, 0, 1.0, -0.4], [0, -1.0, 0, 1.3], [0, 0, 0, 1.0]]

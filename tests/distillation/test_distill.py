@@ -10,12 +10,12 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from worldline_core.actions.tracks import ActionTracks
-from worldline_core.distillation import objectives, trajectory_store
+from worldline_core.actions.track_store import ActionTracks
+from worldline_core.distillation import objectives, teacher_trajectories
 from worldline_core.distillation.batches import robot_masks
-from worldline_core.distillation.config import DistillConfig
 from worldline_core.distillation.distill import distill
-from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.teacher_trajectories import TrajectoryStore, write_trajectories
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.store.digest import digest_file, folder_files
@@ -97,7 +97,7 @@ def test_a_finished_run_is_read_not_repeated(
     def refuse(*args: object, **kwargs: object) -> None:
         raise RuntimeError("trained again")
 
-    monkeypatch.setattr("worldline_core.distillation.stage.train", refuse)
+    monkeypatch.setattr("worldline_core.distillation.distillation_step.train", refuse)
     assert distill(config(), inputs, output) == counts
 
 
@@ -127,7 +127,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     distill(settings, inputs, tmp_path / "whole")
     kills = [
         (objectives.TeacherForcingObjective, "loss", 3),
-        (trajectory_store, "write_bytes_atomic", 2),
+        (teacher_trajectories, "write_bytes_atomic", 2),
         (objectives.TrajectoryObjective, "loss", 3),
         (objectives.DistributionMatchingObjective, "loss", 8),
     ]

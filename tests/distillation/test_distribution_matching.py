@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from worldline_core.distillation.causal_history import CacheWindow
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow
 from worldline_core.distillation.distribution_matching import (
     causal_score,
     distribution_gradient,
@@ -16,8 +16,8 @@ from worldline_core.distillation.distribution_matching import (
     self_forced_rollout,
 )
 from worldline_core.errors import ConfigError
-from worldline_core.rollout.block_causal import BlockCausalSimulator
-from worldline_core.rollout.euler import Noise
+from worldline_core.rollout.causal_simulator import BlockCausalSimulator
+from worldline_core.rollout.full_clip import Noise
 from worldline_core.training.flow_matching import LossWeighting
 
 
@@ -148,7 +148,7 @@ def test_the_rollout_is_causal(make_model, clip) -> None:
 
 
 def test_memory_of_the_history_does_not_grow_with_the_rollout(make_model, clip) -> None:
-    from worldline_core.distillation.causal_history import CausalHistory
+    from worldline_core.distillation.causal_teacher_forcing import CausalHistory
 
     history = CausalHistory(make_model(0), clip.views, CacheWindow(sink_blocks=1, recent_blocks=2))
     history.remember(clip.latents[..., :1, :, :], clip.maps[..., :1, :, :])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from einops import repeat
 
-from worldline_core.distillation.perceptual import PerceptualLoss
+from worldline_core.distillation.auxiliary_losses import PerceptualLoss
 from worldline_core.errors import UnavailableError
 
 ALEXNET = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights, auxiliary_losses, boundary_loss
-from worldline_core.distillation.robot_losses import (
+from worldline_core.distillation.auxiliary_losses import (
+    AuxiliaryWeights,
+    auxiliary_losses,
+    boundary_loss,
     robot_motion_loss,
     robot_reconstruction_loss,
     view_weights,

@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from worldline_core.distillation.causal_history import CacheWindow
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow
 from worldline_core.distillation.teacher_trajectories import (
     NODES,
     euler_nodes,

@@ -3,14 +3,14 @@ import pytest
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.planning.bracket import choose, shown_order
-from worldline_core.evaluation.planning.selector import (
+from worldline_core.evaluation.planning.selectors import (
     CandidateScore,
     CandidateVideo,
     Comparison,
     ShownFrames,
+    VLMSelector,
     planning_indices,
 )
-from worldline_core.evaluation.planning.vlm_selector import VLMSelector
 
 
 def load(candidate: int) -> CandidateVideo:

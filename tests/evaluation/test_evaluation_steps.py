@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.evaluation.planning import outcomes
+from worldline_core.evaluation.planning import evaluate_planning as outcomes
 from worldline_core.evaluation.planning.evaluate_planning import (
     CHOICES_FILE,
     SEALED_FILE,

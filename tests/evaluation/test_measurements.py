@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.evaluation.conftest import make_film
-from worldline_core.evaluation.policy.measured.coloured_things import (
+from worldline_core.evaluation.policy.coloured_things import (
     ColouredThing,
     OwnColour,
     colour_share,
@@ -14,8 +14,8 @@ from worldline_core.evaluation.policy.measured.coloured_things import (
     named_things,
     own_colour,
 )
-from worldline_core.evaluation.policy.measured.facts import score
-from worldline_core.evaluation.policy.measured.measurements import LATE_COUNT, measure_lift
+from worldline_core.evaluation.policy.measured_judge import score
+from worldline_core.evaluation.policy.measurements import LATE_COUNT, measure_lift
 
 CUBE = ColouredThing("red", "cube")
 

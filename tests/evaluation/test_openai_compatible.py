@@ -10,9 +10,9 @@ import pytest
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.policy.judge import Trajectory
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-from worldline_core.evaluation.vlm.config import VLMConfig, open_vlm
-from worldline_core.evaluation.vlm.content import Image, Text
+from worldline_core.evaluation.vlm.message import Image, Text
 from worldline_core.evaluation.vlm.openai_compatible import OpenAICompatibleModel
+from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
 
 
 class Server:

@@ -9,17 +9,20 @@ from worldline_core.evaluation.policy.evidence import (
     MotionEvidence,
     Reconciliation,
     StateChangeEvidence,
-)
-from worldline_core.evaluation.policy.frame_sampling import first_pass_indices, motion_indices, verification_indices
-from worldline_core.evaluation.policy.judge import Extracted, Trajectory
-from worldline_core.evaluation.policy.judgement import judge_trajectory
-from worldline_core.evaluation.policy.routing import route
-from worldline_core.evaluation.policy.rules import (
     establishes_success,
     motion_establishes_success,
     reconciliation_establishes_success,
+    route,
 )
-from worldline_core.evaluation.vlm.answers import parse_answer
+from worldline_core.evaluation.policy.judge import (
+    Extracted,
+    Trajectory,
+    first_pass_indices,
+    judge_trajectory,
+    motion_indices,
+    verification_indices,
+)
+from worldline_core.evaluation.vlm.message import parse_answer
 
 FACTS = (True, False, None)
 

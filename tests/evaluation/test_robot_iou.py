@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.video.end_effector_error import end_effector_error
-from worldline_core.evaluation.video.robot_iou import frame_iou, video_iou
+from worldline_core.evaluation.video.metrics import end_effector_error, frame_iou, video_iou
 
 EMPTY = np.zeros((4, 6), dtype=bool)
 LEFT = EMPTY.copy()

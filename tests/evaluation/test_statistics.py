@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.statistics import bootstrap_mean, paired_difference
+from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
 
 
 def test_interval_covers_the_true_mean_about_as_often_as_it_says():

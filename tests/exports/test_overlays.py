@@ -10,10 +10,7 @@ import torch
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.data.video.decode import decode_video
-from worldline_core.errors import DataError
-from worldline_core.exports.labels import text_width_px
-from worldline_core.exports.overlay_views import (
+from worldline_core.actions.overlay_views import (
     GAP_PX,
     HEADING_HEIGHT_PX,
     LEGEND_HEIGHT_PX,
@@ -22,7 +19,7 @@ from worldline_core.exports.overlay_views import (
     overlay_sheet,
     write_overlay_video,
 )
-from worldline_core.exports.overlays import (
+from worldline_core.actions.overlays import (
     ARM_COLOURS,
     AXIS_COLOURS,
     OverlayStyle,
@@ -33,6 +30,9 @@ from worldline_core.exports.overlays import (
     heat_layer,
     picture_pixel,
 )
+from worldline_core.data.video.decode import decode_video
+from worldline_core.errors import DataError
+from worldline_core.pictures.labels import text_width_px
 
 HEIGHT, WIDTH = 32, 48
 """As `conftest` makes tracks."""

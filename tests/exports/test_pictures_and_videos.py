@@ -8,12 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
+from worldline_core.actions.overlays import heat_picture
 from worldline_core.data.video.decode import decode_video
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.labels import fit_text, text_strip, text_width_px
-from worldline_core.exports.overlays import heat_picture
-from worldline_core.exports.pictures import jpeg_bytes, png_bytes, scale_frames, scaled_size
-from worldline_core.exports.side_by_side import GAP_PX, LABEL_HEIGHT_PX, compose_side_by_side, write_side_by_side
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import (
+    fit_text,
+    jpeg_bytes,
+    png_bytes,
+    scale_frames,
+    scaled_size,
+    text_strip,
+    text_width_px,
+)
+from worldline_core.pictures.side_by_side import GAP_PX, LABEL_HEIGHT_PX, compose_side_by_side, write_side_by_side
 
 
 def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray:

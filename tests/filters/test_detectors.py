@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from worldline_core.filters.alignment import (
+    ProjectionConfig,
+    TimeAlignmentConfig,
+    detect_image_lag,
+    detect_pose_lag,
+    detect_projection,
+    lag_by_correlation,
+)
 from worldline_core.filters.base_motion import BaseMotionConfig, changed_area, detect_base_motion
-from worldline_core.filters.blur import BlurConfig, detect_blur
 from worldline_core.filters.calibration import (
     CalibrationConfig,
     detect_camera,
@@ -15,23 +22,20 @@ from worldline_core.filters.calibration import (
     detect_hand_eye,
 )
 from worldline_core.filters.corrupted import CorruptedConfig, detect_corrupted
-from worldline_core.filters.exposure import ExposureConfig, detect_dark, detect_overexposed
-from worldline_core.filters.joint_motion import JointMotionConfig, detect_joint_jump, detect_joint_speed
-from worldline_core.filters.picture_statistics import picture_statistics
-from worldline_core.filters.projection import (
-    ProjectionConfig,
-    detect_projection,
+from worldline_core.filters.exposure import BlurConfig, ExposureConfig, detect_blur, detect_dark, detect_overexposed
+from worldline_core.filters.motion import (
+    JointMotionConfig,
+    ResetConfig,
+    StaticConfig,
+    detect_joint_jump,
+    detect_joint_speed,
+    detect_reset,
+    detect_static,
+    range_speed,
 )
-from worldline_core.filters.reset import ResetConfig, detect_reset
-from worldline_core.filters.static import StaticConfig, detect_static, range_speed
-from worldline_core.filters.time_alignment import (
-    TimeAlignmentConfig,
-    detect_image_lag,
-    detect_pose_lag,
-    lag_by_correlation,
-)
+from worldline_core.filters.signals import picture_statistics
 from worldline_core.filters.verdict import long_runs, runs
-from worldline_core.geometry.rigid import hand_eye_residual, inside_image, mean_pose, project_points, rigid_inverse
+from worldline_core.geometry.transforms import hand_eye_residual, inside_image, mean_pose, project_points, rigid_inverse
 
 FPS = 8.0
 

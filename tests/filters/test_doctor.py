@@ -12,9 +12,9 @@ from worldline_core.data.episodes.conventions import RecordedConventions, corrup
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails
-from worldline_core.filters.doctor import FilterDoctorConfig, detect_mistake, kinematics_of
+from worldline_core.filters.calibration import FilterDoctorConfig, detect_mistake, kinematics_of
+from worldline_core.filters.examine import inspect
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.inspect_episode import inspect
 from worldline_core.filters.signals import Signals, measure
 
 CONFIG = FilterDoctorConfig()

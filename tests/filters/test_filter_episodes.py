@@ -19,7 +19,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import tool_poses
-from worldline_core.geometry.rigid import rigid_inverse
+from worldline_core.geometry.transforms import rigid_inverse
 
 HEIGHT, WIDTH, FRAMES, FPS = 64, 96, 33, 8.0
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1.0]])

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.config.loader import CONFIG_ROOT, load_config
+from tools.labelled_clips import FAULTS, HARMLESS, Clip, at_frames
+from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import view_thumbnails
+from worldline_core.filters.examine import Finding, inspect
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.inspect_episode import Finding, inspect
-from worldline_core.filters.labelled_clips import FAULTS, HARMLESS, Clip, at_frames
-from worldline_core.filters.reasons import REASONS
 from worldline_core.filters.signals import measure
+from worldline_core.filters.verdict import REASONS
 
 
 @pytest.fixture(scope="module")

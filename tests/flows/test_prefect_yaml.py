@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from prefect import Flow
 
-from worldline_core.config import read_yaml
-from worldline_core.config.loader import preset_names
+from worldline_core.config import preset_names, read_yaml
 
 TOP_KEYS = {"name", "prefect-version", "definitions", "deployments"}
 DEPLOYMENT_KEYS = {"name", "description", "entrypoint", "parameters", "schedules", "work_pool", "tags"}

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.cameras import project, transform_intrinsics
-from worldline_core.geometry.image_transforms import ImageTransform
+from worldline_core.geometry.cameras import ImageTransform, project, transform_intrinsics
 
 K = np.array([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
 SIZE = (480, 640)

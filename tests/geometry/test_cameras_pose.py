@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.camera_pose import CameraPose
-from worldline_core.geometry.rigid import (
+from worldline_core.geometry.cameras import CameraPose
+from worldline_core.geometry.transforms import (
     MAX_ROTATION_DEVIATION,
     mean_pose,
     nearest_rotation,
@@ -87,7 +87,7 @@ def test_pyright_refuses_a_bare_array_for_a_pose(tmp_path: Path) -> None:
     snippet.write_text(
         "import numpy as np\n"
         "from worldline_core.data.episodes.episode import CameraTrack\n"
-        "from worldline_core.geometry.camera_pose import CameraPose\n"
+        "from worldline_core.geometry.cameras import CameraPose\n"
         "T = np.eye(4)[None]\n"
         'CameraTrack.from_pose("head", np.eye(3), T, width=4, height=4)\n'
         'CameraPose.from_camera_to_base(T, axes="opengl2", where="head")\n'

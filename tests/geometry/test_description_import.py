@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="descriptions are compiled by MuJoCo")
 
+from tools import description_import
+from tools.description_import import Recipe, import_description
 from worldline_core.errors import DataError
-from worldline_core.geometry import description_import
-from worldline_core.geometry.description_import import Recipe, import_description
 from worldline_core.geometry.mjcf import read_mjcf
 
 ARM = """

@@ -13,8 +13,14 @@ from hypothesis import strategies as st
 
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.distortion import Distortion, distortion_from_ros
-from worldline_core.geometry.distortion_points import distort_points, undistort_points, undistort_rays
-from worldline_core.geometry.undistortion import MAX_HALF_ANGLE_DEG, undistorted_intrinsics, undistortion
+from worldline_core.geometry.undistortion import (
+    MAX_HALF_ANGLE_DEG,
+    distort_points,
+    undistort_points,
+    undistort_rays,
+    undistorted_intrinsics,
+    undistortion,
+)
 
 K = np.array([[400.0, 0.0, 318.0], [0.0, 410.0, 239.0], [0.0, 0.0, 1.0]])
 SIZE = (480, 640)

@@ -12,20 +12,28 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from worldline_core.geometry.cameras import inside_image, project, unproject
-from worldline_core.geometry.pose_formats import (
+from worldline_core.geometry.se3 import (
+    invert,
+    rot6d_from_rotation,
+    rotation_angle,
+    rotation_from_quaternion_wxyz,
+    rotation_from_rot6d,
+    transform_from,
+)
+from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
     euler_moving_xyz_from_rotation,
+    project_points,
     quaternion_wxyz_from_rotation,
     quaternion_xyzw_from_rotation,
+    rigid_inverse,
+    rotation_angle_deg,
     rotation_from_euler_fixed_xyz,
     rotation_from_euler_moving_xyz,
     rotation_from_quaternion_xyzw,
 )
-from worldline_core.geometry.pose_formats import rotation_from_quaternion_wxyz as rotation_in_numpy
-from worldline_core.geometry.rigid import inside_image as inside_in_numpy
-from worldline_core.geometry.rigid import project_points, rigid_inverse, rotation_angle_deg
-from worldline_core.geometry.rot6d import rot6d_from_rotation, rotation_from_rot6d
-from worldline_core.geometry.se3 import invert, rotation_angle, rotation_from_quaternion_wxyz, transform_from
+from worldline_core.geometry.transforms import inside_image as inside_in_numpy
+from worldline_core.geometry.transforms import rotation_from_quaternion_wxyz as rotation_in_numpy
 
 K = torch.tensor([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]], dtype=torch.float64)
 steady = settings(derandomize=True, deadline=None)

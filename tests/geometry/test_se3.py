@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.rot6d import rot6d_from_rotation, rotation_from_rot6d
 from worldline_core.geometry.se3 import (
     check_rigid,
     invert,
     is_rigid,
+    rot6d_from_rotation,
     rotation_angle,
     rotation_from_quaternion_wxyz,
+    rotation_from_rot6d,
     transform_from,
     transform_points,
 )

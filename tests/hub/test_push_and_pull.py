@@ -12,8 +12,8 @@ import pytest
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
-from worldline_core.exports.publish_content import FILE_LIST
-from worldline_core.exports.publish_hub import HubLocation, pull_from_hub, push_to_hub
+from worldline_core.publishing.publish_content import FILE_LIST
+from worldline_core.publishing.publish_hub import HubLocation, pull_from_hub, push_to_hub
 from worldline_core.store.digest import digest_folder
 
 PLACE = HubLocation("lab/toy")

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.base import LoadedEpisode
 from worldline_core.data.sources.open import open_source
+from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.errors import DataError
 
 
@@ -338,7 +338,7 @@ def test_raw_images_of_every_encoding(tmp_path: Path, toy: Any) -> None:
 
 def test_images_are_read_one_by_one(tmp_path: Path, toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Decoded lazily and in order: asking for five frames decodes five."""
-    import worldline_core.data.mcap.topics.images as images
+    import worldline_core.data.mcap.images as images
 
     toy.robot().write(tmp_path / "a.mcap")
     loaded = load(toy.declared(tmp_path))

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.block_causal import (
+from worldline_core.model.block_causal_attention import (
+    KVCache,
     TeacherForcingAttention,
     block_bounds,
     block_causal_mask,
     teacher_forcing_mask,
     visible_blocks,
 )
-from worldline_core.model.kv_cache import KVCache
 from worldline_core.model.layers import grouped_attention
 from worldline_core.model.rope import rotate, rotation
 from worldline_core.model.world_model import WorldModel

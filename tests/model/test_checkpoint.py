@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.config import WorldModelConfig
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import WorldModelConfig
 
 CONTRACT = {"fps": 8.0, "gripper": "0 closed, 1 open", "sigma_px_ref": 10.0}
 

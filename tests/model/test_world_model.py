@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.config import cosmos3_nano_config
 from worldline_core.model.rope import video_positions, view_starts
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import cosmos3_nano_config
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 

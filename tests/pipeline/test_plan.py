@@ -8,7 +8,7 @@ import pytest
 
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.pipeline.config import PipelineConfig
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import Node, find_artifacts, plan, run_node, without_training
 from worldline_core.pipeline.steps import STEPS
 from worldline_core.store.store import ArtifactStore

@@ -16,10 +16,9 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS
-from worldline_core.recorder.episode_recorder import EpisodeRecorder, Recording
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, prepare_rendering, record
 from worldline_core.recorder.rendering import SceneRenderer
-from worldline_core.recorder.simulate import Motion
+from worldline_core.recorder.simulate import EpisodeRecorder, Motion, Recording
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,15 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
+from tools.kinematics_export import embodiment_yaml, kinematics_xml
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.recorder.controllers import Waypoint, plan_waypoints, sample_waypoints
-from worldline_core.recorder.episode_recorder import EpisodeRecorder, state_names
 from worldline_core.recorder.inverse_kinematics import InverseKinematics, tool_rotation
-from worldline_core.recorder.kinematics_export import embodiment_yaml, kinematics_xml
 from worldline_core.recorder.robots import ROBOTS
 from worldline_core.recorder.scene_model import CUBE_HALF, DRAWER_TRAVEL, SceneModel, build_scene_model
-from worldline_core.recorder.scenes import SCENES, TEST_SCENES, TRAIN_SCENES
-from worldline_core.recorder.task_layout import apply_layout, outcome, sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder, state_names
+from worldline_core.recorder.task_layout import SCENES, TEST_SCENES, TRAIN_SCENES, apply_layout, outcome, sample_layout
 
 EMBODIMENTS = Path(__file__).resolve().parents[2] / "configs" / "embodiments"
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.tracks import write_index, write_shard
+from worldline_core.actions.track_store import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-from worldline_core.evaluation.policy.accuracy import summarise_decisions
+from worldline_core.evaluation.policy.evaluate_policy import summarise_decisions
 from worldline_core.evaluation.scores import Score, summarise, write_scores
-from worldline_core.evaluation.video.by_frame import write_by_frame
+from worldline_core.evaluation.video.evaluate_video import write_by_frame
 from worldline_core.report.report import ReportConfig, report
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 from worldline_core.store.atomic import write_json_atomic

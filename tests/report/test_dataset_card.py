@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from worldline_core.config import validate
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import read_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter

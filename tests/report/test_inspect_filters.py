@@ -12,9 +12,9 @@ from rerun.chunk import RrdReader
 
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.exports.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.report.artifacts import read_rows
 from worldline_core.report.inspect import inspect
 from worldline_core.report.inspect_filters import FilteredSet

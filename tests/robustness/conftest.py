@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
+from tools.corrupted import lerobot_v21
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.recorder.corrupted import lerobot_v21
 
 
 @pytest.fixture

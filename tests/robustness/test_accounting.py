@@ -10,14 +10,14 @@ import pytest
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
+from tools.corrupted import lerobot_v21
+from tools.corrupted.corpus import confusion, is_right, outcomes, read_corpus, write_corpus
+from tools.corrupted.labels import Label
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.guards.rejection import REASONS
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.recorder.corrupted import lerobot_v21
-from worldline_core.recorder.corrupted.corpus import confusion, is_right, outcomes, read_corpus, write_corpus
-from worldline_core.recorder.corrupted.labels import Label
 
 
 def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_the_damage_depends_on_the_seed_alone(tmp_path: Path) -> None:
 
 
 def test_an_outcome_counts_only_at_the_stage_that_has_to_find_it() -> None:
-    from worldline_core.recorder.corrupted.corpus import Outcome
+    from tools.corrupted.corpus import Outcome
 
     label = Label("e", "layout", "still", "filter", ("static",))
     assert is_right(label, Outcome("filter", "static"))

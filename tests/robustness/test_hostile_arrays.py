@@ -11,10 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from worldline_core.data.guards import parquet_file
-from worldline_core.data.guards.json_file import read_json, read_json_lines
-from worldline_core.data.guards.npy_file import read_npy
-from worldline_core.data.guards.parquet_file import column_names, read_table
+from worldline_core.data.guards import plain_files as parquet_file
+from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_npy, read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 
 

@@ -11,11 +11,11 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
+from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap import chunks as mcap_chunks
 from worldline_core.data.mcap.chunks import check_chunks
 from worldline_core.data.mcap.reader import read_episode_id, read_episode_mcap
-from worldline_core.recorder.corrupted import mcap
 
 MAGIC = b"\x89MCAP0\r\n"
 

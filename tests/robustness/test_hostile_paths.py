@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.config import CurateConfig
+from tools.corrupted import lerobot_v21
+from tools.corrupted.content import FPS, pictures
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
-from worldline_core.data.guards.listed_ids import check_id, storable, unique_identity
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_id, storable, unique_identity
 from worldline_core.data.guards.source_paths import fill_template, inside
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
-from worldline_core.recorder.corrupted import lerobot_v21
-from worldline_core.recorder.corrupted.content import FPS, pictures
 
 Make = Callable[[int], tuple[Path, CurateConfig]]
 

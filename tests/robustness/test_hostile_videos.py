@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tools.corrupted import files
 from worldline_core.data.guards.limits import MAX_FRAMES
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video import clip as video_clip
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.header import check_video_header
-from worldline_core.recorder.corrupted import files
 
 RANDOM = np.random.default_rng(0)
 

@@ -11,10 +11,10 @@ from pydantic import TypeAdapter
 
 pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 
+from tools.corrupted import mutations
+from tools.corrupted.mutations import attack, mutations_of, read_everything
+from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.data.sources.open import SourceConfig
-from worldline_core.recorder.corrupted import mutations
-from worldline_core.recorder.corrupted.mutations import attack, mutations_of, read_everything
-from worldline_core.recorder.corrupted.one_of_each import write_one_of_each
 
 LAYOUTS = (
     "lerobot_v21",

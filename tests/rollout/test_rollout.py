@@ -13,16 +13,16 @@ import torch
 from pydantic import ValidationError
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.tracks import write_index, write_shard
+from worldline_core.actions.track_store import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.config import WorldModelConfig
-from worldline_core.model.tokenizer.fit import fit_patch_tokenizer
+from worldline_core.model.tokenizer.train_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.controls import shuffled_partners
+from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import RolloutConfig, rollout
+from worldline_core.rollout.rollout_config import shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.digest import digest_folder
 

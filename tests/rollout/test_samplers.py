@@ -10,17 +10,17 @@ import torch
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
-from worldline_core.rollout.block_causal import BlockCausalSimulator
-from worldline_core.rollout.euler import (
+from worldline_core.rollout.causal_simulator import BlockCausalSimulator
+from worldline_core.rollout.full_clip import (
     CAUSAL_SIGMAS,
     Noise,
     check_nodes,
     euler_step,
+    rollout_full_clip,
     shifted_sigmas,
     sigmas_causal,
     sigmas_full,
 )
-from worldline_core.rollout.full_clip import rollout_full_clip
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,7 @@ def store_server() -> Iterator[object]:
 
 @pytest.fixture
 def store(store_server: object) -> Iterator[object]:
-    from worldline_core.scale.remote import process_cache
+    from worldline_core.store.remote import process_cache
 
     process_cache().clear()
     yield store_server

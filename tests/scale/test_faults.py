@@ -12,17 +12,15 @@ from pydantic import ValidationError
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.scale import transient
-from worldline_core.scale.crashes import portable_message
-from worldline_core.scale.mapping import ends_the_run
-from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.mapping import RunnerConfig, ends_the_run, portable_message
 from worldline_core.scale.shard_manifest import (
     InputRow,
     check_account,
     read_shard_manifests,
     write_shard_manifest,
 )
-from worldline_core.scale.transient import UnreachableInputError, is_transient, with_retries
+from worldline_core.store import remote as transient
+from worldline_core.store.remote import UnreachableInputError, is_transient, with_retries
 
 
 class ClientError(Exception):
@@ -162,7 +160,7 @@ def test_runner_settings() -> None:
 
 def test_the_runner_is_no_part_of_a_key() -> None:
     from worldline_core.config import load_config
-    from worldline_core.pipeline.config import PipelineConfig
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
     from worldline_core.pipeline.plan import plan
 
     plain, dask = (

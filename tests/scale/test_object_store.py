@@ -15,17 +15,16 @@ from fsspec.implementations.memory import MemoryFileSystem
 from object_store import ObjectStore
 from upath import UPath
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
-from worldline_core.scale import transient
 from worldline_core.scale.mapping import SerialMapper
-from worldline_core.scale.remote import RemoteCache, list_files, process_cache
 from worldline_core.scale.shard_manifest import read_merged_manifest
-from worldline_core.scale.transient import UnreachableInputError
+from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
+from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
 from worldline_core.store.store import ArtifactStore
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"

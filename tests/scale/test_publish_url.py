@@ -13,11 +13,11 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location
 from worldline_core.errors import ArtifactError
-from worldline_core.exports.publish import pull, push
-from worldline_core.exports.publish_content import FILE_LIST
-from worldline_core.scale import transient
-from worldline_core.scale.transient import UnreachableInputError
+from worldline_core.publishing.publish import pull, push
+from worldline_core.publishing.publish_content import FILE_LIST
+from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
+from worldline_core.store.remote import UnreachableInputError
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from upath import UPath
 
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.mcap.io import write_episode_mcap
 from worldline_core.store.digest import digest_folder
 

@@ -18,14 +18,13 @@ import numpy as np
 import pytest
 
 from tasks.shard_mapper import shard_mapper
-from worldline_core.data.curation.config import CurateConfig
 from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.scale.mapping import SerialMapper
-from worldline_core.scale.runner_config import RunnerConfig
+from worldline_core.scale.mapping import RunnerConfig, SerialMapper
 from worldline_core.scale.shard_manifest import read_merged_manifest
 from worldline_core.store.digest import digest_folder
 
@@ -113,7 +112,7 @@ def test_in_a_flow_the_shards_are_tasks_with_names(
     from prefect.client.orchestration import get_client
 
     from tasks.artifact_task import ArtifactReference, artifact_task
-    from worldline_core.pipeline.sources import source_inputs
+    from worldline_core.pipeline.pipeline_config import source_inputs
 
     configured, settings = config(recordings), runner("processes", workers=2, episodes_per_shard=5)
 

@@ -12,9 +12,8 @@ from scale_jobs import NumbersJob, attempts, jobs_of, write_numbers
 
 from tasks.shard_mapper import shard_mapper
 from worldline_core.errors import UnavailableError
-from worldline_core.scale.mapping import Job, run_jobs
-from worldline_core.scale.runner_config import RunnerConfig
-from worldline_core.scale.transient import UnreachableInputError
+from worldline_core.scale.mapping import Job, RunnerConfig, run_jobs
+from worldline_core.store.remote import UnreachableInputError
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
 

@@ -18,8 +18,7 @@ from safetensors.torch import save_file
 
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training import trainer
-from worldline_core.training.flow_matching import add_noise, flow_matching_loss
-from worldline_core.training.objective import FlowMatchingObjective
+from worldline_core.training.flow_matching import FlowMatchingObjective, add_noise, flow_matching_loss
 from worldline_core.training.stage import Stage
 from worldline_core.training.stage1 import Stage1Config, train_stage1
 from worldline_core.training.stage2 import Stage2Config, train_stage2

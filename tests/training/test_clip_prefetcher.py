@@ -16,11 +16,10 @@ import pytest
 import torch
 
 from worldline_core.errors import DataError, TrainingError
-from worldline_core.training.clip_input import ReadingConfig
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_reader import ClipReader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_source import Clip, ReadingConfig
 from worldline_core.training.latent_store import LatentStore
 
 VIEWS = ("head", "left_wrist", "right_wrist")

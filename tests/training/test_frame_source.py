@@ -12,14 +12,12 @@ import torch
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
-from worldline_core.model.tokenizer.pixels import frames_to_video
-from worldline_core.training.clip_input import FrameInput, LatentInput, ReadingConfig
+from worldline_core.model.tokenizer.tokenizer import frames_to_video
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_reader import ClipReader, SkipLog
 from worldline_core.training.clip_sampler import ClipBatch, ClipSampler, ClipSampling
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_source import Clip, FrameInput, LatentInput, ReadingConfig, training_rows
 from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
-from worldline_core.training.episode_rows import training_rows
 from worldline_core.training.frame_source import FrameSource, frame_rows
 from worldline_core.training.latent_store import LatentStore
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from worldline_core.model.kv_cache import KVCache
+from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.world_model import WorldModel, WorldModelConfig, preconditioned_velocity
 
 STD = 0.75

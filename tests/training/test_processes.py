@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.digest import digest_folder
-from worldline_core.training.metrics_log import read_metrics
+from worldline_core.training.trainer import read_metrics
 
 
 def free_port() -> int:
@@ -142,7 +142,7 @@ def test_processes_that_were_killed_end_with_the_same_bytes(
 
 
 def test_gradients_and_values_of_a_single_process_are_left_alone(make_model: Callable[..., WorldModel]) -> None:
-    from worldline_core.training.processes import average_gradients, average_values, join_processes, wait_for_all
+    from worldline_core.training.trainer import average_gradients, average_values, join_processes, wait_for_all
 
     assert join_processes("cpu") == (0, 1)
     wait_for_all()

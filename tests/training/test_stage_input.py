@@ -14,14 +14,14 @@ from safetensors.torch import load_file
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.pipeline.config import PipelineConfig
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
-from worldline_core.training.metrics_log import read_metrics
+from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, train_stage1
 from worldline_core.training.stage2 import Stage2Config, train_stage2
-from worldline_core.training.teacher import TeacherConfig, train_teacher
+from worldline_core.training.trainer import read_metrics
 
 TRAINER = {
     "steps": 4,

@@ -16,12 +16,12 @@ from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.training import stage as stage_module
 from worldline_core.training import trainer as trainer_module
-from worldline_core.training.episode_rows import training_rows
-from worldline_core.training.metrics_log import read_metrics
-from worldline_core.training.objective import FlowMatchingObjective
+from worldline_core.training.clip_source import training_rows
+from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
 from worldline_core.training.stage2 import Stage2Config, stage2_groups, train_stage2
-from worldline_core.training.teacher import TeacherConfig, train_teacher
+from worldline_core.training.trainer import read_metrics
 
 MakeConfig = Callable[..., WorldModelConfig]
 

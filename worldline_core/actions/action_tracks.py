@@ -22,9 +22,8 @@ from worldline_core.actions.episode_tracks import (
     collate_tracks,
 )
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
-from worldline_core.actions.tool_projection import project_tools
-from worldline_core.actions.track_counts import TrackCounts, count_samples
-from worldline_core.actions.tracks import ActionTracks
+from worldline_core.actions.tool_projection import TrackCounts, count_samples, project_tools
+from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Observation
 from worldline_core.calibration.pose_evidence import rms_hand_eye, unrest_log_likelihood
 from worldline_core.calibration.reading import Reading
-from worldline_core.data.episodes.convention_needs import applicable
-from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.data.episodes.conventions import RecordedConventions, applicable
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.geometry.rigid import rigid_inverse
+from worldline_core.geometry.transforms import rigid_inverse
 
 _COMMON_SIZES = (
     (1080, 1920), (1200, 1920), (720, 1280), (800, 1280), (960, 1280), (768, 1024), (600, 960), (600, 800), (540, 960),

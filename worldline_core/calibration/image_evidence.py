@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from worldline_core.calibration.config import CalibrationDoctorConfig, Typical
 from worldline_core.calibration.observation import Observation, cell_centres
 from worldline_core.calibration.reading import Reading
-from worldline_core.geometry.rigid import rigid_inverse, rotation_angle_deg
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
+from worldline_core.geometry.transforms import rigid_inverse, rotation_angle_deg
 
 _MIN_STEP_PX = 0.7
 _FOLLOWS = 0.5  # correlation above which an angle between flows means something

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.diagnosis import ViewMeasures
 from worldline_core.calibration.gripper_evidence import finger_flow, stopped_share
 from worldline_core.calibration.hypotheses import camera_lag_scores
@@ -17,6 +16,7 @@ from worldline_core.calibration.image_evidence import (
 from worldline_core.calibration.observation import Observation
 from worldline_core.calibration.pose_evidence import in_view_share, mount_offset, principal_point_offset, rms_hand_eye
 from worldline_core.calibration.reading import Reading
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig
 from worldline_core.data.episodes.episode import CameraTrack
 
 _FOLLOWS = 3.0  # times as rigid

@@ -13,7 +13,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rigid import hand_eye_residual
+from worldline_core.geometry.transforms import hand_eye_residual
 
 GRAY_WIDTH = 96
 CELL_PX = 4

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, project_tools
+from worldline_core.actions.overlay_views import legend_strip, view_name
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced, pad
-from worldline_core.exports.labels import INK, MUTED, Picture, draw_tag, text_strip
-from worldline_core.exports.overlay_views import legend_strip, view_name
-from worldline_core.exports.overlays import OverlayStyle, draw_overlay
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, pad
+from worldline_core.pictures.labels import INK, MUTED, Picture, draw_tag, text_strip
 
 if TYPE_CHECKING:
     from worldline_core.calibration.diagnosis import Diagnosis, ViewMeasures

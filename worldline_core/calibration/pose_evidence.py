@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from worldline_core.calibration.config import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Arm, Observation
 from worldline_core.calibration.reading import Reading
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.geometry.rigid import (
+from worldline_core.geometry.transforms import (
     hand_eye_residual,
     inside_image,
     project_points,

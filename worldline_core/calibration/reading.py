@@ -9,14 +9,14 @@ import numpy as np
 
 from worldline_core.actions.robot_masks import robot_capsules
 from worldline_core.calibration.observation import CELL_PX, Observation
-from worldline_core.data.episodes.convention_needs import arm_blocks
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
+    arm_blocks,
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.geometry.rigid import rigid_inverse
+from worldline_core.geometry.transforms import rigid_inverse
 
 _CAPSULE_SAMPLES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 _TOOL_POINTS_M = np.array([0.0, 0.05, 0.1, 0.15])

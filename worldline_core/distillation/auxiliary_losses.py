@@ -1,19 +1,139 @@
 """Auxiliary objectives of Stage III and their weights (appendix, "Score-Based Distribution Matching").
 
 Axes: b clips, v views, c latent channels, t latent frames (the observed one first), h and w rows and columns.
+
+The perceptual auxiliary (L_LPIPS): distance of decoded frames in a pretrained network's features.
+
+It needs the LPIPS weights in a local folder. Without them the term is off, and says so: a network with random weights
+would be no perceptual distance.
+
+Robot-focused losses: what the robot region of a predicted clip must reproduce (paper, Stage III).
+
+Few-step students tend to spend their capacity on the static background.  These two terms look only at the
+robot: an L2 distance on its latents and an L1 distance on their temporal differences, each divided by the area
+of the mask so that a distant robot counts as much as a near one, the wrist views twice.
+
+Axes: b clips, v views, c latent channels, t latent frames, h and w latent rows and columns.
+
+Robot masks of training clips at latent resolution, from the capsules stored with the action tracks.
+
+Masks weigh the robot-focused losses during distillation; no model ever receives them.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
+import torch
+from einops import rearrange, reduce
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from worldline_core.config.base import StrictModel
-from worldline_core.distillation.robot_losses import robot_motion_loss, robot_reconstruction_loss, view_weights
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.robot_masks import kinematic_robot_masks
+from worldline_core.config import StrictModel
+from worldline_core.errors import ConfigError
+from worldline_core.evaluation.video.lpips import LPIPS, load_lpips
+from worldline_core.geometry.cameras import valid_intrinsics
+from worldline_core.geometry.se3 import is_rigid
+from worldline_core.model.tokenizer.tokenizer import VideoTokenizer
+
+
+class PerceptualLoss:
+    """Mean LPIPS of some decoded frames, differentiable in the predicted latents.
+
+    Args:
+        tokenizer: decodes latents; stays frozen.
+        weights: folder of the LPIPS weights.
+        latent_frames: how many latent frames, the last ones, are compared (decoding is the expensive part).
+
+    Raises:
+        UnavailableError: the folder lacks the weights.
+    """
+
+    def __init__(self, tokenizer: VideoTokenizer, weights: Path, latent_frames: int = 2, device: str = "cpu") -> None:
+        self.tokenizer = tokenizer
+        self.latent_frames = latent_frames
+        self.network = load_lpips(weights).to(device)
+        # The metric is declared free of gradients; the loss is the same function with them.
+        self._distance = inspect.unwrap(LPIPS.forward)
+
+    def __call__(
+        self, predicted: Float[Tensor, "b v c t h w"], target: Float[Tensor, "b v c t h w"]
+    ) -> Float[Tensor, ""]:
+        """LPIPS between both clips, decoded from their observed frame on and cut to the last latent frames."""
+        video = self._decode(predicted)
+        with torch.no_grad():
+            reference = self._decode(target)
+        count = self.latent_frames * self.tokenizer.temporal_compression
+        frames, references = (
+            rearrange(clip[:, :, -count:] / 2 + 0.5, "n c t h w -> (n t) c h w").clamp(0, 1)
+            for clip in (video, reference)
+        )
+        return self._distance(self.network, frames, references).mean()
+
+    def _decode(self, latents: Tensor) -> Tensor:
+        return self.tokenizer.decode(rearrange(latents.float(), "b v c t h w -> (b v) c t h w"))
+
+
+HEAD_VIEW = "head"
+
+
+def view_weights(views: Sequence[str], wrist_weight: float = 2.0) -> Float[Tensor, " v"]:
+    """Weight of each view: 1 for the head, `wrist_weight` for every other one (appendix, 2 in the paper)."""
+    if not views:
+        raise ConfigError("the robot losses need at least one view", expected="a list of view names", got="[]")
+    return torch.tensor([1.0 if view == HEAD_VIEW else wrist_weight for view in views])
+
+
+def mask_normalised_mean(
+    error: Float[Tensor, "b v t h w"], mask: Float[Tensor, "b v t h w"], weights: Float[Tensor, " v"]
+) -> Float[Tensor, ""]:
+    """Mean of `error` inside `mask` per clip and view, then the weighted mean over clips and views.
+
+    A clip-view pair in which no robot is visible takes no part, with neither its error nor its weight; a batch
+    without any robot costs exactly zero (and stays differentiable).
+    """
+    area = reduce(mask, "b v t h w -> b v", "sum")
+    total = reduce(error * mask, "b v t h w -> b v", "sum")
+    present = (area > 0).to(error.dtype) * weights.to(error)
+    per_view = total / area.clamp_min(torch.finfo(area.dtype).eps)
+    return (per_view * present).sum() / present.sum().clamp_min(1.0)
+
+
+def robot_reconstruction_loss(
+    predicted: Float[Tensor, "b v c t h w"],
+    target: Float[Tensor, "b v c t h w"],
+    mask: Float[Tensor, "b v t h w"],
+    weights: Float[Tensor, " v"],
+) -> Float[Tensor, ""]:
+    """L_robot: squared error on the robot's latents (first term of L_RF), mean over channels and mask area."""
+    error = reduce((predicted - target) ** 2, "b v c t h w -> b v t h w", "mean")
+    return mask_normalised_mean(error, mask, weights)
+
+
+def robot_motion_loss(
+    predicted: Float[Tensor, "b v c t h w"],
+    target: Float[Tensor, "b v c t h w"],
+    mask: Float[Tensor, "b v t h w"],
+    weights: Float[Tensor, " v"],
+) -> Float[Tensor, ""]:
+    """L_Δrobot: absolute error on the differences of neighbouring latent frames (second term of L_RF).
+
+    A difference belongs to the robot when the robot covers the cell in either of its two frames: where it leaves
+    matters as much as where it arrives.  A single frame has no difference and costs zero.
+    """
+    if predicted.shape[3] < 2:
+        return (predicted * 0.0).sum()
+    error = (predicted.diff(dim=3) - target.diff(dim=3)).abs()
+    either = torch.maximum(mask[:, :, 1:], mask[:, :, :-1])
+    return mask_normalised_mean(reduce(error, "b v c t h w -> b v t h w", "mean"), either, weights)
+
 
 PerceptualDistance = Callable[[Tensor, Tensor], Tensor]
 """Distance of two latent clips `b v c t h w` after decoding; see `perceptual.py`."""
@@ -98,3 +218,42 @@ def auxiliary_losses(
     for weight, value in terms.values():
         total = total + weight * value
     return AuxiliaryLosses(total, {name: value.detach() for name, (_, value) in terms.items()})
+
+
+def clip_robot_masks(
+    clips: Sequence[EpisodeTracks], views: Sequence[str], grid_size: tuple[int, int]
+) -> Float[Tensor, "b v t h w"]:
+    """Masks (0 or 1) of clips of equal length, one for each latent frame.
+
+    A view without a valid calibration shows no robot: its mask is empty, and the losses leave it out.
+
+    Args:
+        clips: tracks cut to every RGB frame of each clip (4 k + 1 frames).
+        grid_size: (rows, columns) of the latents.
+
+    Raises:
+        ConfigError: the clips do not fit the tokenizer.
+    """
+    parts = max(len(clip.capsule_radii) for clip in clips)
+    order = [[clip.views.index(view) for view in views] for clip in clips]
+    capsules = np.stack([_padded(clip.capsules, 1, parts) for clip in clips])
+    radii = np.stack([_padded(clip.capsule_radii, 0, parts) for clip in clips])
+    K = torch.from_numpy(np.stack([clip.K[index] for clip, index in zip(clips, order, strict=True)]))
+    cameras = torch.from_numpy(
+        np.stack([clip.T_base_camera[:, index] for clip, index in zip(clips, order, strict=True)])
+    )
+    calibrated = valid_intrinsics(K) & is_rigid(cameras).all(dim=1)
+    identity = torch.eye(4, dtype=K.dtype)
+    K = torch.where(calibrated[..., None, None], K, identity[:3, :3])
+    cameras = torch.where(calibrated[:, None, :, None, None], cameras, identity)
+    masks = kinematic_robot_masks(
+        torch.from_numpy(capsules), torch.from_numpy(radii), K, cameras, clips[0].image_size, grid_size
+    )
+    return masks * calibrated[:, :, None, None, None].to(masks)
+
+
+def _padded(array: np.ndarray, axis: int, size: int) -> np.ndarray:
+    """Zeros at the end of `axis`: a capsule of radius 0 covers nothing."""
+    widths = [(0, 0)] * array.ndim
+    widths[axis] = (0, size - array.shape[axis])
+    return np.pad(array, widths)

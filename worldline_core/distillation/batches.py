@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.clip_masks import clip_robot_masks
-from worldline_core.distillation.config import DistillConfig
-from worldline_core.distillation.teacher_trajectories import teacher_trajectories, with_observed_frame
-from worldline_core.distillation.trajectory_store import TrajectoryStore
+from worldline_core.distillation.auxiliary_losses import clip_robot_masks
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.teacher_trajectories import TrajectoryStore, teacher_trajectories, with_observed_frame
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch, ClipLoader

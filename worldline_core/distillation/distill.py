@@ -14,21 +14,19 @@ from typing import Any
 import torch
 
 from worldline_core.distillation.batches import TrajectoryLoader, TrajectoryMaker
-from worldline_core.distillation.config import DistillConfig
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.distillation_step import LPIPS_OFF, STEPS, DistillationStage, named_parameters
 from worldline_core.distillation.objectives import (
     DistributionMatchingObjective,
     TeacherForcingObjective,
     TrajectoryObjective,
 )
-from worldline_core.distillation.stage import LPIPS_OFF, STEPS, DistillationStage, named_parameters
-from worldline_core.distillation.teacher_trajectories import NODES
-from worldline_core.distillation.trajectory_store import INDEX, TrajectoryStore, write_trajectories
+from worldline_core.distillation.teacher_trajectories import INDEX, NODES, TrajectoryStore, write_trajectories
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.latent_store import TEMPORAL_COMPRESSION
-from worldline_core.training.processes import wait_for_all
-from worldline_core.training.trainer import ParameterGroup, TrainerConfig
+from worldline_core.training.trainer import ParameterGroup, TrainerConfig, wait_for_all
 
 __all__ = ["DistillConfig", "distill"]
 

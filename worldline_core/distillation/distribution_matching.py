@@ -20,14 +20,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.causal_history import CacheWindow, CausalHistory
-from worldline_core.distillation.causal_teacher_forcing import frame_sigmas
-from worldline_core.distillation.config import CYCLE
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow, CausalHistory, frame_sigmas
+from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.distillation.teacher_trajectories import NODES
 from worldline_core.errors import ConfigError
-from worldline_core.model.block_causal import block_bounds
+from worldline_core.model.block_causal_attention import block_bounds
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.euler import euler_step
+from worldline_core.rollout.full_clip import euler_step
 from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
 
 Score = Callable[[Tensor, Tensor, Tensor], Tensor]

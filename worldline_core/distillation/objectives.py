@@ -11,7 +11,7 @@ from torch import Tensor
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses, enabled_terms
 from worldline_core.distillation.batches import maps_of, parts_of
 from worldline_core.distillation.causal_teacher_forcing import block_sigmas, teacher_forcing_loss
-from worldline_core.distillation.config import CYCLE, DistillConfig
+from worldline_core.distillation.distill_config import CYCLE, DistillConfig
 from worldline_core.distillation.distribution_matching import (
     Score,
     causal_score,

@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from worldline_core.exports.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.exports.rerun_recording import log_frames, timeline
+from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    from worldline_core.filters.inspect_episode import Finding
+    from worldline_core.filters.examine import Finding
 
 _LARGEST_RATIO = 5.0
 """Curves are clipped there, or one outlier would flatten all others."""

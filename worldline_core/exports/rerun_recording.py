@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
-from worldline_core.exports.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
-from worldline_core.exports.pictures import jpeg_bytes, png_bytes
+from worldline_core.actions.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
 from worldline_core.exports.rerun_blueprint import blueprint
+from worldline_core.pictures.labels import jpeg_bytes, png_bytes
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
-from worldline_core.exports.side_by_side import write_side_by_side
+from worldline_core.pictures.side_by_side import write_side_by_side
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.filters.verdict import Curve, Verdict, long_runs
 
 _CELL = 8

@@ -1,13 +1,30 @@
-"""Calibration: K is sane, camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay fixed."""
+"""Calibration: K is sane, camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay fixed.
+
+The calibration doctor as a detector: no usual mistake explains the recording better than what it says of itself.
+
+An explained mistake condemns the episode for Stage II as well: its evidence names the configuration line that repairs
+the source, and nothing is repaired silently.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
-from worldline_core.filters.verdict import Verdict
-from worldline_core.geometry.rigid import hand_eye_residual, rotation_angle_deg
+from worldline_core.calibration.calibration_doctor import bad_terms, diagnose
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.errors import UnavailableError
+from worldline_core.filters.verdict import Verdict, runs
+from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.transforms import hand_eye_residual, rotation_angle_deg
 
 
 class CalibrationConfig(StrictModel):
@@ -92,3 +109,110 @@ def detect_fixed_camera(T_base_camera: np.ndarray, config: CalibrationConfig) ->
         metres_95 <= config.max_hand_eye_m and degrees_95 <= config.max_hand_eye_deg,
         {"moved_m": metres_95, "turned_deg": degrees_95},
     )
+
+
+class FilterDoctorConfig(CalibrationDoctorConfig):
+    """As the doctor's, but other readings are tried only where the recorded one looks bad, and of long or fast
+    recordings a part is looked at."""
+
+    search: Literal["always", "when_suspicious"] = "when_suspicious"
+    rate_hz: float = Field(
+        default=8.0,
+        gt=0,
+        description="frames a second that are compared: at the recorded 30 Hz an arm moves by less than a small image's pixel "
+        "from frame to frame, and a lag of a tenth of a second is more frames than are tried",
+    )
+    max_frames: int = Field(
+        default=40, ge=17, description="at that rate; of longer stretches the part with most motion"
+    )
+
+
+_UNEXPLAINED = "calibration_unexplained"
+# Of fewer frames in a row nothing can be said.
+_MIN_FRAMES = 4
+
+
+def detect_mistake(
+    episode: Episode, gray: Mapping[str, np.ndarray], bad_frames: np.ndarray, config: FilterDoctorConfig
+) -> Verdict:
+    """Whether the recording's calibration is consistent; if not, the explanation and the line that repairs it.
+
+    Args:
+        gray: by view, uint8 (n, h, w).
+        bad_frames: bool (n,), frames that other detectors dropped; the longest stretch without any is judged.
+    """
+    stretches = runs(~bad_frames)
+    if not stretches:
+        return Verdict(_UNEXPLAINED, True, {"verdict": "too_little_evidence"})
+    start, stop = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+    step = max(1, round(episode.fps / config.rate_hz))
+    if stop - start < _MIN_FRAMES * step:
+        return Verdict(_UNEXPLAINED, True, {"verdict": "too_little_evidence"})
+    start, stop = _liveliest(episode, start, stop, step * config.max_frames)
+    if (start, stop, step) != (0, len(bad_frames), 1):
+        episode = episode.cut(start, stop, step)
+        gray = {view: images[start:stop:step] for view, images in gray.items()}
+    diagnosis = diagnose(episode, gray, kinematics_of(episode), config)
+    return Verdict(
+        _reason(diagnosis),
+        diagnosis.verdict in ("consistent", "too_little_evidence"),
+        _numbers(diagnosis, config, step) | {"first_frame": start, "every_frame": step},
+    )
+
+
+def _liveliest(episode: Episode, start: int, stop: int, length: int) -> tuple[int, int]:
+    """Of frames start..stop the `length` in a row whose states change most; all where there are no more."""
+    if stop - start <= length:
+        return start, stop
+    change = np.abs(np.diff(episode.state[start:stop].astype(np.float64), axis=0)).sum(axis=1)
+    until = np.concatenate([[0.0], np.cumsum(change)])
+    first = start + int((until[length - 1 :] - until[: len(until) - length + 1]).argmax())
+    return first, first + length
+
+
+def _reason(diagnosis: Diagnosis) -> str:
+    if diagnosis.verdict != "explained":
+        return _UNEXPLAINED
+    lags = all(field.endswith("lag_frames") for field in diagnosis.best.conventions.departures)
+    return "time_alignment" if lags else "calibration"
+
+
+def _numbers(diagnosis: Diagnosis, config: CalibrationDoctorConfig, step: int) -> dict[str, float | int | str | None]:
+    numbers: dict[str, float | int | str | None] = {
+        "verdict": diagnosis.verdict,
+        "mistake": diagnosis.best.mistake,
+        "score_as_recorded": diagnosis.none.score,
+        "threshold_margin": config.min_margin,
+    }
+    if diagnosis.verdict == "explained":
+        numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(_config_lines(diagnosis.best, step))}
+    if diagnosis.verdict == "unexplained":
+        bad = bad_terms(diagnosis.none, config)
+        numbers |= {"bad": ", ".join(sorted(bad, key=lambda name: bad[name]))}
+    return numbers
+
+
+def _config_lines(best: Explanation, step: int) -> Sequence[str]:
+    """The lines that repair the source; lags counted in its own frames."""
+    lags = {field: step * getattr(best.conventions, field) for field in best.conventions.departures if "_lag_" in field}
+    return best.conventions.model_copy(update=lags).config_lines() if lags and step > 1 else best.config_lines
+
+
+def kinematics_of(episode: Episode) -> ArmKinematics | None:
+    """Of the episode's embodiment; None where it is unknown, its description is not here, or it is of another layout."""
+    kinematics = _load(episode.embodiment) if episode.embodiment in embodiment_names() else None
+    if kinematics is None:
+        return None
+    embodiment, poses = kinematics.embodiment, episode.T_base_ee
+    if poses is not None and poses.shape[1] != len(embodiment.arms):
+        return None
+    fits = episode.state_kind != "joints" or episode.state.shape[1] == embodiment.state_size
+    return kinematics if fits else None
+
+
+@lru_cache(maxsize=16)
+def _load(name: str) -> ArmKinematics | None:
+    try:
+        return ArmKinematics(load_embodiment(name))
+    except UnavailableError:  # the doctor then judges recorded tool poses without a stated mount
+        return None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
-from worldline_core.filters.picture_statistics import PictureStatistics
+from worldline_core.config import StrictModel
+from worldline_core.filters.signals import PictureStatistics
 from worldline_core.filters.verdict import Curve, Verdict, runs
 
 

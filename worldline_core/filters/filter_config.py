@@ -7,20 +7,14 @@ from typing import Any, Self
 
 from pydantic import Field, JsonValue, model_validator
 
-from worldline_core.config.base import StrictModel
-from worldline_core.config.loader import validate
+from worldline_core.config import StrictModel, validate
 from worldline_core.errors import ConfigError
+from worldline_core.filters.alignment import ProjectionConfig, TimeAlignmentConfig
 from worldline_core.filters.base_motion import BaseMotionConfig
-from worldline_core.filters.blur import BlurConfig
-from worldline_core.filters.calibration import CalibrationConfig
+from worldline_core.filters.calibration import CalibrationConfig, FilterDoctorConfig
 from worldline_core.filters.corrupted import CorruptedConfig
-from worldline_core.filters.doctor import FilterDoctorConfig
-from worldline_core.filters.exposure import ExposureConfig
-from worldline_core.filters.joint_motion import JointMotionConfig
-from worldline_core.filters.projection import ProjectionConfig
-from worldline_core.filters.reset import ResetConfig
-from worldline_core.filters.static import StaticConfig
-from worldline_core.filters.time_alignment import TimeAlignmentConfig
+from worldline_core.filters.exposure import BlurConfig, ExposureConfig
+from worldline_core.filters.motion import JointMotionConfig, ResetConfig, StaticConfig
 
 
 class FilterConfig(StrictModel):

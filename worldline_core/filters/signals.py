@@ -1,4 +1,7 @@
-"""Measured signals of an episode that the detectors look at: tool poses, speeds, small grey images, image change."""
+"""Measured signals of an episode that the detectors look at: tool poses, speeds, small grey images, image change.
+
+Numbers about each small grey picture of a view, which several detectors look at. About 0.05 ms a picture.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,122 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.filters.picture_statistics import PictureStatistics, picture_statistics
-from worldline_core.filters.static import range_speed
+from worldline_core.filters.motion import range_speed
+
+WHITE_LEVEL = 245
+"""Luma from which a pixel tells nothing any more."""
+_FLAT_LEVELS = 2
+_COARSE = 4
+# Pictures whose differences are worked on at a time: they stay in the processor's cache.
+_BATCH = 16
+
+
+@dataclass(frozen=True)
+class PictureStatistics:
+    """All (n,), of small pictures; grey levels are of 255.
+
+    Attributes:
+        mean, contrast: mean and standard deviation of the levels. bright_level: their 95th percentile.
+        white_share: share of pixels at WHITE_LEVEL or above.
+        roughness: 1 minus the correlation of adjacent pixels (the lower of across and down): near 0 for pictures, near 1
+            for noise. It does not depend on gain.
+        detail: mean squared difference of adjacent pixels, across plus down.
+        flat_share: share of rows at the lower edge that have together one grey level, plus those at the upper edge.
+        change: mean absolute difference from the picture before (0 for the first).
+        coarse_change: the same of pictures reduced by four, in which sensor noise hardly shows.
+    """
+
+    mean: np.ndarray
+    contrast: np.ndarray
+    bright_level: np.ndarray
+    white_share: np.ndarray
+    roughness: np.ndarray
+    detail: np.ndarray
+    flat_share: np.ndarray
+    change: np.ndarray
+    coarse_change: np.ndarray
+
+
+def picture_statistics(gray: np.ndarray) -> PictureStatistics:
+    """Of uint8 (n, h, w)."""
+    count, height, width = gray.shape
+    histograms = np.stack([np.bincount(image.reshape(-1), minlength=256) for image in gray]).astype(np.float64)
+    levels = np.arange(256)
+    pixels = height * width
+    mean = histograms @ levels / pixels
+    variance = np.maximum(histograms @ levels**2 / pixels - mean**2, 0)
+    across, down, change = _differences(gray)
+    coarse_size = (max(1, width // _COARSE), max(1, height // _COARSE))
+    coarse_change = np.zeros(count)
+    coarse_before = None
+    for i, image in enumerate(gray):
+        coarse = cv2.resize(image.astype(np.float32), coarse_size, interpolation=cv2.INTER_AREA)
+        if coarse_before is not None:
+            coarse_change[i] = cv2.norm(coarse, coarse_before, cv2.NORM_L1) / coarse.size
+        coarse_before = coarse
+    across, down, change = across / (height * (width - 1)), down / ((height - 1) * width), change / pixels
+    low, high = gray.min(axis=2).astype(np.int16), gray.max(axis=2).astype(np.int16)
+    cumulative = np.cumsum(histograms, axis=1)
+    return PictureStatistics(
+        mean,
+        np.sqrt(variance),
+        (cumulative < 0.95 * pixels).sum(axis=1).astype(np.float64),
+        histograms[:, WHITE_LEVEL:].sum(axis=1) / pixels,
+        np.minimum(np.maximum(across, down) / (2 * np.maximum(variance, 1e-3)), 1.0),
+        across + down,
+        _flat_edge(low, high) + _flat_edge(low[:, ::-1], high[:, ::-1]),
+        change,
+        coarse_change,
+    )
+
+
+def _differences(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of uint8 (n, h, w), three (n,): summed squared differences of adjacent pixels across and down, and summed absolute
+    differences from the picture before (0 for the first).
+
+    A row's sum of squares is a whole number below 2^24 (for w <= 258), so float32 holds it exactly in whatever order BLAS
+    adds.
+    """
+    count, height, width = gray.shape
+    across, down, change = np.empty(count), np.empty(count), np.zeros(count)
+    ones = np.ones(width, dtype=np.float32)
+
+    def row_sums(one: np.ndarray, other: np.ndarray, *, squared: bool) -> np.ndarray:
+        difference = cv2.absdiff(one, other).astype(np.float32)
+        if squared:
+            np.multiply(difference, difference, out=difference)
+        return (difference @ ones[: difference.shape[1]]).astype(np.float64)
+
+    for start in range(0, count, _BATCH):
+        part = slice(start, start + _BATCH)
+        rows = np.ascontiguousarray(gray[part]).reshape(-1, width)
+        across[part] = row_sums(rows[:, 1:], rows[:, :-1], squared=True).reshape(-1, height).sum(axis=1)
+        # The last row of a picture and the first one of the next are no neighbours.
+        below = np.append(row_sums(rows[1:], rows[:-1], squared=True), 0.0)
+        down[part] = below.reshape(-1, height)[:, :-1].sum(axis=1)
+        with_previous = np.ascontiguousarray(gray[max(start - 1, 0) : part.stop]).reshape(-1, width)
+        if len(with_previous) > height:
+            moved = row_sums(with_previous[height:], with_previous[:-height], squared=False)
+            change[max(start, 1) : part.stop] = moved.reshape(-1, height).sum(axis=1)
+    return across, down, change
+
+
+def _flat_edge(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Share of rows, from the last one up, that together span no more than a few levels.
+
+    Args:
+        low, high: (n, h) darkest and brightest level of each row.
+    """
+    lowest = np.minimum.accumulate(low[:, ::-1], axis=1)
+    highest = np.maximum.accumulate(high[:, ::-1], axis=1)
+    return (highest - lowest <= _FLAT_LEVELS).mean(axis=1)
+
 
 _METRES_A_RADIAN = 0.3
 """How far a tool gets whose arm nobody knows, a radian of a joint: half the reach of a small arm."""

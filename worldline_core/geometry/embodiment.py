@@ -2,44 +2,73 @@
 
 One YAML file an embodiment in `configs/embodiments/`, beside it (or in a Python package, or at the user) the kinematic
 description. `observation.state` and `action` hold, for each arm in order, its joint positions, then its gripper.
+
+Which joints of a recording leave their limits, and by how much.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from worldline_core.config import StrictModel, read_yaml, validate
-from worldline_core.config.loader import CONFIG_ROOT
+from worldline_core.config import CONFIG_ROOT, StrictModel, read_yaml, validate
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.description import (
     Description,
-    description_variable,
     locate_description,
     read_description_file,
 )
-from worldline_core.geometry.joint_limits import LimitViolation, limit_violations
-from worldline_core.geometry.rigid_offset import RigidOffset
+from worldline_core.geometry.transforms import RigidOffset
 
-__all__ = [
-    "EMBODIMENT_ROOT",
-    "Arm",
-    "Description",
-    "Embodiment",
-    "FingerJoint",
-    "Gripper",
-    "RigidOffset",
-    "WristCamera",
-    "description_variable",
-    "embodiment_names",
-    "load_embodiment",
-    "read_description",
-]
+
+@dataclass(frozen=True)
+class LimitViolation:
+    """A joint that leaves its limits: frames outside, and the furthest value with its frame, in `unit` (or metres)."""
+
+    joint: str
+    frames: int
+    worst: float
+    worst_frame: int
+    lower: float
+    upper: float
+    unit: str
+
+    @property
+    def excess(self) -> float:
+        """How far the worst value is beyond its limit."""
+        return max(self.lower - self.worst, self.worst - self.upper)
+
+
+def limit_violations(
+    state: np.ndarray,
+    outside: np.ndarray,
+    limits: Mapping[int, tuple[float, float]],
+    names: Sequence[str],
+    unit: str,
+) -> list[LimitViolation]:
+    """The joints with a frame outside, the furthest first.
+
+    Args:
+        state: (N, J).
+        outside: (N, J) bool, as `Embodiment.outside_limits` gives.
+        limits: lower and upper by column.
+    """
+    found: list[LimitViolation] = []
+    for column in map(int, np.flatnonzero(outside.any(axis=0))):
+        lower, upper = limits[column]
+        values = state[:, column].astype(np.float64)
+        frame = int(np.argmax(np.maximum(lower - values, values - upper)))
+        count = int(outside[:, column].sum())
+        found.append(LimitViolation(names[column], count, float(values[frame]), frame, lower, upper, unit))
+    return sorted(found, key=lambda violation: -violation.excess)
+
 
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
 

@@ -21,8 +21,8 @@ from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.description import TreeBody, kept_for, mounted
 from worldline_core.geometry.embodiment import Embodiment, read_description
-from worldline_core.geometry.kinematic_tree import TreeBody, kept_for, mounted
 from worldline_core.geometry.mjcf import read_mjcf
 from worldline_core.geometry.se3 import invert
 from worldline_core.geometry.urdf import read_urdf

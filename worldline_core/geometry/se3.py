@@ -2,6 +2,10 @@
 
 `T_a_b` maps points given in frame b to frame a, so `T_a_c = T_a_b @ T_b_c`. Quaternions are wxyz, unit length.
 Functions are batched over leading axes, differentiable, and keep dtype and device.
+
+Rot6D: a rotation as its first two columns (Zhou et al., CVPR 2019, "On the Continuity of Rotation Representations").
+
+Layout: `[R00, R10, R20, R01, R11, R21]`, that is column x, then column y.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.pose_formats import MIN_QUATERNION_NORM
+from worldline_core.geometry.transforms import MIN_QUATERNION_NORM
 
 ROTATION_TOLERANCE = 1e-4
 """Largest deviation of R R^T from the identity (and of det R from 1) that still counts as a rotation."""
@@ -94,3 +98,26 @@ def check_rigid(T: Float[Tensor, "*b 4 4"], where: object) -> None:
             got=f"{len(bad)} of {good.numel()} bad, the first {bad[0].tolist()}",
             next_step="check whether the matrix is transposed, scaled, or stored in another layout",
         )
+
+
+def rot6d_from_rotation(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
+    """First two columns, one after the other."""
+    return torch.cat([rotation[..., :, 0], rotation[..., :, 1]], dim=-1)
+
+
+def rotation_from_rot6d(rot6d: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation by Gram-Schmidt: exact for Rot6D of a rotation, the nearest frame built from x first otherwise.
+
+    Raises: CalibrationError when the two vectors span no plane (one is zero, or they are parallel).
+    """
+    area = torch.linalg.cross(rot6d[..., :3], rot6d[..., 3:]).norm(dim=-1)
+    if not bool((area > 1e-9).all()):
+        raise CalibrationError(
+            "Rot6D spans no frame: a column is zero, not finite, or parallel to the other",
+            expected="two columns that are not parallel",
+            got=f"{int((~(area > 1e-9)).sum())} of {area.numel()} such",
+        )
+    x = torch.nn.functional.normalize(rot6d[..., :3], dim=-1)
+    y = rot6d[..., 3:] - (x * rot6d[..., 3:]).sum(-1, keepdim=True) * x
+    y = torch.nn.functional.normalize(y, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)

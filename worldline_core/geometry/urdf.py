@@ -16,7 +16,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.geometry.kinematic_tree import TreeBody, TreeJoint, numbers, parse_xml, unit
+from worldline_core.geometry.description import TreeBody, TreeJoint, numbers, parse_xml, unit
 
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
 

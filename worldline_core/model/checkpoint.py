@@ -16,8 +16,8 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from worldline_core.errors import CheckpointError
-from worldline_core.model.config import WorldModelConfig
 from worldline_core.model.world_model import WorldModel, is_text_parameter
+from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 CheckpointKind = Literal["base", "stage1", "stage2", "causal"]

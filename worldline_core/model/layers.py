@@ -1,19 +1,26 @@
 """One layer of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
 Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+
+Sinusoidal time embedding, added to noisy tokens only.
+
+Action maps to token residuals (method.md section 2).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the customary name
+import torch.nn.functional as F
 from einops import rearrange
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from worldline_core.model.config import WorldModelConfig
+from worldline_core.errors import DataError
 from worldline_core.model.rope import Rotation, rotate
+from worldline_core.model.world_model_config import WorldModelConfig
 
 
 class GenerationAttention(Protocol):
@@ -170,3 +177,69 @@ class MixtureLayer(nn.Module):
             generation = generation + self.self_attn.generate(normalised, attend, layer, text)
             generation = generation + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(generation))
         return generation, understanding, text
+
+
+CHANNELS = 256
+
+
+def sinusoids(times: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 256"]:
+    """Cosines, then sines, of ``times`` at frequencies 1 down to 1e-4 (geometric), float32."""
+    half = CHANNELS // 2
+    exponent = -math.log(10000.0) * torch.arange(half, dtype=torch.float32, device=times.device) / half
+    angles = times.to(torch.float32).unsqueeze(-1) * exponent.exp()
+    return torch.cat((angles.cos(), angles.sin()), dim=-1)
+
+
+class TimeEmbedder(nn.Module):
+    """Two-layer perceptron on the sinusoids; runs in the dtype of its weights, outside autocast (Cosmos3: float32)."""
+
+    def __init__(self, hidden_size: int) -> None:
+        super().__init__()
+        self.linear_1 = nn.Linear(CHANNELS, hidden_size)
+        self.linear_2 = nn.Linear(hidden_size, hidden_size)
+
+    def forward(self, times: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape d"]:
+        with torch.autocast(device_type=times.device.type, enabled=False):
+            features = sinusoids(times).to(self.linear_1.weight.dtype)
+            return self.linear_2(F.silu(self.linear_1(features)))
+
+
+class ActionEncoder(nn.Module):
+    """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
+
+    Because the last layer starts at zero, a model that gains this branch computes what it computed before.
+    """
+
+    def __init__(self, channels: int, patch_size: int, hidden_size: int) -> None:
+        super().__init__()
+        self.channels = channels
+        self.patch_size = patch_size
+        self.conv = nn.Conv3d(channels, channels, kernel_size=(1, 3, 3), padding=(0, 1, 1))
+        self.proj = nn.Linear(channels * patch_size**2, hidden_size)
+        self.reset_output()
+
+    def reset_output(self) -> None:
+        """Set the last layer to zero."""
+        nn.init.zeros_(self.proj.weight)
+        nn.init.zeros_(self.proj.bias)
+
+    def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
+        """Residuals for the video tokens, in order ``(t v h w)``.
+
+        Raises:
+            DataError: the maps have another number of channels.
+        """
+        if maps.ndim != 6 or maps.shape[2] != self.channels:
+            raise DataError(
+                "Action maps have the wrong shape", expected=f"(b, v, {self.channels}, t, h, w)", got=tuple(maps.shape)
+            )
+        flat = rearrange(maps, "b v c t h w -> (b v) c t h w")
+        flat = flat + self.conv(flat)
+        patches = rearrange(
+            flat,
+            "(b v) c t (h p) (w q) -> b (t v h w) (p q c)",
+            v=maps.shape[1],
+            p=self.patch_size,
+            q=self.patch_size,
+        )
+        return self.proj(patches)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError
-from worldline_core.model.config import WorldModelConfig
+from worldline_core.model.world_model_config import WorldModelConfig
 
 Rotation = tuple[Tensor, Tensor]
 """Cosines and sines of the rotation angles, each ``(..., n, head_dim)``, float32."""

@@ -9,14 +9,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.pipeline.config import PipelineConfig, RolloutRun
-from worldline_core.pipeline.sources import source_inputs
+from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun, source_inputs
 from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.scale.mapping import ShardMapper
 from worldline_core.store.store import Artifact, ArtifactStore
-from worldline_core.training.clip_input import FrameInput
+from worldline_core.training.clip_source import FrameInput
 from worldline_core.training.stage import StageConfig
 
 

@@ -1,23 +1,51 @@
 """The verbs: each step's version, core function, configuration and inputs.
 
 Functions and configs are named, not imported: listing the steps costs nothing, and running one imports only that one.
+
+Freed memory stays with the process.
+
+glibc gives large freed blocks back to the kernel at once; the next tensor of that size has every page mapped and zeroed
+anew. Models on a CPU make such tensors all the time: benchmarks/freed_memory.py measures what that costs.
 """
 
 from __future__ import annotations
 
+import ctypes
 import importlib
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
-from worldline_core.pipeline.freed_memory import keep_freed_memory
 from worldline_core.store.store import Artifact, ArtifactStore
 
 if TYPE_CHECKING:
     from worldline_core.scale.mapping import ShardMapper
+
+
+_TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # malloc.h
+_NEVER = 2**31 - 1
+
+
+def keep_freed_memory() -> bool:
+    """Tell the C library to keep freed blocks for the next allocation; true where it does.
+
+    Peak memory stays what it is, but is given back only when the process ends. A choice made in the environment
+    (MALLOC_..., GLIBC_TUNABLES, another allocator in LD_PRELOAD) is left alone, and other C libraries know no such thing.
+    """
+    if any(name.startswith("MALLOC_") or name in ("GLIBC_TUNABLES", "LD_PRELOAD") for name in os.environ):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):
+        return False
+    # Threads share one arena: those of threads are small, and what does not fit into them is mapped and unmapped again.
+    settings = ((_MMAP_MAX, 0), (_TRIM_THRESHOLD, _NEVER), (_ARENA_MAX, 1))
+    done = [bool(mallopt(parameter, value)) for parameter, value in settings]
+    return all(done)
 
 
 @dataclass(frozen=True)
@@ -110,7 +138,7 @@ _STEPS = (
     Step(
         "import_backbone",
         1,
-        "worldline_core.model.import_backbone",
+        "worldline_core.model.cosmos3",
         "import_backbone",
         "ImportBackboneConfig",
         ("diffusers",),
@@ -119,7 +147,7 @@ _STEPS = (
     Step(
         "train_tokenizer",
         1,
-        "worldline_core.model.tokenizer.train",
+        "worldline_core.model.tokenizer.train_tokenizer",
         "train_tokenizer",
         "TokenizerConfig",
         ("episodes",),
@@ -128,7 +156,7 @@ _STEPS = (
     Step(
         "train_teacher",
         1,
-        "worldline_core.training.teacher",
+        "worldline_core.training.small_teacher",
         "train_teacher",
         "TeacherConfig",
         ("episodes",),
@@ -137,7 +165,7 @@ _STEPS = (
     Step(
         "train_segmenter",
         1,
-        "worldline_core.evaluation.segmenters.train",
+        "worldline_core.evaluation.segmenters.train_segmenter",
         "train_segmenter",
         "SegmenterConfig",
         ("episodes",),

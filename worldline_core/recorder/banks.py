@@ -17,12 +17,11 @@ import pyarrow.parquet as pq
 from pydantic import Field
 from tqdm import tqdm
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import DataError
-from worldline_core.recorder.episode_recorder import EpisodeRecorder
 from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment, prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
-from worldline_core.recorder.simulate import Motion
+from worldline_core.recorder.simulate import EpisodeRecorder, Motion
 from worldline_core.recorder.task_layout import Layout
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.recorder.episode_recorder import Recording
+from worldline_core.recorder.simulate import Recording
 
 DEFECTS_FILE = "injected_defects.json"
 

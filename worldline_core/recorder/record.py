@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import UnavailableError
 from worldline_core.store.atomic import write_json_atomic
 
@@ -153,8 +153,8 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> tuple[str, str, str]:
     """Record one episode into the set's parts; runs in a worker process."""
     from worldline_core.data.episodes.episode_set import EpisodeSetWriter
     from worldline_core.recorder.defects import DEFECTS
-    from worldline_core.recorder.episode_recorder import EpisodeRecorder
     from worldline_core.recorder.scene_model import FRAME_RATE
+    from worldline_core.recorder.simulate import EpisodeRecorder
 
     job, config, output = task
     if job.embodiment not in _RECORDERS:

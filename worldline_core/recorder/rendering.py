@@ -12,7 +12,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.recorder.scene_model import SceneModel
-from worldline_core.recorder.scenes import Scene
+from worldline_core.recorder.task_layout import Scene
 
 FRAME_SIZE = (128, 192)
 # MuJoCo cameras look along -z with y up.

@@ -56,7 +56,7 @@ def arm_spec(robot: Robot, folder: Path | None = None) -> Any:
         raise DataError(
             "Robot model not found",
             where=path,
-            next_step="write it with: uv run worldline_core/recorder/import_robots.py artifacts/shipped/robots",
+            next_step="write it with: uv run tools/import_robots.py artifacts/shipped/robots",
         )
     spec = mujoco.MjSpec.from_file(str(path))
     spec.meshdir = ""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 
 
 class ReportConfig(StrictModel):

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldline_core.exports.pictures import jpeg_bytes, png_bytes
+from worldline_core.pictures.labels import jpeg_bytes, png_bytes
 from worldline_core.report.artifacts import JsonObject, ReportInputs, read_json
 from worldline_core.report.config import ReportConfig
 from worldline_core.report.markup import Child, Html, element, join
@@ -17,7 +17,7 @@ from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.exports.labels import Picture
+    from worldline_core.pictures.labels import Picture
     from worldline_core.rollout.rollout_set import RolloutSet
 
 

@@ -12,8 +12,8 @@ import yaml
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.pictures import jpeg_bytes
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.report.card_blocks import (
     Block,
     FunnelBlock,

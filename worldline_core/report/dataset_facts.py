@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from worldline_core.data.curation.instructions import RAW_INSTRUCTION
-from worldline_core.data.curation.primary_view import PRIMARY_VIEW_REASON
+from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON
 from worldline_core.data.curation.rules import CURATION_FILE
 from worldline_core.data.curation.source_table import SourceFacts, read_source_table
 from worldline_core.data.curation.source_weights import WEIGHTS_FILE

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from worldline_core.exports.clip_strip import KEPT_COLOUR, reason_colour
-from worldline_core.filters.reasons import REASONS
+from worldline_core.filters.verdict import REASONS
+from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.report.markup import Html, element, join, notice
 from worldline_core.report.page import asset
 

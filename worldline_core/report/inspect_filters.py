@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.exports.clip_strip import ClipStrip, clip_strip, stacked
-from worldline_core.exports.contact_sheet import evenly_spaced
-from worldline_core.exports.labels import Picture
-from worldline_core.exports.pictures import jpeg_bytes, png_bytes
 from worldline_core.exports.rollout import safe_stem
+from worldline_core.pictures.clip_strip import ClipStrip, clip_strip, stacked
+from worldline_core.pictures.contact_sheet import evenly_spaced
+from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
 from worldline_core.report.artifacts import read_json, read_rows
 from worldline_core.report.filters_page import ReasonGroup, filters_page
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode_set import EpisodeSet
+    from worldline_core.filters.examine import Finding
     from worldline_core.filters.filter_config import FilterConfig
-    from worldline_core.filters.inspect_episode import Finding
     from worldline_core.filters.verdict import Curve
 
 KEPT = "kept"
@@ -84,7 +83,7 @@ class FilteredSet:
     @cached_property
     def config(self) -> FilterConfig:
         """The thresholds that the artifact was made with, as its manifest says; the defaults where there is none."""
-        from worldline_core.config.loader import validate
+        from worldline_core.config import validate
         from worldline_core.filters.filter_config import FilterConfig
 
         content = read_json(self.folder / "manifest.json").get("config")
@@ -119,7 +118,7 @@ class FilteredSet:
 
         Raises: DataError when the episode's images cannot be read.
         """
-        from worldline_core.filters.inspect_episode import inspect
+        from worldline_core.filters.examine import inspect
         from worldline_core.filters.signals import measure
 
         i = self.episodes.position(episode_id)

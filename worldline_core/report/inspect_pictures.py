@@ -11,9 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.labels import Picture
-from worldline_core.exports.pictures import png_bytes
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import Picture, png_bytes
 from worldline_core.report.artifacts import read_json, read_rows
 from worldline_core.report.inspect_sheets import MOMENTS, episode_sheet, rollout_sheet, tracks_sheet
 from worldline_core.report.refusals import episode_of
@@ -189,7 +188,7 @@ class Subject:
             DataError, ConfigError, UnavailableError: they cannot be computed.
         """
         from worldline_core.actions.action_tracks import compute_tracks
-        from worldline_core.actions.tracks import ActionTracks
+        from worldline_core.actions.track_store import ActionTracks
         from worldline_core.geometry.embodiment import load_embodiment
         from worldline_core.geometry.kinematics import ArmKinematics
 
@@ -257,8 +256,8 @@ class Subject:
         return output / "index.html"
 
     def _write_overlay(self, path: Path, position: int, tracks: EpisodeTracks) -> None:
-        from worldline_core.exports.overlay_views import write_overlay_video
-        from worldline_core.exports.overlays import OverlayStyle
+        from worldline_core.actions.overlay_views import write_overlay_video
+        from worldline_core.actions.overlays import OverlayStyle
 
         row = self.episodes.rows[position]
         frames = {view: np.asarray(self.episodes.frames(position, view)) for view in row.views}

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.labels import Picture
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import Picture
 from worldline_core.report.artifacts import read_rows
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ def rollout_sheet(rollouts: RolloutSet, episode_id: str | None) -> Picture | Non
 
 def tracks_sheet(episodes: EpisodeSet, position: int, tracks: EpisodeTracks, sigma_px_ref: float) -> Picture:
     """Four moments of an episode in every view, with what its tracks say drawn over them."""
-    from worldline_core.exports.overlay_views import overlay_sheet
-    from worldline_core.exports.overlays import OverlayStyle
+    from worldline_core.actions.overlay_views import overlay_sheet
+    from worldline_core.actions.overlays import OverlayStyle
 
     row = episodes.rows[position]
     moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)

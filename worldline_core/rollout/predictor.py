@@ -14,17 +14,15 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.actions.tracks import ActionTracks
+from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, check_action_contract, load_checkpoint
-from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
-from worldline_core.model.tokenizer.pixels import frames_to_video, video_to_frames
+from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.block_causal import BLOCK_SIZE, BlockCausalSimulator
-from worldline_core.rollout.config import Job, RolloutConfig
-from worldline_core.rollout.euler import Noise, sigmas_causal, sigmas_full
-from worldline_core.rollout.full_clip import rollout_full_clip
+from worldline_core.rollout.causal_simulator import BLOCK_SIZE, BlockCausalSimulator
+from worldline_core.rollout.full_clip import Noise, rollout_full_clip, sigmas_causal, sigmas_full
+from worldline_core.rollout.rollout_config import Job, RolloutConfig
 from worldline_core.rollout.speed import Elapsed, timed
 
 WARM_UP_BLOCKS = 2

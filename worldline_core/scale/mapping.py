@@ -3,19 +3,29 @@
 A job (a shard) is a frozen dataclass of plain values that names some episodes. Its function keeps what it finishes on
 disk, episode by episode, so doing a job again only does what is missing: that is what makes a retry, another size of
 shards and a resumed run give the same result.
+
+Where mapped work runs. It never changes a result, and is therefore no part of any cache key.
+
+What is known about an episode whose processing ended in an unforeseen way, without this machine's paths.
 """
 
 from __future__ import annotations
 
 import errno
 import logging
+import re
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from pathlib import Path
+from typing import Any, Literal, Protocol, Self
 
+from pydantic import Field, model_validator
+
+from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, UnavailableError, WorldLineError
-from worldline_core.scale.transient import UnreachableInputError, is_transient
+from worldline_core.store.remote import UnreachableInputError, is_transient
 
 logger = logging.getLogger(__name__)
 
@@ -198,3 +208,64 @@ def _first_line(error: BaseException) -> str:
 def cut[T](items: Sequence[T], size: int) -> list[Sequence[T]]:
     """Consecutive pieces of `size`, the last one shorter."""
     return [items[start : start + size] for start in range(0, len(items), size)]
+
+
+class RunnerConfig(StrictModel):
+    """What does the work on many episodes.
+
+    `auto` takes this process for few episodes, since starting others takes longer than the work, and processes for many.
+    """
+
+    kind: Literal["auto", "serial", "processes", "dask", "ray"] = "auto"
+    workers: int | None = Field(default=None, ge=1, description="processes; null: one for each core of this machine")
+    address: str | None = Field(
+        default=None, description="scheduler of a Dask or Ray cluster; null: a cluster of its own on this machine"
+    )
+    episodes_per_shard: int = Field(default=DEFAULT_EPISODES_PER_SHARD, ge=1)
+    in_flight: int | None = Field(default=None, ge=1, description="shards handed out at a time; null: two for a worker")
+    serial_below: int = Field(default=256, ge=0, description="auto: fewer episodes than this are done in this process")
+    retries: int = Field(
+        default=DEFAULT_RETRIES, ge=0, description="further attempts at a shard that could not reach its input"
+    )
+    retry_seconds: float = Field(
+        default=DEFAULT_RETRY_SECONDS, ge=0, description="pause before the first of them; doubles"
+    )
+    remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, each worker")
+
+    @model_validator(mode="after")
+    def _address_is_of_a_cluster(self) -> RunnerConfig:
+        if self.address is not None and self.kind not in ("dask", "ray"):
+            raise ValueError(f"an address is that of a Dask or Ray cluster; the kind is {self.kind}")
+        return self
+
+
+_ADDRESS = re.compile(r"0x[0-9a-fA-F]{4,}")
+_ABSOLUTE = re.compile(r"(?<![\w.:/])/(?:[^\s'\":,;()]+/)+")
+_FRAMES = 5
+_PACKAGE_ROOT = Path(__file__).parents[2]
+
+
+def crash_evidence(error: BaseException) -> dict[str, Any]:
+    """{"type", "message", "trace"}: the trace is the innermost frames as `file:line function`, innermost last."""
+    frames = traceback.extract_tb(error.__traceback__)[-_FRAMES:]
+    return {
+        "type": type(error).__name__,
+        "message": portable_message(str(error)),
+        "trace": [f"{_short(frame.filename)}:{frame.lineno} {frame.name}" for frame in frames],
+    }
+
+
+def portable_message(text: str) -> str:
+    """A message without addresses in memory and without folders: it must not differ from run to run."""
+    return _ABSOLUTE.sub("", _ADDRESS.sub("0x…", text))
+
+
+def _short(filename: str) -> str:
+    """A file within its package."""
+    path = Path(filename)
+    if path.is_relative_to(_PACKAGE_ROOT) and "site-packages" not in path.parts:
+        return path.relative_to(_PACKAGE_ROOT).as_posix()
+    parts = path.parts
+    if "site-packages" in parts:
+        return "/".join(parts[parts.index("site-packages") + 1 :])
+    return path.name

@@ -3,10 +3,18 @@
 ``artifacts/<step>/<key>/`` holds a finished artifact; its ``manifest.json`` is written last. The key is a digest of
 the step's name and version, its config, and the digests of its inputs: nothing else decides whether work is done
 again. Unfinished work lives in ``<key>.partial/`` and is continued by the next call.
+
+One worker at a time on an artifact; the lock dies with its process.
+
+Several processes that torchrun started on one step: the first owns the artifact, the others help it to be made.
+
+Only the first takes the lock and finishes the artifact; it announces itself in a small file beside the lock, so that a
+helper neither waits for a lock that is never freed nor joins work that another command is doing.
 """
 
 from __future__ import annotations
 
+import fcntl
 import importlib.metadata
 import json
 import logging
@@ -15,20 +23,82 @@ import platform
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
-from worldline_core.scale.remote import is_remote, remote_digest
-from worldline_core.store.atomic import remove_unfinished, write_json_atomic
+from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic, write_json_atomic
 from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
-from worldline_core.store.lock import exclusive_lock
-from worldline_core.store.workers import announced, is_helper, wait_for_announcement, wait_until
+from worldline_core.store.remote import is_remote, remote_digest
 
 logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Hold an advisory lock on ``path`` (``flock``: the kernel frees it when the process ends, also after kill -9)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            logger.warning("waiting for another process that works on %s", path.stem)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+_POLL_SECONDS = 0.1
+
+
+def is_helper() -> bool:
+    """Whether torchrun started this process as another than the first."""
+    return int(os.environ.get("WORLD_SIZE", "1")) > 1 and int(os.environ.get("RANK", "0")) > 0
+
+
+def _launch() -> bytes:
+    """Names the launch that this process belongs to: the same in all of its processes."""
+    names = ("TORCHELASTIC_RUN_ID", "MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE")
+    return " ".join(os.environ.get(name, "") for name in names).encode()
+
+
+@contextmanager
+def announced(path: Path) -> Iterator[None]:
+    """Within the context, helpers of this launch may work; without helpers nothing is written."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield
+        return
+    write_bytes_atomic(path, _launch())
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def wait_for_announcement[T](path: Path, finished: Callable[[], T | None]) -> T | None:
+    """Return None once the first process has begun, or what ``finished`` finds if there is nothing left to do.
+
+    If the first process fails instead, torchrun ends this one.
+    """
+    while (found := finished()) is None:
+        if path.is_file() and path.read_bytes() == _launch():
+            return None
+        time.sleep(_POLL_SECONDS)
+    return found
+
+
+def wait_until[T](finished: Callable[[], T | None]) -> T:
+    """Return what ``finished`` finds, once it finds something."""
+    while (found := finished()) is None:
+        time.sleep(_POLL_SECONDS)
+    return found
+
 
 KEY_LENGTH = 16
 _VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")

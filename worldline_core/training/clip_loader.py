@@ -12,13 +12,12 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
-from worldline_core.actions.tracks import ActionTracks
+from worldline_core.actions.track_store import ActionTracks
 from worldline_core.errors import ArtifactError
-from worldline_core.model.text import ClipFacts
+from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.training.clip_reader import ReadBatch, batch_views, read_clips
 from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.clip_source import ClipSource
-from worldline_core.training.text import TextEncoder
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
 

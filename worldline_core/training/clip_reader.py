@@ -13,9 +13,8 @@ import numpy as np
 from torch import Tensor, from_numpy
 
 from worldline_core.errors import DataError
-from worldline_core.training.clip_input import ReadingConfig
 from worldline_core.training.clip_sampler import PRIMARY, Clip, ClipBatch, ClipSampler
-from worldline_core.training.clip_source import ClipSource
+from worldline_core.training.clip_source import ClipSource, ReadingConfig
 
 logger = logging.getLogger(__name__)
 

@@ -2,17 +2,29 @@
 
 Reading is split in two, so that it can go on in other processes: `read` touches files and gives an array, `latents`
 makes of it what a model sees, on the model's device.
+
+Where a stage's clips come from and how they are read: configuration.
+
+Which episodes a stage may train on: those in the latent store that the filters let through for this stage.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
+
+from worldline_core.actions.track_store import ActionTracks
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frame_decoder import DecoderChoice
+from worldline_core.errors import DataError
 
 TEMPORAL_COMPRESSION = 4
 
@@ -111,3 +123,70 @@ def longest_clip(num_frames: int, start: int, stride: int) -> int:
     """Most frames, 4 k + 1, of a clip at ``start`` with ``stride`` in an episode of ``num_frames``."""
     steps = (num_frames - 1 - start) // stride
     return 1 + TEMPORAL_COMPRESSION * (steps // TEMPORAL_COMPRESSION)
+
+
+class ReadingConfig(StrictModel):
+    """How clips are read, whatever they are.
+
+    ``workers``: processes that read ahead, each ``prefetch`` micro-batches at most; 0 reads in the training process when
+    a batch is needed. What is trained on does not depend on either.
+    ``on_unreadable``: "raise" stops at the first clip that cannot be read; "skip" takes another clip in its place, names
+    it in the log and in ``run/skipped_clips-*.jsonl``, counts it, and stops after ``max_skipped``.
+    """
+
+    workers: int = Field(default=0, ge=0)
+    prefetch: int = Field(default=2, ge=1)
+    on_unreadable: Literal["raise", "skip"] = "raise"
+    max_skipped: int = Field(default=100, ge=1)
+
+
+class LatentInput(ReadingConfig):
+    """Latents that encode_latents cached."""
+
+    kind: Literal["latents"] = "latents"
+
+
+class FrameInput(ReadingConfig):
+    """Frames straight from the EpisodeSet; the tokenizer encodes them during training.
+
+    ``image_size``: (H, W) that frames are resized to, as in encode_latents. ``start_step``: clips start at multiples of
+    it. ``decoder``: "auto" is torchcodec where it loads, else PyAV. ``open_files``: video files that a process keeps open.
+    """
+
+    kind: Literal["frames"] = "frames"
+    image_size: tuple[int, int] = (64, 96)
+    start_step: int = Field(default=1, ge=1)
+    decoder: DecoderChoice = "auto"
+    open_files: int = Field(default=16, ge=1)
+
+
+ClipInput = Annotated[LatentInput | FrameInput, Field(discriminator="kind")]
+
+
+logger = logging.getLogger(__name__)
+
+
+def training_rows[RowT: ClipRow](
+    store: ClipSource[RowT], episodes: EpisodeSet, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
+) -> list[RowT]:
+    """Rows of the store whose episode is in the set, fit for the stage, and (Stage II) has action tracks.
+
+    Raises:
+        DataError: if none is left.
+    """
+    allowed = {row.episode_id for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)}
+    # Episodes encoded by their task-facing view alone are for Stage I, however fit their other views are.
+    every_view = set(store.description.get("views", ())) if stage == 2 else set()
+    rows = [row for row in store.rows if row.episode_id in allowed and every_view <= set(row.views)]
+    fitting = [row for row in rows if tracks is None or row.episode_id in tracks]
+    if len(fitting) < len(rows):
+        logger.warning("%d of %d episodes have no action tracks and are left out.", len(rows) - len(fitting), len(rows))
+    if not fitting:
+        raise DataError(
+            "No episode is left to train on.",
+            where=f"stage {stage}",
+            expected="episodes that are in the EpisodeSet, the clips' store and (Stage II) the action tracks",
+            got=f"{len(allowed)} fit episodes in the set, {len(store)} in the store",
+            next_step="see the quarantine tables of curate, filter and render_actions",
+        )
+    return fitting

@@ -16,7 +16,7 @@ from pydantic import Field
 from safetensors.torch import save_file
 from torch import Tensor
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.latent_store import (
@@ -140,8 +140,7 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     from tqdm import tqdm
 
     from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.model.tokenizer.base import load_tokenizer
-    from worldline_core.model.tokenizer.pixels import frames_to_video
+    from worldline_core.model.tokenizer.tokenizer import frames_to_video, load_tokenizer
 
     episodes = EpisodeSet.open(inputs["episodes"])
     tokenizer = load_tokenizer(inputs["tokenizer"])

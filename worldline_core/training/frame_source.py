@@ -17,10 +17,8 @@ from torch import Tensor
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.model.tokenizer.base import VideoTokenizer, load_tokenizer
-from worldline_core.model.tokenizer.pixels import resize_frame
-from worldline_core.training.clip_input import FrameInput
-from worldline_core.training.clip_source import Clip, ClipRow, longest_clip
+from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, load_tokenizer, resize_frame
+from worldline_core.training.clip_source import Clip, ClipRow, FrameInput, longest_clip
 from worldline_core.training.encode_latents import tokenizer_fingerprint
 
 logger = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 
 
 class RelationalConfig(StrictModel):

@@ -1,8 +1,12 @@
-"""What Stage I and Stage II share around their objective: clips, the run itself, and its checkpoint."""
+"""What Stage I and Stage II share around their objective: clips, the run itself, and its checkpoint.
+
+Losses on held-out clips: always the same clips, noise and noise levels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,25 +14,88 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
-from worldline_core.actions.tracks import ActionTracks
-from worldline_core.config.base import StrictModel
+from worldline_core.actions.track_store import ActionTracks
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_input import ClipInput, FrameInput, LatentInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_reader import BatchReader, ClipReader, SkipLog
-from worldline_core.training.clip_sampler import PRIMARY, ClipSampler, ClipSampling, source_counts
-from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows
-from worldline_core.training.episode_rows import training_rows
-from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
+from worldline_core.training.clip_sampler import JOINT, PRIMARY, ClipSampler, ClipSampling, source_counts
+from worldline_core.training.clip_source import (
+    ClipInput,
+    ClipRow,
+    ClipSource,
+    FrameInput,
+    LatentInput,
+    ReadingConfig,
+    named_rows,
+    training_rows,
+)
+from worldline_core.training.flow_matching import FlowMatchingObjective, LossWeighting, SigmaSampling
 from worldline_core.training.frame_source import FrameSource
 from worldline_core.training.latent_store import LatentStore
-from worldline_core.training.objective import FlowMatchingObjective
-from worldline_core.training.trainer import ParameterGroup, TrainerConfig, TrainingResult, train
-from worldline_core.training.validation import validation_function
+from worldline_core.training.trainer import (
+    ParameterGroup,
+    TrainerConfig,
+    TrainingResult,
+    autocast,
+    step_generator,
+    train,
+)
+
+logger = logging.getLogger(__name__)
+VALIDATION_SEED = 20_000
+
+
+def validation_function(
+    store: ClipSource,
+    clips: ClipSampling,
+    splits: Sequence[str],
+    trainer: TrainerConfig,
+    rows: Sequence[ClipRow],
+    loader: ClipLoader,
+    objective: FlowMatchingObjective,
+    reading: ReadingConfig | None = None,
+) -> Callable[[], dict[str, float]] | None:
+    """A function that measures the held-out losses, or None (said in the log) where there are no such clips.
+
+    Args:
+        reading: what to do with held-out clips that cannot be read (default: stop).
+    """
+    longest = max(clips.lengths) - 1
+    held_out = [row for row in rows if row.split in splits and row.num_frames > longest * max(clips.strides)]
+    if not held_out or not trainer.validation_batches:
+        logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", longest + 1, splits)
+        return None
+    # At least two clips, so that "shuffled actions" are another clip's.
+    size = max(2, trainer.batch_size)
+    # Where steps on one view are mixed in, it is still the joint prediction that counts.
+    if clips.view_weights is not None and JOINT in clips.view_weights:
+        clips = clips.model_copy(update={"view_weights": None})
+    # A few clips stand for all: drawn anew by their weights, they come from many episodes.
+    clips = clips.model_copy(update={"order": "weighted", "hop": None})
+    sampler = ClipSampler(store, clips, splits=splits, batch_size=size, seed=VALIDATION_SEED, rows=held_out)
+    reader = ClipReader(store, sampler, loader.views, reading)
+
+    def validate() -> dict[str, float]:
+        totals: dict[str, float] = {}
+        objective.model.eval()
+        for index in range(trainer.validation_batches):
+            read = reader.read(index)
+            for item in read.skipped:
+                logger.warning("Held-out clip skipped: %s", item.reason)
+            batch = loader.finish(read)
+            with autocast(trainer):
+                values = objective.validation_losses(batch, step_generator(VALIDATION_SEED, index, trainer.device))
+            for key, value in values.items():
+                totals[key] = totals.get(key, 0.0) + value / trainer.validation_batches
+        objective.model.train()
+        return totals
+
+    return validate
 
 
 class StageConfig(StrictModel):

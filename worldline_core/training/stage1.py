@@ -10,14 +10,13 @@ import torch
 from pydantic import Field
 
 from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.text import TextConfig, load_text_encoder
 from worldline_core.model.world_model import WorldModel, WorldModelConfig, is_text_parameter
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipSampling
-from worldline_core.training.objective import FlowMatchingObjective
-from worldline_core.training.processes import join_processes
+from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage import Stage, StageConfig
-from worldline_core.training.text import TextConfig, load_text_encoder
-from worldline_core.training.trainer import ParameterGroup
+from worldline_core.training.trainer import ParameterGroup, join_processes
 
 
 class Stage1Config(StageConfig):

@@ -13,17 +13,16 @@ import torch
 from pydantic import Field
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
-from worldline_core.actions.tracks import ActionTracks
+from worldline_core.actions.track_store import ActionTracks
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_source import ClipSource
-from worldline_core.training.objective import FlowMatchingObjective, RelationalTerm
-from worldline_core.training.processes import join_processes
+from worldline_core.training.flow_matching import FlowMatchingObjective, RelationalTerm
 from worldline_core.training.relational import RelationalConfig
 from worldline_core.training.stage import Stage, StageConfig
-from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
+from worldline_core.training.trainer import OptimizerConfig, ParameterGroup, join_processes
 from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
 
 FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)

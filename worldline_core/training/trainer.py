@@ -1,13 +1,21 @@
-"""The training loop of every stage: optimiser, averages, metrics, and a state from which a killed run continues."""
+"""The training loop of every stage: optimiser, averages, metrics, and a state from which a killed run continues.
+
+Metrics of a run as JSON lines that a resumed run continues without a seam.
+
+Training on several processes: torchrun starts them, each takes its part of every global batch, weights stay equal.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
+import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -15,18 +23,103 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, TrainingError
+from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_sampler import Clip
-from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.metrics_log import MetricsLog
-from worldline_core.training.processes import average_gradients, average_values
 from worldline_core.training.training_state import (
     STATE_FILE,
+    ExponentialAverage,
     identity_digests,
     load_training_state,
     save_training_state,
 )
+
+
+class MetricsLog:
+    """Appends rows with a ``step``; rows later than the resumed step are dropped, so they are written again once."""
+
+    def __init__(self, path: Path, resume_step: int) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kept = [line for line in _complete_lines(path) if json.loads(line)["step"] <= resume_step]
+        write_bytes_atomic(path, "".join(f"{line}\n" for line in kept).encode())
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Append one row."""
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(row, allow_nan=False) + "\n")
+
+
+def _complete_lines(path: Path) -> list[str]:
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8")
+    # A kill may have cut the last line short.
+    return text[: text.rfind("\n") + 1].splitlines()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """All rows of a log, for the report's loss curves."""
+    return [json.loads(line) for line in _complete_lines(path)]
+
+
+# The first process makes the offline trajectories alone: at full size that takes hours while the others wait.
+_PATIENCE = timedelta(hours=24)
+
+
+def join_processes(device: str) -> tuple[int, int]:
+    """(rank, world size) as torchrun sets them; (0, 1) otherwise. Joins the process group when there is one.
+
+    Call it before anything is moved to ``device``: on GPUs it makes "cuda" this process's own card.
+    """
+    world_size = int(os.environ.get("WORLD_SIZE", "1"))
+    rank = int(os.environ.get("RANK", "0"))
+    if world_size > 1 and not torch.distributed.is_initialized():
+        on_gpu = torch.device(device).type == "cuda"
+        if on_gpu:
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+        torch.distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PATIENCE)
+    return rank, world_size
+
+
+def wait_for_all() -> None:
+    """Return once every process has come here; at once when there is only this one."""
+    if torch.distributed.is_initialized():
+        torch.distributed.barrier()
+
+
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Mean of every gradient over the processes, in place.
+
+    Where only some processes used a parameter (text dropout is drawn by each), it counts as zero on the others; where
+    none did, there is still no gradient.
+    """
+    if not torch.distributed.is_initialized():
+        return
+    parameters = list(parameters)
+    device = parameters[0].device
+    used = torch.tensor([parameter.grad is not None for parameter in parameters], dtype=torch.int32, device=device)
+    torch.distributed.all_reduce(used)
+    for parameter, count in zip(parameters, used.tolist(), strict=True):
+        if not count:
+            continue
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        torch.distributed.all_reduce(parameter.grad)
+        parameter.grad /= torch.distributed.get_world_size()
+
+
+def average_values(values: Mapping[str, float]) -> dict[str, float]:
+    """Mean of every number over the processes, the same on all of them; they must name the same numbers."""
+    if not torch.distributed.is_initialized():
+        return dict(values)
+    names = sorted(values)
+    on_gpu = torch.distributed.get_backend() == "nccl"
+    numbers = torch.tensor([values[name] for name in names], dtype=torch.float64, device="cuda" if on_gpu else "cpu")
+    torch.distributed.all_reduce(numbers)
+    numbers /= torch.distributed.get_world_size()
+    return dict(zip(names, numbers.tolist(), strict=True))
 
 
 class OptimizerConfig(StrictModel):

@@ -9,7 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.rules import decided_findings
 from worldline_core.data.curation.shard import (
     CurateShard,
@@ -24,8 +24,8 @@ from worldline_core.data.curation.source_table import write_source_table
 from worldline_core.data.curation.source_weights import write_source_weights
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
-from worldline_core.data.guards.json_file import read_json
-from worldline_core.data.guards.listed_ids import unique_identity
+from worldline_core.data.guards.plain_files import read_json
+from worldline_core.data.guards.rejection import unique_identity
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, cut, run_jobs
 from worldline_core.scale.shard_manifest import (
     check_account,

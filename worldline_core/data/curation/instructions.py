@@ -11,7 +11,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
 
 RAW_INSTRUCTION = "raw_instruction"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.curation.fingerprint import MINHASHES, MOMENTS, Fingerprint
 
 _BAND = 3

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.fingerprint import Fingerprint
 from worldline_core.data.curation.near_duplicates import NearDuplicate, find_near_duplicates
-from worldline_core.data.curation.scene_leaks import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
+from worldline_core.data.curation.scenes import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic

@@ -8,22 +8,19 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from worldline_core.data.curation.config import CurateConfig
-from worldline_core.data.curation.episode import check_episode, prepare_episode
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.recorded_episode import check_episode, prepare_episode
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
-from worldline_core.data.guards.file_watch import unchanged_files, watch_run
-from worldline_core.data.guards.listed_ids import check_id
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, parse_location, portable_text
-from worldline_core.data.sources.base import EpisodeSource
+from worldline_core.data.guards.rejection import RejectedInputError, check_id
+from worldline_core.data.guards.source_paths import AnyPath, parse_location, portable_text, unchanged_files, watch_run
 from worldline_core.data.sources.open import open_source
+from worldline_core.data.sources.source import EpisodeSource
 from worldline_core.errors import CalibrationError, DataError
-from worldline_core.scale.crashes import crash_evidence, portable_message
-from worldline_core.scale.mapping import ends_the_run
+from worldline_core.scale.mapping import crash_evidence, ends_the_run, portable_message
 from worldline_core.scale.shard_manifest import InputRow, write_shard_manifest
-from worldline_core.scale.transient import UnreachableInputError, is_transient
 from worldline_core.store.digest import digest_value
+from worldline_core.store.remote import UnreachableInputError, is_transient
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from worldline_core.data.curation.config import CurateConfig
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.atomic import write_json_atomic

@@ -14,8 +14,7 @@ import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
-from worldline_core.geometry.camera_pose import CameraPose
-from worldline_core.geometry.image_transforms import ImageTransform
+from worldline_core.geometry.cameras import CameraPose, ImageTransform
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]

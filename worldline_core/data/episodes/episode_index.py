@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.plain_files import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.lerobot.v3 import write_table

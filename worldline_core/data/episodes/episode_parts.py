@@ -17,8 +17,7 @@ from worldline_core.data.curation.fingerprint import fingerprint
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.video.thumbnail_cache import write_thumbnails
-from worldline_core.data.video.thumbnails import ViewThumbnails
+from worldline_core.data.video.thumbnails import ViewThumbnails, write_thumbnails
 from worldline_core.errors import DataError
 
 

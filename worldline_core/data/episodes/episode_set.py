@@ -13,13 +13,13 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.sidecar import Sidecar
-from worldline_core.data.guards.json_file import parse_json
-from worldline_core.data.guards.source_paths import inside, is_remote
+from worldline_core.data.guards.plain_files import parse_json
+from worldline_core.data.guards.source_paths import inside
 from worldline_core.data.lerobot.v3 import IMAGE_PREFIX, LeRobotV3Dataset
 from worldline_core.data.video.clip import VideoClip, read_clip
-from worldline_core.data.video.thumbnail_cache import cache_path, read_thumbnails
-from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
+from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
+from worldline_core.store.remote import is_remote
 
 __all__ = ["EpisodeRow", "EpisodeSet", "EpisodeSetWriter", "QuarantineRow"]
 

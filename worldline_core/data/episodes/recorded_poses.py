@@ -16,13 +16,13 @@ import numpy as np
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.camera_pose import CameraAxes, CameraPose
-from worldline_core.geometry.pose_formats import rotation_from_quaternion_xyzw
-from worldline_core.geometry.rigid import (
+from worldline_core.geometry.cameras import CameraAxes, CameraPose
+from worldline_core.geometry.transforms import (
     MAX_ROTATION_DEVIATION,
     RotationRepair,
     repair_rotations,
     rotation_deviation,
+    rotation_from_quaternion_xyzw,
 )
 
 Extrinsics = Literal["camera_to_base", "base_to_camera"]

@@ -12,9 +12,8 @@ import pyarrow as pa
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
-from worldline_core.data.guards.json_file import read_json, well_formed
 from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, check_image_size, too_large
-from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.plain_files import read_json, read_table, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.lerobot.v3 import write_table

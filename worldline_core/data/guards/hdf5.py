@@ -2,6 +2,8 @@
 
 A file may point outside of itself (external links, external storage, virtual datasets) or declare a huge array in a few
 bytes; both are refused before anything is read.
+
+Views of an HDF5 recording that are stored as one encoded image a frame.
 """
 
 from __future__ import annotations
@@ -11,11 +13,12 @@ import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from worldline_core.data.guards.hdf5_heap import check_entries
+from worldline_core.data.guards.images import decode_image
 from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, MAX_FRAMES, regular_file, too_large
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
@@ -268,3 +271,32 @@ def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
         ) from error
     with handle:
         yield Hdf5File(path, local, handle)
+
+
+Channels = Literal["as_written", "standard"]
+"""`standard`: usual JPEG and PNG files. `as_written`: a recorder handed OpenCV its RGB arrays, which takes them for BGR, so
+the files show red as blue, and OpenCV's own reading gives RGB back."""
+
+
+def hdf5_images(path: AnyPath, key: str, length: int, channels: Channels) -> Iterator[np.ndarray]:
+    """uint8 (H, W, 3) RGB, frame by frame.
+
+    Raises: RejectedInputError, while it is iterated: missing_file, missing_column, length_mismatch, too_large (by the
+        image's own header, before it is decoded), unreadable, path_traversal.
+    """
+    first: tuple[int, ...] | None = None
+    with open_hdf5(path) as file:
+        for number, content in enumerate(file.image_files(key, length)):
+            where = f"{path}, {key}, frame {number}"
+            image = decode_image(content, where, channels="bgr" if channels == "as_written" else "rgb")
+            first = first or image.shape
+            if image.shape != first:
+                raise RejectedInputError(
+                    "unreadable",
+                    "Images differ in size",
+                    where=where,
+                    expected=f"{first[1]}x{first[0]}",
+                    got=f"{image.shape[1]}x{image.shape[0]}",
+                    evidence={"frame": number, "first": list(first[:2]), "found": list(image.shape[:2])},
+                )
+            yield image

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from worldline_core.data.guards.json_file import read_json_lines
-from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.plain_files import read_json_lines, read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import fill_template, inside
-from worldline_core.data.lerobot.episode_table import EpisodeTable, whole_number
-from worldline_core.data.lerobot.info import DescribedDataset, read_info
+from worldline_core.data.lerobot.metadata import DescribedDataset, EpisodeTable, read_info, whole_number
 from worldline_core.data.lerobot.v3 import column_to_numpy
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_video, video_size

@@ -19,12 +19,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from worldline_core.data.guards.file_watch import note_file
-from worldline_core.data.guards.parquet_file import read_table
+from worldline_core.data.guards.plain_files import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import fill_template, find_files, inside
-from worldline_core.data.lerobot.episode_table import EpisodeTable, whole_number
-from worldline_core.data.lerobot.info import DescribedDataset, read_info
+from worldline_core.data.guards.source_paths import fill_template, find_files, inside, note_file
+from worldline_core.data.lerobot.metadata import DescribedDataset, EpisodeTable, read_info, whole_number
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_segment, video_size
 from worldline_core.errors import DataError

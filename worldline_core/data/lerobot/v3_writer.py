@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from worldline_core.data.episodes.episode_parts import Part
-from worldline_core.data.episodes.statistics import as_json, image_statistics, vector_statistics
+from worldline_core.data.episodes.view_recording import as_json, image_statistics, vector_statistics
 from worldline_core.data.lerobot.v3 import (
     DATA_PATH,
     EPISODES_PATH,
@@ -22,7 +22,7 @@ from worldline_core.data.lerobot.v3 import (
     write_table,
 )
 from worldline_core.data.video.encoder import concatenate_videos
-from worldline_core.data.video.thumbnail_cache import cache_path
+from worldline_core.data.video.thumbnails import cache_path
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 _CHUNK_SIZE = 1000

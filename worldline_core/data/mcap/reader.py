@@ -14,14 +14,14 @@ from mcap.reader import make_reader
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as
 from worldline_core.data.guards.images import decode_image
-from worldline_core.data.guards.json_file import parse_json, well_formed
 from worldline_core.data.guards.limits import regular_file
+from worldline_core.data.guards.plain_files import parse_json, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import local_file
 from worldline_core.data.mcap.chunks import DAMAGE, check_chunks
 from worldline_core.data.mcap.io import EPISODE_METADATA, READABLE_VERSIONS
 from worldline_core.geometry.distortion import Distortion, distortion_from_ros
-from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
+from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
 _TEXTS = (
     "episode_id",

@@ -20,14 +20,13 @@ from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
 from worldline_core.data.guards.images import read_image
-from worldline_core.data.guards.json_file import read_text
-from worldline_core.data.guards.npy_file import read_npy
+from worldline_core.data.guards.plain_files import read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
-from worldline_core.data.sources.base import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
-from worldline_core.geometry.camera_pose import CameraPose
+from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
+from worldline_core.geometry.cameras import CameraPose
 from worldline_core.geometry.distortion import Distortion
-from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
 AGIBOT_CAMERAS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
 """View -> AgiBot's name of the camera, in file names of every layout."""

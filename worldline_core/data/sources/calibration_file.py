@@ -24,16 +24,16 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
-from worldline_core.data.guards.json_file import read_json
 from worldline_core.data.guards.limits import regular_file, too_large
+from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.sources.base import LensConfig
-from worldline_core.geometry.camera_pose import CameraAxes, CameraPose
-from worldline_core.geometry.pose_formats import pose_from_euler_fixed_xyz
+from worldline_core.data.sources.source import LensConfig
+from worldline_core.geometry.cameras import CameraAxes, CameraPose
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 MAX_YAML_BYTES = 16 << 20
 """PyYAML takes about a hundred bytes of memory for each; calibrations of each frame belong into JSON."""
@@ -113,7 +113,7 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
 
 
 def _yaml(path: AnyPath) -> Any:
-    from worldline_core.config.loader import read_yaml
+    from worldline_core.config import read_yaml
     from worldline_core.errors import ConfigError
 
     file = regular_file(path, "Calibration file")

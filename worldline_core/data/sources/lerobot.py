@@ -2,10 +2,13 @@
 
 LeRobot states neither the unit of joint angles, nor what a gripper reading means, nor where cameras are, so all three are
 declared in the configuration. Without calibration such episodes serve action-free training.
+
+Every LeRobot dataset below a folder: RoboCOIN and Galaxea publish one a task, hundreds of them.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,21 +17,18 @@ from worldline_core.data.curation.checks import EVALUATION_ONLY, TRAINING_SPLITS
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, fill_template, inside
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
 from worldline_core.data.lerobot.v21 import LeRobotV21Dataset
-from worldline_core.data.sources.base import LoadedEpisode, no_masks
 from worldline_core.data.sources.calibration_file import (
     CalibratedView,
     CalibrationFile,
     calibrated_view,
     read_calibration,
 )
-from worldline_core.data.sources.lerobot_columns import ArmVectors, flat_names
-from worldline_core.data.sources.lerobot_config import LeRobotSourceConfig
-from worldline_core.errors import ConfigError
-
-__all__ = ["LeRobotSource", "LeRobotSourceConfig"]
+from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, flat_names
+from worldline_core.data.sources.source import LoadedEpisode, no_masks
+from worldline_core.errors import ConfigError, DataError
 
 _RATE_TOLERANCE = 1e-2
 _DROID_VIDEOS = {"observation.images.exterior_1_left", "observation.images.exterior_2_left"}
@@ -214,3 +214,49 @@ def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: dict[str, Any]) 
     """Whether a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
     said = (config.label, config.embodiment, root.name, str(info.get("robot_type")), str(info.get("repo_id")))
     return says_droid(*said) or set(info["features"]) >= _DROID_VIDEOS
+
+
+_OPEN_DATASETS = 8
+
+
+class LeRobotCollection:
+    """Datasets of one layout; each has its own scene unless the configuration names one.
+
+    A dataset that cannot be opened stands in the list as one input, and is quarantined with what is wrong with it; what
+    the configuration itself gets wrong of any of them stops the listing.
+
+    Raises: DataError when there is no dataset at all; ConfigError as `LeRobotSource`.
+    """
+
+    def __init__(self, config: LeRobotSourceConfig, root: AnyPath) -> None:
+        self._config = config
+        self._roots: dict[str, AnyPath] = {}
+        for info in find_files(root, "info.json"):
+            place = relative_name(info, root)
+            if place.parent.name == "meta":
+                self._roots["-".join([config.label, *place.parts[:-2]])] = info.parent.parent
+        if not self._roots:
+            raise DataError(
+                "Folder holds no LeRobot dataset",
+                where=str(root),
+                expected="folders with meta/info.json",
+                next_step="unpack the archives; leave `collection` out for a single dataset of another layout",
+            )
+        self._open = lru_cache(maxsize=_OPEN_DATASETS)(self._opened)
+
+    def _opened(self, label: str) -> LeRobotSource:
+        return LeRobotSource(self._config, self._roots[label], label)
+
+    def episode_ids(self) -> list[str]:
+        listed: list[str] = []
+        for label in sorted(self._roots):
+            try:
+                listed += self._open(label).episode_ids()
+            except DataError:
+                listed.append(label)
+        return listed
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        if episode_id in self._roots:
+            self._open(episode_id).episode_ids()  # raises what the listing met
+        return self._open(episode_id.rsplit("-", 1)[0]).load(episode_id)

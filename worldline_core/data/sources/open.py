@@ -9,18 +9,15 @@ from pydantic import Field
 from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
-from worldline_core.data.sources.base import EpisodeSource
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
 from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
-from worldline_core.data.sources.lerobot import LeRobotSource, LeRobotSourceConfig
-from worldline_core.data.sources.lerobot_collection import LeRobotCollection
-from worldline_core.data.sources.mcap import McapSource, McapSourceConfig
-from worldline_core.data.sources.mcap_topics import McapTopicsSource, McapTopicsSourceConfig
-from worldline_core.data.sources.repaired import RepairedSource
+from worldline_core.data.sources.lerobot import LeRobotCollection, LeRobotSource, LeRobotSourceConfig
+from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapTopicsSource, McapTopicsSourceConfig
+from worldline_core.data.sources.repaired import PinholeSource, RepairedSource
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
+from worldline_core.data.sources.source import EpisodeSource
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
-from worldline_core.data.video.undistort import PinholeSource
 from worldline_core.errors import DataError
 
 SourceConfig = Annotated[

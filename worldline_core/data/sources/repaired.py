@@ -1,15 +1,21 @@
-"""A source whose recordings depart from the contract's conventions, read as if they did not."""
+"""A source whose recordings depart from the contract's conventions, read as if they did not.
+
+Recordings of a distorting lens become those of a pinhole, before anything else looks at their pixels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from worldline_core.data.curation.checks import check_intrinsics
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
+from worldline_core.data.episodes.recorded_poses import rejected_as
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.base import EpisodeSource, LoadedEpisode
+from worldline_core.data.sources.source import EpisodeSource, LoadedEpisode
+from worldline_core.geometry.distortion import Distortion
 
 
 class RepairedSource:
@@ -69,3 +75,97 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
         clips={view: clip.cut(images.start, images.stop) if lagging else clip for view, clip in loaded.clips.items()},
         images=cut_images,
     )
+
+
+class PinholeSource:
+    """Wraps a source: the episodes it loads are those of pinhole cameras."""
+
+    def __init__(self, source: EpisodeSource) -> None:
+        self._source = source
+
+    def episode_ids(self) -> list[str]:
+        return self._source.episode_ids()
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        return undistorted(self._source.load(episode_id))
+
+
+def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
+    """The episode with images, masks and K of pinhole cameras; its conventions name the lenses that were taken out.
+
+    Raises: RejectedInputError (singular_intrinsics), or (invalid_distortion) when a lens has no camera matrix, its model cannot be inverted inside
+        of the image, or the images have another size than the one it was calibrated for.
+    """
+    if not loaded.distortions:
+        return loaded
+    from worldline_core.geometry.undistortion import Undistortion, undistortion
+
+    where = f"episode {loaded.episode.episode_id}"
+    cameras = dict(loaded.episode.cameras)
+    lenses: dict[str, Undistortion] = {}
+    for view, distortion in loaded.distortions.items():
+        if view not in cameras:
+            raise RejectedInputError(
+                "invalid_distortion",
+                "A lens is stated for a view without a camera matrix",
+                where=f"{where}, view {view}",
+                expected=", ".join(cameras) or "a calibrated view",
+                got=view,
+                evidence={"view": view},
+            )
+        camera = cameras[view]
+        check_intrinsics(camera, f"{where}, view {view}")
+        evidence = {"view": view, "model": distortion.model, "coefficients": list(distortion.coefficients)}
+        with rejected_as("invalid_distortion", f"{where}, view {view}", evidence):
+            lenses[view] = undistortion(distortion, camera.K, (camera.height, camera.width), None)
+        cameras[view] = replace(camera, K=lenses[view].K)
+
+    def frames(view: str) -> np.ndarray:
+        images = loaded.frames(view)
+        if view not in lenses:
+            return images
+        _check_size(images, lenses[view].image_size, where, view)
+        return lenses[view].frames(images)
+
+    def images(view: str) -> Iterator[np.ndarray]:
+        for image in loaded.each_image(view):
+            if view in lenses:
+                _check_size(image[None], lenses[view].image_size, where, view)
+                yield lenses[view].frames(image[None])[0]
+            else:
+                yield image
+
+    def robot_masks(view: str) -> np.ndarray | None:
+        masks = loaded.robot_masks(view)
+        if masks is None or view not in lenses:
+            return masks
+        _check_size(masks, lenses[view].image_size, where, view)
+        return lenses[view].masks(masks)
+
+    noted = {**loaded.episode.conventions, "undistorted": _described(loaded.distortions)}
+    episode = replace(loaded.episode, cameras=cameras, conventions=noted)
+    return replace(
+        loaded,
+        episode=episode,
+        frames=frames,
+        robot_masks=robot_masks,
+        distortions={},
+        clips={view: clip for view, clip in loaded.clips.items() if view not in lenses},
+        images=images,
+    )
+
+
+def _described(distortions: Mapping[str, Distortion]) -> str:
+    return "; ".join(f"{view}: {d.model} {list(d.coefficients)}" for view, d in distortions.items())
+
+
+def _check_size(images: np.ndarray, size: tuple[int, int], where: str, view: str) -> None:
+    if images.shape[1:3] != size:
+        raise RejectedInputError(
+            "invalid_distortion",
+            "Images have another size than their lens was calibrated for",
+            where=f"{where}, view {view}",
+            expected=f"{size[0]}x{size[1]}",
+            got=f"{images.shape[1]}x{images.shape[2]}",
+            evidence={"view": view, "calibrated": list(size), "images": list(images.shape[1:3])},
+        )

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from worldline_core.data.guards.hdf5_images import Channels
+from worldline_core.data.guards.hdf5 import Channels
 
 Track = Literal["puppet", "master"]
 

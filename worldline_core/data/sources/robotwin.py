@@ -21,15 +21,14 @@ from pydantic import Field
 from worldline_core.data.curation.checks import EVALUATION_LAYOUTS
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
-from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
-from worldline_core.data.guards.hdf5_images import Channels, hdf5_images
+from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.images import image_size
-from worldline_core.data.guards.json_file import read_json
+from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.base import EvaluationSourceConfig, GripperRange, LoadedEpisode, no_masks
-from worldline_core.geometry.camera_pose import CameraPose
-from worldline_core.geometry.pose_formats import pose_from_quaternion_wxyz
+from worldline_core.data.sources.source import EvaluationSourceConfig, GripperRange, LoadedEpisode, no_masks
+from worldline_core.geometry.cameras import CameraPose
+from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
 _DIGITS = re.compile(r"(\d+)")
 _ARMS = ("left", "right")

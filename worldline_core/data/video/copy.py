@@ -18,8 +18,7 @@ from av.packet import Packet
 from av.video.stream import VideoStream
 
 from worldline_core.data.video.clip import FRAME_TOLERANCE, Picture, VideoClip, damaged_frame, wrong_count
-from worldline_core.data.video.encoder import BITEXACT, frame_rate
-from worldline_core.data.video.nal_units import length_prefixed
+from worldline_core.data.video.encoder import BITEXACT, frame_rate, length_prefixed
 
 COPIED_CODECS = ("h264", "hevc", "av1", "vp9")
 """Codecs that mp4 holds and that the usual readers of datasets (torchcodec, PyAV, LeRobot) decode."""

@@ -1,19 +1,25 @@
 """Reading video with PyAV, which carries its own FFmpeg: a machine without system codecs still decodes.
 
 Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
+
+When the frames of a video are shown, from its packets: nothing is decoded.
+
+Images and masks at another size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.video.clip import FRAME_TOLERANCE, open_video, seek_before, wrong_count
+from worldline_core.data.video.clip import FRAME_TOLERANCE, open_video, seek_before, undecodable, wrong_count
 from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import ImageTransform
 
 
 def iterate_frames(path: AnyPath, start_time: float = 0.0) -> Iterator[tuple[float, np.ndarray]]:
@@ -99,3 +105,60 @@ def video_size(path: AnyPath) -> tuple[int, int, float]:
     with open_video(path) as (_, stream):
         rate = stream.average_rate or stream.base_rate or Fraction(0)
         return stream.height, stream.width, float(rate)
+
+
+def frame_times(path: AnyPath) -> np.ndarray:
+    """(N,) float64 presentation times [s] of a video's frames from the first one's, in the order of presentation.
+
+    A packet of video is one frame; those that an edit list cuts away are marked and left out.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no video, or frames without a time),
+        truncated_video.
+    """
+    with open_video(path) as (container, stream):
+        base = stream.time_base or Fraction(1, 1000)
+        ticks = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+    timed = [tick for tick in ticks if tick is not None]
+    if not ticks:
+        raise undecodable(path, "no frames")
+    if len(timed) < len(ticks):
+        raise RejectedInputError(
+            "unreadable",
+            "Frames of the video have no time",
+            where=str(path),
+            expected=f"{len(ticks)} frames with a time",
+            got=f"{len(timed)}",
+        )
+    ordered = np.sort(np.asarray(timed, dtype=np.int64))
+    return (ordered - ordered[0]) * float(base)
+
+
+Fit = Literal["stretch", "letterbox", "crop"]
+
+
+def fitted(from_size: tuple[int, ...], size: tuple[int, int] | None, fit: Fit) -> ImageTransform:
+    """From (height, width) to a wanted one: stretched, whole with black bars, or filled with the rest cut away."""
+    transform = ImageTransform.of((from_size[0], from_size[1]))
+    if size is None:
+        return transform
+    match fit:
+        case "stretch":
+            return transform.resize(size)
+        case "letterbox":
+            return transform.letterbox(size)
+        case "crop":
+            return transform.centre_crop(size)
+
+
+def resize_frames(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    """uint8 (N, H, W, 3) at (height, width): area averages when shrinking, linear when enlarging."""
+    return frames if size is None else _resized(frames, size).frames(frames)
+
+
+def resize_masks(masks: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    """bool (N, H, W) at (height, width): True where at least half of a pixel's area was."""
+    return masks if size is None else _resized(masks, size).masks(masks)
+
+
+def _resized(images: np.ndarray, size: tuple[int, int]) -> ImageTransform:
+    return fitted((images.shape[1], images.shape[2]), size, "stretch")

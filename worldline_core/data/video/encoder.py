@@ -4,6 +4,11 @@ Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
 
 Encoding is single-threaded libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key frame, and
 presentation order equals file order: clips can be joined without encoding again and found by frame number.
+
+Packets of H.264 and H.265 as mp4 holds them: every NAL unit behind its length.
+
+FFmpeg's bitstream filters hand packets on with start codes (Annex B). Its mp4 writer stores them like that when the stream's
+header is one of lengths; its decoders do not mind, while other players, and the joining of LeRobot's tools, do.
 """
 
 from __future__ import annotations
@@ -17,11 +22,44 @@ from typing import Literal, Self
 import av
 import cv2
 import numpy as np
+from av import Packet
 from av.bitstream import BitStreamFilterContext
 from av.codec.context import Flags
+from av.video.stream import VideoStream
 
-from worldline_core.data.video.nal_units import length_prefixed
 from worldline_core.errors import DataError
+
+_START_CODE = b"\x00\x00\x01"
+
+
+def length_prefixed(packet: Packet, stream: VideoStream) -> Packet:
+    """The packet with lengths in the place of start codes, or itself where it has none.
+
+    Args:
+        stream: whose header (avcC, hvcC: it begins with 1) says that lengths are expected.
+    """
+    header = stream.codec_context.extradata
+    if not header or header[0] != 1 or stream.codec_context.codec.canonical_name not in ("h264", "hevc"):
+        return packet
+    data = bytes(packet)
+    if not data.startswith(b"\x00" + _START_CODE) or _are_lengths(data):
+        return packet
+    # A NAL unit ends without zeros and holds no start code (emulation prevention), so splitting at start codes is exact.
+    units = [unit.rstrip(b"\x00") for unit in data.split(_START_CODE)]
+    prefixed = Packet(b"".join(len(unit).to_bytes(4, "big") + unit for unit in units if unit))
+    prefixed.pts, prefixed.dts, prefixed.duration = packet.pts, packet.dts, packet.duration
+    prefixed.is_keyframe = packet.is_keyframe
+    if packet.time_base is not None:
+        prefixed.time_base = packet.time_base
+    return prefixed
+
+
+def _are_lengths(data: bytes) -> bool:
+    position = 0
+    while position + 4 < len(data):
+        position += 4 + int.from_bytes(data[position : position + 4], "big")
+    return position == len(data)
+
 
 PixelFormat = Literal["yuv420p", "yuv444p"]
 

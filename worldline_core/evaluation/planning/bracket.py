@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.planning.selector import CandidateVideo, Selector
+from worldline_core.evaluation.planning.selectors import CandidateVideo, Selector
 
 GROUP_SIZE = 4
 SURVIVORS = 2

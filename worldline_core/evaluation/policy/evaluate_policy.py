@@ -2,6 +2,8 @@
 
 Judged are the same trajectories for every method, as many successes as failures in every split and task family. The
 recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling.
+
+Accuracy of verdicts: pooled per seed, averaged over seeds; by split and task family; with intervals.
 """
 
 from __future__ import annotations
@@ -15,14 +17,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.evaluation.vlm.config import VLMConfig
+from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
+from worldline_core.evaluation.vlm.vlm_config import VLMConfig
 from worldline_core.store.atomic import write_json_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.evaluation.policy.judge import Judge
+
 
 logger = logging.getLogger(__name__)
 
@@ -53,8 +57,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     """
     from tqdm import tqdm
 
-    from worldline_core.evaluation.policy.judge import Trajectory
-    from worldline_core.evaluation.policy.judgement import judge_trajectory
+    from worldline_core.evaluation.policy.judge import Trajectory, judge_trajectory
     from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts, open_tracks, tool_points
 
     recordings = Recordings.open(inputs["episodes"])
@@ -121,11 +124,11 @@ def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
     """The judge that the config names."""
     if config.judge == "measured":
         from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-        from worldline_core.evaluation.segmenters.base import open_segmenter
+        from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 
         return MeasuredEvidenceJudge(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
     from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-    from worldline_core.evaluation.vlm.config import open_vlm
+    from worldline_core.evaluation.vlm.vlm_config import open_vlm
 
     return VLMJudge(open_vlm(config.judge, config.vlm))
 
@@ -167,7 +170,6 @@ def _write(
 ) -> dict[str, Any]:
     import pyarrow as pa
 
-    from worldline_core.evaluation.policy.accuracy import summarise_decisions
     from worldline_core.evaluation.scores import SUMMARY_FILE, Score, write_scores, write_table
 
     integers = {"seed", "answers", "malformed_answers"}
@@ -196,3 +198,60 @@ _SCHEMA_ORDER = (
     "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "instruction", "outcome",
     "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
 )  # fmt: skip
+
+
+ALL = "all"
+
+
+def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
+    """Accuracy of every method and group, and differences between methods.
+
+    Args:
+        rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, answers, malformed_answers.
+
+    Returns:
+        {"trajectories", "methods": {method: {group: {"accuracy": interval, "seeds": {...}, "confusion": {...}}}},
+         "differences": [...]}; groups are "all", each split, each family, and split/family.
+    """
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        names = (ALL, row["split"], row["task_family"], f"{row['split']}/{row['task_family']}")
+        for name in dict.fromkeys(names):
+            groups[row["method"], name].append(row)
+    methods: dict[str, dict[str, Any]] = defaultdict(dict)
+    by_trajectory: dict[str, dict[str, float]] = {}
+    for (method, group), members in sorted(groups.items()):
+        per_trajectory, per_seed = _means(members, "episode_id"), _means(members, "seed")
+        if group == ALL:
+            by_trajectory[method] = per_trajectory
+        interval = bootstrap_mean(list(per_trajectory.values()), resamples=resamples, seed=seed)
+        confusion = {"true_success": 0, "false_success": 0, "true_failure": 0, "false_failure": 0}
+        for row in members:
+            right = "true" if row["predicted"] == row["outcome"] else "false"
+            confusion[f"{right}_{row['predicted']}"] += 1
+        methods[method][group] = {
+            "accuracy": interval.as_json(),
+            "seeds": {str(name): value for name, value in per_seed.items()},
+            "confusion": confusion,
+            "malformed_answers": sum(row["malformed_answers"] for row in members),
+            "answers": sum(row["answers"] for row in members),
+        }
+    names = sorted(by_trajectory)
+    differences = []
+    for index, first in enumerate(names):
+        for second in names[index + 1 :]:
+            interval = paired_difference(by_trajectory[first], by_trajectory[second], resamples=resamples, seed=seed)
+            if interval is not None:
+                differences.append({"first": first, "second": second, "metric": "accuracy", **interval.as_json()})
+    return {
+        "trajectories": len({row["episode_id"] for row in rows}),
+        "methods": dict(methods),
+        "differences": differences,
+    }
+
+
+def _means(rows: Sequence[Mapping[str, Any]], key: str) -> dict[Any, float]:
+    values: dict[Any, list[float]] = defaultdict(list)
+    for row in rows:
+        values[row[key]].append(float(row["predicted"] == row["outcome"]))
+    return {name: sum(items) / len(items) for name, items in sorted(values.items())}

@@ -2,15 +2,25 @@
 
 A fact is true, false, or null (hidden in every view). An answer that cannot be parsed becomes evidence in which every
 fact is null: it is counted, and rules never take null for success.
+
+Instruction to task family: which evidence is asked for (appendix "Evidence-based trajectory evaluation").
+
+Placing is a state change: what counts is where the object ends. The paper does not print its router; this one goes by
+the verbs.
+
+Deterministic rules from evidence to a decision (appendix "Evidence-based trajectory evaluation").
+
+Only facts that are stated decide: a null is never taken for the favourable value, and a wrong object or a drop fails.
 """
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, StrictBool
 
-from worldline_core.evaluation.vlm.answers import Answer, AnswerText
+from worldline_core.evaluation.vlm.message import Answer, AnswerText
 
 EvidenceFamily = Literal["grasp", "lift", "state_change"]
 Fact = StrictBool | None
@@ -76,3 +86,84 @@ SCHEMAS: dict[EvidenceFamily, type[GraspEvidence] | type[LiftEvidence] | type[St
     "lift": LiftEvidence,
     "state_change": StateChangeEvidence,
 }
+
+
+_STATE_CHANGE = [
+    "place",
+    "put",
+    "set",
+    "insert",
+    "stack",
+    "drop",
+    "pour",
+    "fold",
+    "open",
+    "close",
+    "press",
+    "push",
+    "pull",
+    "click",
+    "turn",
+    "rotate",
+    "switch",
+    "slide",
+    "move",
+    "hang",
+    "scoop",
+    "transfer",
+    "sweep",
+    "wipe",
+    "plug",
+    "screw",
+    "hand",
+    "give",
+    "pass",
+    "arrange",
+    "sort",
+]
+_LIFT = ("lift", "pick", "raise", "hold up", "take")
+_GRASP = ("grasp", "grab", "grip", "seize", "hold")
+
+
+def route(instruction: str) -> EvidenceFamily:
+    """The family whose evidence decides the instruction.
+
+    The last demand wins: "pick up the cup and place it" is a state change, "grasp and lift" is a lift. An instruction
+    with none of the known verbs is a state change, the family that asks for the whole instructed effect.
+    """
+    text = instruction.lower()
+    if _contains(text, _STATE_CHANGE):
+        return "state_change"
+    if _contains(text, _LIFT):
+        return "lift"
+    return "grasp" if _contains(text, _GRASP) else "state_change"
+
+
+def _contains(text: str, words: list[str] | tuple[str, ...]) -> bool:
+    endings = r"(?:s|es|ed|ing|ping|ting|ding)?"
+    return any(re.search(rf"\b{re.escape(word.rstrip('e'))}e?{endings}\b", text) for word in words)
+
+
+def establishes_success(evidence: Evidence) -> bool:
+    """Whether the evidence establishes that the task was completed."""
+    if evidence.wrong_object_or_drop is not False:
+        return False
+    if isinstance(evidence, GraspEvidence):
+        return evidence.target_held_for_two_late_steps is True
+    if isinstance(evidence, LiftEvidence):
+        return (
+            evidence.target_held_for_two_late_steps is True
+            and evidence.head_view_confirms_target_displacement is True
+            and evidence.target_on_original_support_at_end is False
+        )
+    return evidence.required_final_state_visible is True
+
+
+def reconciliation_establishes_success(reconciliation: Reconciliation, evidence: Evidence) -> bool:
+    """P4 may turn an unsuccessful state change, but not against a wrong object or a drop that was seen."""
+    return reconciliation.observations_prove_completion is True and evidence.wrong_object_or_drop is not True
+
+
+def motion_establishes_success(motion: MotionEvidence, evidence: Evidence) -> bool:
+    """P5 may turn an unsuccessful lift or state change, but not against a wrong object or a drop that was seen."""
+    return motion.task_effect_completed is True and evidence.wrong_object_or_drop is not True

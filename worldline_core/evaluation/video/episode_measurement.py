@@ -10,14 +10,12 @@ import torch
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.recordings import Recordings, tool_points
-from worldline_core.evaluation.segmenters.base import Segmenter
-from worldline_core.evaluation.video.end_effector_error import end_effector_error
+from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.video.lpips import LPIPS
-from worldline_core.evaluation.video.metrics import frames_to_unit, psnr, ssim
-from worldline_core.evaluation.video.robot_iou import frame_iou
+from worldline_core.evaluation.video.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
 
 if TYPE_CHECKING:
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
     from worldline_core.rollout.rollout_set import RolloutSet
 
 HEAD = "head"

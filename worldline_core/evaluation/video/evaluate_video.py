@@ -3,28 +3,34 @@
 Two robot IoUs are reported. ``robot_iou`` follows the paper: one segmenter masks the true and the predicted video
 independently of each other. ``robot_iou_exact`` compares the predicted video's mask with the recording's exact one.
 How good the segmenter itself is shows in the rows of the method ``true``: its masks of true frames against exact ones.
+
+Metrics against time: means over trajectories of every frame, to see drift along a rollout.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import pyarrow as pa
 from pydantic import Field
 
-from worldline_core.config.base import StrictModel
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import UnavailableError
+from worldline_core.evaluation.scores import write_table
 from worldline_core.store.atomic import write_json_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode import Episode
-    from worldline_core.evaluation.segmenters.base import Segmenter
+    from worldline_core.evaluation.segmenters.segmenter import Segmenter
+
 
 logger = logging.getLogger(__name__)
 
@@ -56,9 +62,9 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     """
     from tqdm import tqdm
 
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
     from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
-    from worldline_core.evaluation.segmenters.base import open_segmenter
+    from worldline_core.evaluation.segmenters.segmenter import open_segmenter
     from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
 
     recordings = Recordings.open(inputs["episodes"])
@@ -134,7 +140,6 @@ def _write(
 ) -> dict[str, Any]:
     from worldline_core.evaluation.recordings import TRUE_METHOD
     from worldline_core.evaluation.scores import SUMMARY_FILE, Score, summarise, write_scores
-    from worldline_core.evaluation.video.by_frame import write_by_frame
     from worldline_core.evaluation.video.episode_measurement import finite_mean
 
     scores: list[Score] = []
@@ -178,3 +183,42 @@ def _write(
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
     return {"episodes": summary["num_episodes"], "methods": summary["methods"], "scores": len(scores)}
+
+
+BY_FRAME_SCHEMA = pa.schema(
+    [
+        ("method", pa.string()),
+        ("split", pa.string()),
+        ("view", pa.string()),
+        ("metric", pa.string()),
+        ("frame", pa.int32()),
+        ("mean", pa.float64()),
+        ("count", pa.int32()),
+    ]
+)
+
+
+def write_by_frame(path: Path, videos: Iterable[tuple[str, str, str, str, Sequence[float | None]]]) -> None:
+    """Average per-frame values over videos.
+
+    Args:
+        videos: (method, split, view, metric, value of each frame; None where a frame is left out).
+    """
+    cells: dict[tuple[str, str, str, str, int], list[float]] = defaultdict(list)
+    for method, split, view, metric, frames in videos:
+        for frame, value in enumerate(frames):
+            if value is not None:
+                cells[method, split, view, metric, frame].append(value)
+    rows = [
+        {
+            "method": method,
+            "split": split,
+            "view": view,
+            "metric": metric,
+            "frame": frame,
+            "mean": sum(values) / len(values),
+            "count": len(values),
+        }
+        for (method, split, view, metric, frame), values in sorted(cells.items())
+    ]
+    write_table(path, rows, BY_FRAME_SCHEMA)

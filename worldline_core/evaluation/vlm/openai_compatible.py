@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from worldline_core.errors import ConfigError, UnavailableError
-from worldline_core.evaluation.vlm.content import MAX_NEW_TOKENS, Image, Part, Text
+from worldline_core.evaluation.vlm.message import MAX_NEW_TOKENS, Image, Part, Text
 
 _TRANSIENT_STATUS = frozenset({408, 429, 500, 502, 503, 504})
 

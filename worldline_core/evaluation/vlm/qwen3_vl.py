@@ -10,7 +10,7 @@ import torch
 from einops import rearrange
 
 from worldline_core.errors import UnavailableError
-from worldline_core.evaluation.vlm.content import MAX_NEW_TOKENS, Image, Part, Text, Video
+from worldline_core.evaluation.vlm.message import MAX_NEW_TOKENS, Image, Part, Text, Video
 
 
 class Qwen3VLModel:

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from worldline_core.actions.overlay_views import overlay_sheet
+from worldline_core.actions.overlays import SIGMA_PX_REFERENCE, OverlayStyle, heat_picture
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.overlay_views import overlay_sheet
-from worldline_core.exports.overlays import SIGMA_PX_REFERENCE, OverlayStyle, heat_picture
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.artifacts import read_json
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, table
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
 
 TITLE = "Action maps"
@@ -29,7 +29,7 @@ CHANNEL_LABELS = ("heat", "depth", "rot 1", "rot 2", "rot 3", "rot 4", "rot 5", 
 
 def actions_section(context: ReportContext) -> Section:
     """Overlays of a few episodes in three views."""
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
 
     folder = context.inputs.get("render_actions")
     if folder is None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.artifacts import JsonObject, read_rows
 from worldline_core.report.card_blocks import Heading, duplicate_blocks, source_blocks
 from worldline_core.report.context import ReportContext, Section

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from worldline_core.actions.overlays import draw_overlay
 from worldline_core.errors import DataError
-from worldline_core.exports.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.exports.labels import Picture
-from worldline_core.exports.overlays import draw_overlay
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import Picture
 from worldline_core.report.artifacts import read_rows
 from worldline_core.report.charts import funnel_chart
 from worldline_core.report.context import ReportContext, Section
@@ -153,7 +153,7 @@ def with_tools(
     context: ReportContext, episode_id: str, view: str, frames: np.ndarray, chosen: Sequence[int]
 ) -> np.ndarray:
     """The frames with projected tools, enlarged; unchanged where there are no tracks of the episode."""
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
 
     folder = context.inputs.get("render_actions")
     tracks = ActionTracks.open(folder) if folder is not None else None

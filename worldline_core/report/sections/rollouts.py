@@ -8,7 +8,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError
-from worldline_core.exports.side_by_side import SideBySide, write_side_by_side
+from worldline_core.pictures.side_by_side import SideBySide, write_side_by_side
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Html, element, figure, join, notice, paragraph
 from worldline_core.report.methods import Method, in_order
@@ -181,7 +181,7 @@ def downloads(context: ReportContext, item: ChosenEpisode, number: int) -> Html:
 
 def recordings(context: ReportContext, item: ChosenEpisode, number: int, formats: list[str]) -> list[str]:
     """Names of the files written below run/recordings (a Rerun recording's bytes are not reproducible)."""
-    from worldline_core.actions.tracks import ActionTracks
+    from worldline_core.actions.track_store import ActionTracks
     from worldline_core.exports.rollout import export_rollout
 
     episodes = context.episodes

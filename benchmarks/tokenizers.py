@@ -1,0 +1,114 @@
+"""Which tokenizer for the embedded size: linear, linear with a decoder, or a small convolutional autoencoder.
+
+``python -m benchmarks.tokenizers --episodes SET --tokenizer FOLDER --minutes 5`` trains a small
+``AutoencoderKLWan`` for that long on the training episodes and prints reconstruction quality and time of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from worldline_core.model.tokenizer.patch import PatchTokenizer
+from worldline_core.model.tokenizer.tokenizer import VideoTokenizer
+from worldline_core.model.tokenizer.train_tokenizer import (
+    TokenizerConfig,
+    clip_of,
+    decoder_batch,
+    load_views,
+    milliseconds,
+    reconstruction_metrics,
+    select_episodes,
+)
+from worldline_core.model.tokenizer.wan import WanTokenizer
+
+
+def small_wan(latent_channels: int = 32) -> WanTokenizer:
+    """A Wan autoencoder of about two million parameters: 8 x 8 in space, 4 in time."""
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+
+    vae = AutoencoderKLWan(
+        base_dim=24,
+        decoder_base_dim=32,
+        z_dim=latent_channels,
+        dim_mult=[1, 2, 2],
+        num_res_blocks=1,
+        temperal_downsample=[True, True],
+        is_residual=True,
+        in_channels=12,
+        out_channels=12,
+        patch_size=2,
+        scale_factor_spatial=8,
+        scale_factor_temporal=4,
+        latents_mean=[0.0] * latent_channels,
+        latents_std=[1.0] * latent_channels,
+    )
+    return WanTokenizer(vae)
+
+
+def train_wan(tokenizer: WanTokenizer, videos: list[Tensor], config: TokenizerConfig, seconds: float) -> int:
+    """Train on reconstruction alone for ``seconds``; returns the steps made."""
+    optimizer = torch.optim.AdamW(tokenizer.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
+    started, step = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        video = decoder_batch(videos, config, step)
+        loss = (tokenizer.decode(tokenizer.encode(video)) - video).abs().mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(tokenizer.parameters(), 1.0)
+        optimizer.step()
+        step += 1
+    return step
+
+
+def compare(
+    patch: PatchTokenizer, wan: WanTokenizer, held_out: list[Tensor], frames: int
+) -> dict[str, dict[str, float]]:
+    """Metrics and milliseconds a clip (one view) of both tokenizers, and of the linear part alone."""
+    clip = clip_of(held_out[0], frames, patch.temporal_compression)
+    rows: dict[str, dict[str, float]] = {}
+    tokenizers: dict[str, VideoTokenizer] = {"patch": patch, "wan": wan}
+    for name, tokenizer in tokenizers.items():
+        encode_ms, decode_ms = milliseconds(tokenizer, clip)
+        rows[name] = reconstruction_metrics(tokenizer, held_out, frames)
+        rows[name] |= {"encode_ms": round(encode_ms, 2), "decode_ms": round(decode_ms, 2)}
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    from worldline_core.data.episodes.episode_set import EpisodeSet
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=Path, required=True)
+    parser.add_argument("--tokenizer", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--max-episodes", type=int, default=40)
+    parser.add_argument("--held-out-split", default="validation")
+    options = parser.parse_args(arguments)
+    config = TokenizerConfig(max_episodes=options.max_episodes, batch_size=1)
+    episodes = EpisodeSet.open(options.episodes)
+    chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
+    held_out = select_episodes(episodes, (options.held_out_split,), 4, config.seed)
+    videos = load_views(episodes, chosen, config.image_size, 5)
+    torch.manual_seed(config.seed)
+    wan = small_wan()
+    steps = train_wan(wan, videos, config, options.minutes * 60)
+    rows = compare(
+        PatchTokenizer.load(options.tokenizer),
+        wan.eval().requires_grad_(False),
+        load_views(episodes, held_out, config.image_size, 5),
+        config.clip_frames,
+    )
+    print(f"AutoencoderKLWan: {sum(p.numel() for p in wan.parameters()):,} parameters, {steps} steps")
+    for name, metrics in rows.items():
+        print(name, *(f"{key}={value}" for key, value in metrics.items()))
+
+
+if __name__ == "__main__":
+    main()

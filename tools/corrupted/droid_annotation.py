@@ -1,0 +1,139 @@
+"""DROID annotation JSON with defects, above all in the paths that the annotation names."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.corrupted.content import FPS, gripper_motion, joint_motion, pictures
+from tools.corrupted.labels import Kind, Label
+from worldline_core.data.video.encoder import encode_video
+
+_BENT = np.array([0.0, 0.0, 0.0, -1.6, 0.0, 1.6, 0.0])
+"""A Panda's elbow and wrist cannot be straight."""
+_BASES = 4
+
+Record = dict[str, Any]
+RecordDefect = Callable[[Record, np.random.Generator], None]
+
+
+def _video_at(path: str) -> RecordDefect:
+    def spoil(record: Record, random: np.random.Generator) -> None:
+        record["videos"][0]["video_path"] = path
+
+    return spoil
+
+
+def _without(key: str) -> RecordDefect:
+    def spoil(record: Record, random: np.random.Generator) -> None:
+        del record[key]
+
+    return spoil
+
+
+def _cut_states(record: Record, random: np.random.Generator) -> None:
+    record["states"] = record["states"][:-1]
+    record["joints"] = record["joints"][:-1]
+
+
+def _cut_joints(record: Record, random: np.random.Generator) -> None:
+    record["joints"] = record["joints"][: -int(random.integers(1, 5))]
+
+
+def _ragged(record: Record, random: np.random.Generator) -> None:
+    row = int(random.integers(len(record["states"])))
+    record["states"][row] = record["states"][row][:-1]
+
+
+def _not_a_number(record: Record, random: np.random.Generator) -> None:
+    record["joints"][int(random.integers(len(record["joints"])))][2] = float("nan")
+
+
+def _words(record: Record, random: np.random.Generator) -> None:
+    record["states"][3][1] = "0.4 m"
+
+
+def _ticks(record: Record, random: np.random.Generator) -> None:
+    for row in record["joints"]:
+        row[3] = row[3] * 4096
+
+
+KINDS = (
+    Kind("path_upwards", _video_at("../../../elsewhere/0.mp4"), ("path_traversal",)),
+    Kind("path_absolute", _video_at("/etc/hostname"), ("path_traversal",)),
+    Kind("path_to_nothing", _video_at("videos/none.mp4"), ("missing_file",)),
+    Kind("no_videos", _without("videos"), ("missing_view",)),
+    Kind("no_states", _without("states"), ("missing_column",)),
+    Kind("states_cut", _cut_states, ("length_mismatch",)),
+    Kind("joints_cut", _cut_joints, ("length_mismatch",)),
+    Kind("states_ragged", _ragged, ("length_mismatch", "unreadable")),
+    Kind("states_in_words", _words, ("length_mismatch", "unreadable", "missing_column")),
+    Kind("joints_not_finite", _not_a_number, ("nan_state",)),
+    Kind("joints_in_ticks", _ticks, ("joint_out_of_range",)),
+)
+_TEXTS: tuple[tuple[str, Callable[[str, np.random.Generator], bytes]], ...] = (
+    ("json_cut", lambda text, random: text[: int(len(text) * random.uniform(0.2, 0.8))].encode()),
+    ("json_key_twice", lambda text, random: text.replace("{", '{"states": [], ', 1).encode()),
+    ("json_deep", lambda text, random: b"[" * 200_000),
+    ("json_not_utf8", lambda text, random: text.encode().replace(b"pick", b"p\xff\xfek")),
+)
+
+
+KIND_COUNT = len(KINDS) + len(_TEXTS)
+"""How many recordings `write` adds for each of `each`."""
+
+
+def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
+    """One folder of annotations; see `labels.Layout`."""
+    labels: list[Label] = []
+    (root / "annotation/val").mkdir(parents=True)
+
+    def place(kind: str, text: bytes, reasons: tuple[str, ...] = ()) -> None:
+        number = len(labels)
+        (root / f"annotation/val/{number}.json").write_bytes(text)
+        # The subset's folder is the root itself, so the id has its parts only.
+        labels.append(
+            Label(f"{root.name}-val-{number}", "droid_annotation", kind, "curate" if reasons else "kept", reasons)
+        )
+
+    for number in range(healthy):
+        place("clean", json.dumps(_record(root, f"clean{number}", random)).encode())
+    bases = [_record(root, f"base{number}", random) for number in range(_BASES)]
+    for kind in KINDS:
+        for number in range(each):
+            record = json.loads(json.dumps(bases[number % _BASES]))
+            kind.spoil(record, random)
+            place(kind.name, json.dumps(record).encode(), kind.reasons)
+    for name, change in _TEXTS:
+        for number in range(each):
+            place(name, change(json.dumps(bases[number % _BASES]), random), ("unreadable",))
+    source = {
+        "kind": "droid_annotation",
+        "path": str(root),
+        "name": root.name,
+        "views": ["head", None, None],
+        "fps": FPS,
+        "split": "test",
+    }
+    return labels, source
+
+
+def _record(root: Path, name: str, random: np.random.Generator) -> Record:
+    opening = gripper_motion(random)[:, None]
+    motion = joint_motion(random, 7)
+    path = root / f"videos/{name}/0.mp4"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(path, ignore_errors=True)
+    encode_video(path, pictures(random), FPS, preset="ultrafast")
+    return {
+        "texts": ["pick the block"],
+        "success": 1,
+        "videos": [{"video_path": str(path.relative_to(root))}],
+        "states": np.concatenate([motion[:, :6], 1 - opening], axis=1).tolist(),
+        "joints": np.concatenate([_BENT + 0.3 * motion, 1 - opening], axis=1).tolist(),
+    }

@@ -1,0 +1,119 @@
+"""One small healthy recording in each layout that curation reads, to be damaged by `mutations`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tools.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap
+from tools.corrupted.content import FPS, HEIGHT, WIDTH, gripper_motion, joint_motion, pictures
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.guards.hdf5 import require_h5py
+from worldline_core.data.video.encoder import encode_video
+
+_LENGTH = 4
+_K = np.array([[80.0, 0, (WIDTH - 1) / 2], [0, 80.0, (HEIGHT - 1) / 2], [0, 0, 1]])
+Source = dict[str, Any]
+
+
+def write_one_of_each(folder: Path, seed: int = 0) -> dict[str, Source]:
+    """Layout -> its `curate.sources[]` entry; each in a folder of its own."""
+    random = np.random.default_rng(seed)
+    sources: dict[str, Source] = {}
+    for module in (lerobot_v21, agibot_world, droid_annotation, mcap):
+        name = module.__name__.rsplit(".", 1)[1]
+        sources[name] = module.write(folder / name, 1, 0, random)[1]
+    own = folder / "episode_set"
+    curate(CurateConfig.model_validate({"sources": [sources["mcap"]]}), {}, own)
+    shutil.rmtree(own / "run")
+    sources["episode_set"] = {"kind": "episode_set", "path": str(own)}
+    dataset = next((own / "datasets").iterdir())
+    sources["lerobot_v3"] = {
+        "kind": "lerobot_v3",
+        "path": str(shutil.copytree(dataset, folder / "lerobot_v3")),
+        "embodiment": "ur5e_pair",
+        "angle_unit": "rad",
+        "views": {"observation.images.head": "head"},
+    }
+    writers: dict[str, Callable[[Path, np.random.Generator], Source]] = {
+        "robotwin": _robotwin,
+        "robomind": _robomind,
+        "agibot_gesim": _agibot_gesim,
+        "video_folder": _video_folder,
+    }
+    for name, write in writers.items():
+        sources[name] = {"path": str(folder / name), **write(folder / name, random)}
+    return sources
+
+
+def _jpegs(random: np.random.Generator) -> list[bytes]:
+    return [cv2.imencode(".jpg", image)[1].tobytes() for image in pictures(random, _LENGTH)]
+
+
+def _robotwin(root: Path, random: np.random.Generator) -> Source:
+    path = root / "beat_block/demo/data/episode0.hdf5"
+    path.parent.mkdir(parents=True)
+    with require_h5py().File(path, "w") as file:
+        for number, arm in enumerate(("left", "right")):
+            pose = np.tile([0.3 * number, -0.2, 0.9, 1.0, 0, 0, 0], (_LENGTH, 1))
+            file[f"endpose/{arm}_endpose"] = pose
+            file[f"endpose/{arm}_gripper"] = gripper_motion(random, _LENGTH)
+            file[f"joint_action/{arm}_arm"] = joint_motion(random, 6, _LENGTH)
+            file[f"joint_action/{arm}_gripper"] = gripper_motion(random, _LENGTH)
+        for camera in ("head_camera", "left_camera", "right_camera"):
+            group = f"observation/{camera}"
+            encoded = _jpegs(random)
+            file[f"{group}/rgb"] = np.array(encoded, dtype=f"S{max(map(len, encoded))}")
+            file[f"{group}/intrinsic_cv"] = np.tile(_K, (_LENGTH, 1, 1))
+            file[f"{group}/extrinsic_cv"] = np.tile(np.eye(4)[:3], (_LENGTH, 1, 1))
+            file[f"{group}/cam2world_gl"] = np.tile(np.diag([1.0, -1, -1, 1]), (_LENGTH, 1, 1))
+    instructions = root / "beat_block/demo/instructions/episode0.json"
+    instructions.parent.mkdir()
+    instructions.write_text(json.dumps({"seen": ["Hit the block."], "unseen": []}))
+    return {"kind": "robotwin", "fps": 10}
+
+
+def _robomind(root: Path, random: np.random.Generator) -> Source:
+    path = root / "open_drawer/success_episodes/train/1014_144602/data/trajectory.hdf5"
+    path.parent.mkdir(parents=True)
+    h5py = require_h5py()
+    with h5py.File(path, "w") as file:
+        for camera in ("camera_top", "camera_left", "camera_right"):
+            images = file.create_dataset(
+                f"observations/rgb_images/{camera}", (_LENGTH,), dtype=h5py.vlen_dtype(np.uint8)
+            )
+            for number, content in enumerate(_jpegs(random)):
+                images[number] = np.frombuffer(content, np.uint8)
+        bent = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 2.0, 0.5]) + 0.2 * joint_motion(random, 7, _LENGTH)
+        file["puppet/joint_position"] = np.hstack([bent, gripper_motion(random, _LENGTH)[:, None]])
+        file["language_raw"] = [b"Open the drawer"]
+    gripper = {"closed": 1.0, "open": 0.0}
+    return {"kind": "robomind", "layout": "h5_franka_3rgb", "fps": 10, "gripper_state": gripper}
+
+
+def _agibot_gesim(root: Path, random: np.random.Generator) -> Source:
+    folder = root / "sample_0"
+    folder.mkdir(parents=True)
+    pose = np.concatenate([joint_motion(random, 3, _LENGTH), np.tile([0, 0, 0, 1.0, 60.0], (_LENGTH, 1))], axis=1)
+    np.save(folder / "actions.npy", np.concatenate([pose, pose], axis=1))
+    for name in ("head", "hand_left", "hand_right"):
+        (folder / f"{name}_color").mkdir()
+        for number, image in enumerate(pictures(random, _LENGTH)):
+            cv2.imwrite(str(folder / f"{name}_color/{number}.png"), image)
+        np.save(folder / f"intrinsic_{name}.npy", _K)
+        np.save(folder / f"extrinsic_{name}.npy", np.tile(np.eye(4), (_LENGTH, 1, 1)))
+    return {"kind": "agibot_gesim", "fps": 30}
+
+
+def _video_folder(root: Path, random: np.random.Generator) -> Source:
+    root.mkdir()
+    encode_video(root / "pour.mp4", pictures(random, _LENGTH), FPS, preset="ultrafast")
+    (root / "pour.txt").write_text("pour the water")
+    return {"kind": "video_folder"}

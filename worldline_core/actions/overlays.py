@@ -1,0 +1,241 @@
+"""The one drawer of action tracks over frames: heat, tool axes, gripper ring and, where wanted, the arms' outline.
+
+Every picture of the project in which controls lie over a frame is drawn here: previews of `render_actions`, the report,
+`worldline inspect`, Rerun layers and the pictures of `worldline calibrate check`.
+
+What is drawn of an end-effector that is valid in a view (nothing is drawn of the others):
+
+- heat, the first channel `h` of the action maps (method, section 2), in the arm's colour;
+- the tool's axes, 6 cm long, x red, y green, z blue, in perspective;
+- a ring around the tool's centre, the wider the further the gripper is open.
+
+Frames and tracks may differ in resolution: both are brought to the size of the picture. Pixel centres lie at whole
+numbers (`geometry.image_transforms`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from worldline_core.actions.action_maps import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, grid_sigma
+from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import Resize
+from worldline_core.pictures.labels import Picture, scale_frames, scaled_size
+
+if TYPE_CHECKING:
+    from worldline_core.actions.episode_tracks import EpisodeTracks
+
+ARM_COLOURS: dict[str, tuple[int, int, int]] = {"left": (255, 150, 20), "right": (40, 150, 255)}
+"""RGB. Orange and blue differ for every kind of colour vision."""
+OTHER_ARM_COLOUR = (60, 200, 120)
+AXIS_COLOURS: tuple[tuple[int, int, int], ...] = ((235, 50, 50), (50, 200, 70), (60, 100, 255))
+AXIS_NAMES = ("x", "y", "z")
+AXIS_LENGTH_M = 0.06
+OUTLINE_COLOUR = (255, 255, 255)
+SHADE = (20, 22, 26)
+"""Under every line, so that it is seen on light and dark ground."""
+TILE_HEIGHT = 256
+_FRACTION_BITS = 4
+
+
+@dataclass(frozen=True)
+class OverlayStyle:
+    """How much is drawn.
+
+    Attributes:
+        sigma_px_ref: of the heat, pixels on the 384 x 512 reference canvas.
+        heat: opacity at the centre of the heat, 0 (none) .. 1.
+        outline: also draw the outline of the robot's capsules, the arms as the kinematics place them.
+    """
+
+    sigma_px_ref: float = SIGMA_PX_REFERENCE
+    heat: float = 0.6
+    outline: bool = False
+
+
+DEFAULT_STYLE = OverlayStyle()
+
+
+def arm_colour(arms: Sequence[str], index: int) -> tuple[int, int, int]:
+    """Colour of an arm by its name: left orange, right blue, any other green."""
+    return ARM_COLOURS.get(arms[index] if index < len(arms) else "", OTHER_ARM_COLOUR)
+
+
+def gaussian(
+    uv: NDArray[np.floating], height: int, width: int, sigma_px_ref: float = SIGMA_PX_REFERENCE
+) -> NDArray[np.float32]:
+    """`h(u) = exp(-|u - u_t|^2 / (2 sigma^2))` on an `h w` grid of pixel centres; sigma is given on the reference canvas.
+
+    What `render_action_maps` puts into channel 0 on a grid of this size, for one arm and without torch.
+    """
+    sigma_v, sigma_u = grid_sigma((height, width), sigma_px_ref, REFERENCE_CANVAS)
+    rows = np.exp(-0.5 * ((np.arange(height) - float(uv[1])) / sigma_v) ** 2)
+    columns = np.exp(-0.5 * ((np.arange(width) - float(uv[0])) / sigma_u) ** 2)
+    return (rows[:, None] * columns[None, :]).astype(np.float32)
+
+
+def draw_overlay(
+    frame: Picture,
+    tracks: EpisodeTracks,
+    n: int,
+    view: str,
+    *,
+    tile_height: int = TILE_HEIGHT,
+    style: OverlayStyle = DEFAULT_STYLE,
+) -> Picture:
+    """Frame n of a view, enlarged (or reduced) for reading, with what the tracks say drawn over it.
+
+    Args:
+        frame: `h w 3` RGB of any resolution.
+        tile_height: wanted height; small frames are enlarged by a whole factor to at most this.
+
+    Raises:
+        DataError: the tracks lack the view or the frame.
+    """
+    v = _view_index(tracks, n, view)
+    size = scaled_size(frame.shape[0], frame.shape[1], tile_height)
+    picture = scale_frames(frame[None], size)[0].copy()
+    shown = [arm for arm in range(len(tracks.arms)) if tracks.valid[n, v, arm]]
+    centres = {arm: picture_pixel(tracks.uv[n, v, arm], tracks.image_size, size) for arm in shown}
+    for arm in shown if style.heat > 0 else ():
+        heat = gaussian(centres[arm], *size, style.sigma_px_ref)[..., None] * style.heat
+        picture = np.rint(picture * (1 - heat) + np.asarray(arm_colour(tracks.arms, arm)) * heat).astype(np.uint8)
+    if style.outline:
+        _draw_outline(picture, arm_mask(tracks, n, view, size))
+    for arm in shown:
+        _draw_axes(picture, centres[arm], axis_tips(tracks, n, v, arm), tracks.image_size)
+        _draw_ring(picture, centres[arm], float(tracks.gripper[n, v, arm]), arm_colour(tracks.arms, arm))
+    return picture
+
+
+def _view_index(tracks: EpisodeTracks, n: int, view: str) -> int:
+    if view not in tracks.views or not 0 <= n < tracks.num_frames:
+        raise DataError(
+            "Nothing to draw: the tracks do not reach there",
+            where=f"episode {tracks.episode_id}",
+            expected=f"views {', '.join(tracks.views)}, frames 0..{tracks.num_frames - 1}",
+            got=f"view {view}, frame {n}",
+        )
+    return tracks.views.index(view)
+
+
+def picture_pixel(uv: NDArray[np.floating], image_size: tuple[int, int], size: tuple[int, int]) -> NDArray[np.float64]:
+    """A pixel of an image of (height, width) in a picture of `size`."""
+    affine = Resize(image_size, size).affine
+    return np.asarray(uv, dtype=np.float64) * np.diagonal(affine)[:2] + affine[:2, 2]
+
+
+def axis_tips(
+    tracks: EpisodeTracks, n: int, v: int, arm: int, length_m: float = AXIS_LENGTH_M
+) -> list[NDArray[np.float64] | None]:
+    """Pixels (of the tracks' image size) of the ends of the tool's axes; None for one that is behind the camera."""
+    K = tracks.K[v].astype(np.float64)
+    x, y = tracks.rot6d[n, v, arm, :3].astype(np.float64), tracks.rot6d[n, v, arm, 3:].astype(np.float64)
+    ray = np.linalg.solve(K, np.append(tracks.uv[n, v, arm].astype(np.float64), 1.0))
+    origin = ray * float(tracks.depth[n, v, arm])
+    tips: list[NDArray[np.float64] | None] = []
+    for axis in (x, y, np.cross(x, y)):
+        tip = origin + length_m * axis
+        tips.append((K @ (tip / tip[2]))[:2] if tip[2] > 1e-3 else None)
+    return tips
+
+
+def _fixed_point(point: NDArray[np.float64]) -> tuple[int, int]:
+    """A point in OpenCV's fixed-point form; what is far outside of any picture is brought nearer."""
+    u, v = np.clip(point, -1e4, 1e4) * (1 << _FRACTION_BITS)
+    return round(float(u)), round(float(v))
+
+
+def line_width(height: int) -> int:
+    """Width of a line that is readable in a picture of this height, pixels."""
+    return max(1, round(height / 150))
+
+
+def shade_width(height: int) -> int:
+    """Width of the dark line under a line: in a small picture it would otherwise be all that is seen."""
+    return line_width(height) + (2 if height >= 200 else 1)
+
+
+def _draw_axes(
+    picture: Picture,
+    centre: NDArray[np.float64],
+    tips: Sequence[NDArray[np.float64] | None],
+    image_size: tuple[int, int],
+) -> None:
+    size, width = (picture.shape[0], picture.shape[1]), line_width(picture.shape[0])
+    ends = [None if tip is None else picture_pixel(tip, image_size, size) for tip in tips]
+    for colours, thickness in (((SHADE,) * 3, shade_width(size[0])), (AXIS_COLOURS, width)):
+        for end, colour in zip(ends, colours, strict=True):
+            if end is not None:
+                cv2.line(
+                    picture, _fixed_point(centre), _fixed_point(end), colour, thickness, cv2.LINE_AA, _FRACTION_BITS
+                )
+
+
+def _draw_ring(picture: Picture, centre: NDArray[np.float64], opening: float, colour: tuple[int, int, int]) -> None:
+    height, width = picture.shape[0], line_width(picture.shape[0])
+    radius = round(height * (0.018 + 0.032 * float(np.clip(opening, 0.0, 1.0))) * (1 << _FRACTION_BITS))
+    at = _fixed_point(centre)
+    cv2.circle(picture, at, radius, SHADE, shade_width(height), cv2.LINE_AA, _FRACTION_BITS)
+    cv2.circle(picture, at, radius, colour, width, cv2.LINE_AA, _FRACTION_BITS)
+    cv2.circle(picture, at, (width + 1) << _FRACTION_BITS, SHADE, -1, cv2.LINE_AA, _FRACTION_BITS)
+    cv2.circle(picture, at, width << _FRACTION_BITS, (255, 255, 255), -1, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def arm_mask(tracks: EpisodeTracks, n: int, view: str, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where the robot's capsules fall in a view: bool `h w` of `size`."""
+    import torch
+
+    from worldline_core.actions.robot_masks import project_capsules
+
+    v = _view_index(tracks, n, view)
+    covered = project_capsules(
+        torch.from_numpy(tracks.capsules[None, [n]]),
+        torch.from_numpy(tracks.capsule_radii[None]),
+        torch.from_numpy(tracks.K[None, [v]]),
+        torch.from_numpy(tracks.T_base_camera[None, [n]][:, :, [v]]),
+        tracks.image_size,
+        size,
+    )
+    return covered[0, 0, 0].numpy()
+
+
+def _draw_outline(picture: Picture, mask: NDArray[np.bool_]) -> None:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    width = line_width(picture.shape[0])
+    cv2.drawContours(picture, contours, -1, SHADE, shade_width(picture.shape[0]), cv2.LINE_AA)
+    cv2.drawContours(picture, contours, -1, OUTLINE_COLOUR, width, cv2.LINE_AA)
+
+
+def heat_layer(
+    tracks: EpisodeTracks, n: int, view: str, size: tuple[int, int], sigma_px_ref: float = SIGMA_PX_REFERENCE
+) -> NDArray[np.uint8]:
+    """Every valid arm's Gaussian as one RGBA picture `h w 4`, transparent where there is no heat."""
+    v = _view_index(tracks, n, view)
+    colour = np.zeros((*size, 3), dtype=np.float32)
+    alpha = np.zeros((*size, 1), dtype=np.float32)
+    for arm in range(len(tracks.arms)):
+        if tracks.valid[n, v, arm]:
+            heat = gaussian(picture_pixel(tracks.uv[n, v, arm], tracks.image_size, size), *size, sigma_px_ref)[
+                ..., None
+            ]
+            colour += heat * np.asarray(arm_colour(tracks.arms, arm), dtype=np.float32)
+            alpha += heat
+    shown = np.concatenate([colour / np.maximum(alpha, 1e-6), 200.0 * np.minimum(alpha, 1.0)], axis=-1)
+    return np.clip(shown, 0, 255).astype(np.uint8)
+
+
+def heat_picture(channel: NDArray[np.floating], *, tile_height: int = 128) -> Picture:
+    """One channel of an action map as a picture: blue negative, grey zero, red positive, symmetric range."""
+    peak = float(np.abs(channel).max()) or 1.0
+    value = np.clip(channel / peak, -1.0, 1.0)[..., None].astype(np.float32)
+    zero, red, blue = (np.array(c, np.float32) for c in ((234, 232, 226), (200, 48, 38), (36, 84, 180)))
+    picture = np.where(value >= 0, zero + (red - zero) * value, zero + (blue - zero) * -value)
+    factor = max(1, tile_height // channel.shape[0])
+    return picture.round().astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)

@@ -1,0 +1,284 @@
+"""The calibration doctor: measures an episode under every usual mistake and names the one that explains it."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from itertools import combinations
+
+import numpy as np
+
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, VerdictName
+from worldline_core.calibration.gripper_evidence import gripper_terms, inversion_gain
+from worldline_core.calibration.hypotheses import conventions_to_try, image_lags
+from worldline_core.calibration.image_evidence import image_terms, log_likelihood, observable_views, turn_log_likelihood
+from worldline_core.calibration.measures import notes_on, view_measures
+from worldline_core.calibration.observation import Observation, observe
+from worldline_core.calibration.pose_evidence import pose_terms, unrest_log_likelihood
+from worldline_core.calibration.reading import Reading, read
+from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.geometry.kinematics import ArmKinematics
+
+__all__ = ["CalibrationDoctorConfig", "diagnose", "diagnose_set"]
+
+DEFAULT_CONFIG = CalibrationDoctorConfig()
+_CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size")
+_PAIRS_OF = 4
+_MIN_TRAVEL_M = 0.02
+
+
+def diagnose(
+    episode: Episode,
+    frames: Mapping[str, np.ndarray],
+    kinematics: ArmKinematics | None,
+    config: CalibrationDoctorConfig = DEFAULT_CONFIG,
+) -> Diagnosis:
+    """Whether an episode's calibration is consistent and, if not, which usual mistake explains it.
+
+    Args:
+        frames: images by view, uint8 (n, H, W, 3) RGB or (n, h, w) grey; views without images are judged by poses.
+        kinematics: of the embodiment; None where unknown (tool poses must then be recorded).
+
+    Returns:
+        A diagnosis; verdict too_little_evidence where nothing can be compared.
+
+    Raises:
+        DataError: images or kinematics do not fit the episode.
+    """
+    observation = observe(episode, frames, kinematics)
+    recorded = read(observation, RecordedConventions())
+    if recorded is None or not episode.cameras:
+        missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
+        return _undecided(episode, f"The recording has no {missing}: nothing can be compared")
+    quick = _unsuspicious(observation, recorded, config) if config.search == "when_suspicious" else None
+    if quick is not None:
+        return Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
+    none = _explain(observation, recorded, config)
+    moves = float(np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max())
+    measures = view_measures(observation, recorded, config)
+    notes = notes_on(observation, recorded, measures, config)
+    singles = _singles(observation, recorded, none, config)
+    ranked = sorted([none, *singles], key=lambda e: -e.score)
+    best = ranked[0]
+    if not _healthy(best, config) and not _healthy(none, config):
+        pairs = _pairs(observation, ranked, config)
+        beating = [pair for pair in pairs if pair.score > best.score + config.min_margin]
+        ranked = sorted([*ranked, *beating], key=lambda e: -e.score)
+        best = ranked[0]
+    verdict, best = _decide(none, best, config)
+    if best.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
+        notes = (*notes, "The camera poses lead the states; they may follow the commands: give the kinematics to see")
+    if verdict == "consistent" and moves < _MIN_TRAVEL_M and not observable_views(observation, config):
+        verdict = "too_little_evidence"
+        notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
+    return Diagnosis(episode.episode_id, verdict, best, tuple(ranked), measures, notes)
+
+
+def diagnose_set(
+    source: str, diagnoses: Iterable[Diagnosis], config: CalibrationDoctorConfig = DEFAULT_CONFIG
+) -> SetDiagnosis:
+    """One diagnosis for episodes that were written the same way: scores of the same reading are summed.
+
+    Episodes in which a reading was not tried (it does not apply there) count as written. One episode speaks for or
+    against a reading by `max_gain` at most: a few broken recordings do not make a habit of their source. Numbers that
+    each episode estimates by itself (a tool offset) are taken together under their median. Pairs are left to single
+    episodes.
+
+    Args:
+        diagnoses: made with search "always", so that the readings can be compared.
+    """
+    listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
+    votes = Counter(d.best.mistake if d.verdict == "explained" else d.verdict for d in listed)
+    if not listed:
+        nothing = _undecided_explanation()
+        return SetDiagnosis(source, 0, "too_little_evidence", nothing, (nothing,), {}, ("No episode can be judged",))
+    total_none = sum(d.none.score for d in listed)
+    gains: dict[str, float] = defaultdict(float)
+    members: dict[str, list[Explanation]] = defaultdict(list)
+    for diagnosis in listed:
+        tried: dict[str, Explanation] = {}
+        for explanation in diagnosis.ranked:
+            key = _set_key(explanation)
+            if len(explanation.conventions.departures) == 1 and (
+                key not in tried or explanation.score > tried[key].score
+            ):
+                tried[key] = explanation
+        for key, explanation in tried.items():
+            gains[key] += float(np.clip(explanation.score - diagnosis.none.score, -config.max_gain, config.max_gain))
+            members[key].append(explanation)
+    ranked = [_summed([d.none for d in listed], total_none)]
+    ranked += [_summed(members[key], total_none + gain) for key, gain in gains.items()]
+    ranked.sort(key=lambda e: -e.score)
+    best, none = ranked[0], next(e for e in ranked if e.mistake == "none")
+    limit = config.min_margin + 0.5 * len(listed)
+    if best.mistake == "none" or best.score - none.score < limit:
+        unexplained = votes["unexplained"] > len(listed) / 2
+        verdict: VerdictName = "unexplained" if unexplained else "consistent"
+        best = none
+    else:
+        verdict = "explained"
+    notes = tuple(dict.fromkeys(note for d in listed for note in d.notes))
+    return SetDiagnosis(source, len(listed), verdict, best, tuple(ranked), dict(votes), notes)
+
+
+def _set_key(explanation: Explanation) -> str:
+    """Readings with the same key are the same over episodes."""
+    value = explanation.conventions.model_dump()
+    estimated = explanation.mistake in ("tool_offset_z_m",)
+    return explanation.mistake if estimated else f"{explanation.mistake}: {value.get(explanation.mistake)}"
+
+
+def _summed(members: list[Explanation], score: float) -> Explanation:
+    """The common reading of several episodes."""
+    evidence: dict[str, float] = defaultdict(float)
+    for member in members:
+        for name, value in member.evidence.items():
+            evidence[name] += value
+    by_conventions = Counter(member.conventions for member in members)
+    conventions = by_conventions.most_common(1)[0][0]
+    if members[0].mistake == "tool_offset_z_m":
+        median = float(np.median([member.conventions.tool_offset_z_m for member in members]))
+        conventions = conventions.model_copy(update={"tool_offset_z_m": round(median, 4)})
+        return Explanation(members[0].mistake, conventions, score, dict(evidence), conventions.config_lines())
+    lines = next(member.config_lines for member in members if member.conventions == conventions)
+    return Explanation(members[0].mistake, conventions, score, dict(evidence), lines)
+
+
+def _explain(
+    observation: Observation, reading: Reading, config: CalibrationDoctorConfig, terms: dict[str, float] | None = None
+) -> Explanation:
+    """A reading with its score."""
+    terms = _terms(observation, reading, config) if terms is None else terms
+    conventions = reading.conventions
+    cost = config.complexity * (len(conventions.departures) + (conventions.views is not None) / 2)
+    mistake = "+".join(conventions.departures) or "none"
+    return Explanation(mistake, conventions, float(sum(terms.values())) - cost, terms, conventions.config_lines())
+
+
+def _terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
+    return (
+        pose_terms(observation, reading, config)
+        | image_terms(observation, reading, config)
+        | gripper_terms(observation, reading, config)
+    )
+
+
+def _unsuspicious(observation: Observation, recorded: Reading, config: CalibrationDoctorConfig) -> Explanation | None:
+    """The recording as written where nothing speaks against it, from what is quick to compute; else None."""
+    poses = pose_terms(observation, recorded, config)
+    images = image_terms(observation, recorded, config, wrist_flow=False)
+    found = _explain(observation, recorded, config, poses | images)
+    if min(poses.values(), default=0.0) < config.suspicion or not _healthy(found, config):
+        return None
+    if inversion_gain(observation, recorded, config) > 0:
+        return None
+    score = sum(images.values())
+    for lag in image_lags(observation, config):
+        other = image_terms(observation, recorded.with_image_lag(lag), config, wrist_flow=False)
+        if sum(other.values()) > score:
+            return None
+    return found
+
+
+def _singles(
+    observation: Observation, recorded: Reading, none: Explanation, config: CalibrationDoctorConfig
+) -> list[Explanation]:
+    """Every usual mistake, one at a time."""
+    found = []
+    for conventions in conventions_to_try(observation, recorded, config):
+        reading = _read_or_none(observation, conventions)
+        if reading is not None:
+            found.append(_of_views(observation, reading, none, config))
+    lagging = (recorded.with_image_lag(lag) for lag in image_lags(observation, config))
+    return found + [_explain(observation, reading, config) for reading in lagging]
+
+
+def _read_or_none(observation: Observation, conventions: RecordedConventions) -> Reading | None:
+    try:
+        return read(observation, conventions)
+    except RejectedInputError:  # does not apply to this recording, or a lag leaves nothing of it
+        return None
+
+
+def _of_views(
+    observation: Observation, reading: Reading, none: Explanation, config: CalibrationDoctorConfig
+) -> Explanation:
+    """The mistake in those views which it improves: one camera of a rig may be written unlike the others."""
+    terms = _terms(observation, reading, config)
+    if reading.conventions.departures[0] not in _CAMERA_FIELDS:
+        return _explain(observation, reading, config, terms)
+    views = list(reading.cameras)
+    better = [view for view in views if _of_view(terms, view) > _of_view(none.evidence, view) + 1.0]
+    if not better or len(better) == len(views):
+        return _explain(observation, reading, config, terms)
+    others = [view for view in views if view not in better]
+    merged = {name: none.evidence[name] if _view_of(name, others) else value for name, value in terms.items()}
+    conventions = reading.conventions.model_copy(update={"views": tuple(better)})
+    partial = _read_or_none(observation, conventions)
+    return _explain(observation, reading if partial is None else partial, config, merged)
+
+
+def _of_view(terms: Mapping[str, float], view: str) -> float:
+    return sum(value for name, value in terms.items() if _view_of(name, [view]))
+
+
+def _view_of(name: str, views: list[str]) -> bool:
+    return any(name.endswith(f" {view}") for view in views)
+
+
+def _pairs(observation: Observation, ranked: list[Explanation], config: CalibrationDoctorConfig) -> list[Explanation]:
+    """Two mistakes at once, of those that explain most alone."""
+    first: dict[str, Explanation] = {}
+    for explanation in ranked:
+        if explanation.mistake != "none":
+            first.setdefault(explanation.mistake, explanation)
+    found = []
+    for one, two in combinations(list(first.values())[:_PAIRS_OF], 2):
+        changed = {field: getattr(two.conventions, field) for field in two.conventions.departures}
+        views = one.conventions.views if one.conventions.views == two.conventions.views else None
+        conventions = one.conventions.model_copy(update=changed | {"views": views})
+        reading = _read_or_none(observation, conventions)
+        if reading is not None:
+            found.append(_explain(observation, reading, config))
+    return found
+
+
+def _healthy(explanation: Explanation, config: CalibrationDoctorConfig) -> bool:
+    """Whether nothing measured is impossible for a good recording; noisy signs cannot veto."""
+    return not bad_terms(explanation, config)
+
+
+def bad_terms(explanation: Explanation, config: CalibrationDoctorConfig) -> dict[str, float]:
+    """The terms that no healthy recording has."""
+    limits = {
+        "flow": log_likelihood(config.min_flow, config.arm_flow),
+        "turn": turn_log_likelihood(config.max_flow_turn_deg, config),
+        "hand-eye": unrest_log_likelihood(config.max_hand_eye_m, 0.0, config),
+        **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
+    }
+    return {
+        name: value
+        for name, value in explanation.evidence.items()
+        if value < limits.get(name.split(" ")[0], config.min_term)
+    }
+
+
+def _decide(none: Explanation, best: Explanation, config: CalibrationDoctorConfig) -> tuple[VerdictName, Explanation]:
+    wins = best.mistake != "none" and best.score - none.score >= config.min_margin
+    if wins and _healthy(best, config):
+        return "explained", best
+    if _healthy(none, config):
+        return "consistent", none
+    return "unexplained", none
+
+
+def _undecided_explanation() -> Explanation:
+    return Explanation("none", RecordedConventions(), 0.0, {}, ())
+
+
+def _undecided(episode: Episode, note: str) -> Diagnosis:
+    nothing = _undecided_explanation()
+    return Diagnosis(episode.episode_id, "too_little_evidence", nothing, (nothing,), (), (note,))

@@ -1,0 +1,221 @@
+"""One strict YAML loader: safe, refuses duplicate keys, and names the file and dotted path of a mistake.
+
+The base of every configuration model.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from worldline_core.errors import ConfigError
+
+CONFIG_ROOT = Path(__file__).resolve().parents[2] / "configs"
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """SafeLoader that refuses a key given twice (plain YAML silently keeps the last one)."""
+
+
+def _construct_mapping(loader: _StrictLoader, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    seen: set[object] = set()
+    for key_node, _ in node.value:
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            continue
+        key = loader.construct_object(key_node, deep=True)
+        if key in seen:
+            raise ConfigError(
+                "A key is given twice",
+                where=f"{key_node.start_mark.name}, line {key_node.start_mark.line + 1}",
+                got=key,
+                next_step="keep one of the two",
+            )
+        seen.add(key)
+    return yaml.SafeLoader.construct_mapping(loader, node, deep=deep)
+
+
+_StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read one YAML mapping.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, repeats a key, or does not hold a mapping.
+    """
+    if not path.is_file():
+        raise ConfigError("No such configuration file", where=path, next_step="check the path, or use --preset NAME")
+    try:
+        with path.open(encoding="utf-8") as stream:
+            # _StrictLoader derives from SafeLoader: no object construction.
+            content = yaml.load(stream, Loader=_StrictLoader)  # noqa: S506
+    except yaml.YAMLError as error:
+        raise ConfigError("Not valid YAML", where=path, got=str(error)) from error
+    if not isinstance(content, dict):
+        raise ConfigError(
+            "A configuration file holds one mapping",
+            where=path,
+            expected="key: value lines",
+            got=type(content).__name__,
+        )
+    return content
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that ship with the project (files directly in ``configs/``)."""
+    return sorted(path.stem for path in CONFIG_ROOT.glob("*.yaml"))
+
+
+def preset_path(name: str) -> Path:
+    """The file of a preset.
+
+    Raises:
+        ConfigError: there is no preset of that name; the message lists those there are.
+    """
+    if name not in preset_names():
+        close = difflib.get_close_matches(name, preset_names(), n=1)
+        raise ConfigError(
+            "Unknown preset",
+            expected=f"one of {', '.join(preset_names())}",
+            got=name,
+            next_step=f"did you mean {close[0]!r}?" if close else "use --config FILE for a file of your own",
+        )
+    return CONFIG_ROOT / f"{name}.yaml"
+
+
+def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Apply ``a.b=value`` overrides (the value is read as YAML) to a copy of ``values``.
+
+    Raises:
+        ConfigError: an override is not of the form ``a.b=value``, or goes through something that is not a mapping.
+    """
+    result = _copy_mapping(values)
+    for override in overrides:
+        dotted, separator, text = override.partition("=")
+        keys = dotted.strip().split(".")
+        if not separator or not all(keys):
+            raise ConfigError("An override has the form a.b=value", got=override)
+        node: dict[str, Any] = result
+        for depth, key in enumerate(keys[:-1]):
+            child = node.setdefault(key, {})
+            if not isinstance(child, dict):
+                raise ConfigError(
+                    "An override goes through a value that is not a mapping",
+                    where=".".join(keys[: depth + 1]),
+                    got=override,
+                )
+            node = child
+        try:
+            node[keys[-1]] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError("The value of an override is not valid YAML", where=dotted, got=text) from error
+    return result
+
+
+def _copy_mapping(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: _copy_mapping(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+
+
+def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *, where: object) -> Model:
+    """Build ``model`` from ``values``; every mistake is reported with its dotted path.
+
+    Raises:
+        ConfigError: a key is unknown (the message suggests the nearest one), missing, or has a bad value.
+    """
+    try:
+        return model.model_validate(dict(values))
+    except ValidationError as error:
+        lines = []
+        problems = error.errors()
+        for problem in problems:
+            if problem["type"] == "too_short" and any(_inside(other["loc"], problem["loc"]) for other in problems):
+                continue  # it is short because of an item that is wrong itself
+            dotted = ".".join(str(part) for part in problem["loc"])
+            if problem["type"] == "extra_forbidden":
+                known = _known_keys(model, problem["loc"][:-1])
+                close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
+                hint = f"; did you mean {close[0]!r}?" if close else f"; known keys: {', '.join(known)}"
+                lines.append(f"{dotted}: unknown key{hint}")
+            else:
+                lines.append(f"{dotted}: {problem['msg']} (got {problem.get('input')!r})")
+        raise ConfigError("The configuration is not valid", where=where, got="\n    " + "\n    ".join(lines)) from error
+
+
+def _inside(location: Sequence[int | str], outer: Sequence[int | str]) -> bool:
+    return len(location) > len(outer) and tuple(location[: len(outer)]) == tuple(outer)
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
+    """The keys that a place in the configuration takes, through lists, mappings and unions."""
+    types: list[Any] = [model]
+    for part in location:
+        found: list[Any] = []
+        for current in types:
+            field = getattr(current, "model_fields", {}).get(part)
+            if field is not None:
+                found += _alternatives(field.annotation)
+            elif issubclass(get_origin(current) or object, list | tuple | Mapping):
+                found += [member for item in get_args(current) if item is not ... for member in _alternatives(item)]
+        # No field, no item: the tag that says which member of a union was meant.
+        types = found or [current for current in types if part in _tags(current)] or types
+    return sorted({key for current in types for key in getattr(current, "model_fields", {})})
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    """The members of a union, or what is annotated, by itself."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if isinstance(annotation, TypeAliasType):
+        return _alternatives(annotation.__value__)
+    if origin in (Union, UnionType):
+        return [member for item in get_args(annotation) for member in _alternatives(item)]
+    return [annotation]
+
+
+def _tags(model: Any) -> set[str]:
+    """What a model answers to in a union: its name, and the literals of its fields (`kind`)."""
+    fields = getattr(model, "model_fields", {}).values()
+    literals = {str(value) for f in fields if get_origin(f.annotation) is Literal for value in get_args(f.annotation)}
+    return literals | {getattr(model, "__name__", "")}
+
+
+def load_config[Model: BaseModel](
+    model: type[Model],
+    *,
+    preset: str | None = None,
+    path: Path | None = None,
+    overrides: Sequence[str] = (),
+    section: str | None = None,
+) -> Model:
+    """Load a preset or a file, apply overrides, and validate.
+
+    ``section`` picks one top-level mapping of the file (a single step's config out of a whole preset); overrides are
+    still written from the top (``train_stage2.steps=10``).
+
+    Raises:
+        ConfigError: anything that is not right with it.
+    """
+    if (preset is None) == (path is None):
+        raise ConfigError("Give either a preset or a configuration file", got=f"preset={preset}, config={path}")
+    source = preset_path(preset) if preset is not None else path
+    if source is None:
+        raise ConfigError("No configuration given")
+    values = apply_overrides(read_yaml(source), overrides)
+    if section is not None:
+        values = values.get(section) or {}
+        if not isinstance(values, Mapping):
+            raise ConfigError("A section is a mapping", where=f"{source}: {section}", got=type(values).__name__)
+    return validate(model, values, where=source if section is None else f"{source}: {section}")
+
+
+class StrictModel(BaseModel):
+    """Frozen; an unknown key is an error, never ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

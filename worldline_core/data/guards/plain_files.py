@@ -1,0 +1,242 @@
+"""JSON and JSON lines that are not to be trusted: bounded in size, no repeated keys, every fault named.
+
+NaN and infinities are read as what they are: recorders write them, and the checks of values say where they stand.
+
+NumPy arrays in .npy files that are not to be trusted: what the header declares must be what the file holds.
+
+Parquet tables that are not to be trusted: rows and bytes are bounded, and every fault is named.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tokenize
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.lib import format as npy
+
+from worldline_core.data.guards.limits import (
+    MAX_ARRAY_BYTES,
+    MAX_ROWS,
+    MAX_TABLE_BYTES,
+    MAX_TEXT_BYTES,
+    regular_file,
+    too_large,
+)
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath
+
+
+def read_json(path: AnyPath) -> Any:
+    """JSON of a file.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8, no JSON, a key given twice,
+        nested too deeply, a number of thousands of digits).
+    """
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str | bytes, where: object) -> Any:
+    """JSON of a text.
+
+    Raises: RejectedInputError (unreadable).
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_without_repetition)
+    except RecursionError as error:
+        raise RejectedInputError(
+            "unreadable",
+            "JSON is nested too deeply",
+            where=str(where),
+            expected="some levels",
+            got="more than Python's recursion limit",
+        ) from error
+    except ValueError as error:  # of the decoder, of UTF-8, of a key given twice, of a number with too many digits
+        raise RejectedInputError("unreadable", "File is not valid JSON", where=str(where), got=str(error)) from error
+
+
+def read_json_lines(path: AnyPath) -> Iterator[Any]:
+    """The values of a file with one JSON value a line; empty lines are skipped.
+
+    Raises: RejectedInputError as `read_json`, naming the line.
+    """
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        if line.strip():
+            yield parse_json(line, f"{path}, line {number}")
+
+
+def read_text(path: AnyPath) -> str:
+    """The text of a file.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8).
+    """
+    file = regular_file(path)
+    try:
+        size = file.stat().st_size
+        if size > MAX_TEXT_BYTES:
+            raise too_large("Text file is too large", where=str(path), limit=MAX_TEXT_BYTES, got=size, unit="bytes")
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RejectedInputError(
+            "unreadable", "File cannot be read as text", where=str(path), got=str(error)
+        ) from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        raise ValueError(f"the key {twice!r} is given twice")
+    return values
+
+
+@contextmanager
+def well_formed(where: object, layout: str) -> Iterator[None]:
+    """Around the reading of parsed content: what has another shape than its layout says is a fault of the file.
+
+    Raises: RejectedInputError (unreadable) for a missing key, another type, another length, a number out of range.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise RejectedInputError(
+            "unreadable",
+            "Content has another shape than its layout",
+            where=str(where),
+            expected=layout,
+            got=f"{type(error).__name__}: {error}",
+        ) from error
+
+
+def read_npy(path: AnyPath) -> np.ndarray:
+    """The array of a .npy file; never unpickles.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, of objects, or cut off).
+    """
+    file = regular_file(path)
+    try:
+        size = file.stat().st_size
+        with file.open("rb") as stream:
+            version = npy.read_magic(stream)
+            if version not in ((1, 0), (2, 0)):
+                raise ValueError(f"format version {version}")
+            read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            shape, fortran_order, dtype = read_header(stream)
+            if dtype.hasobject:
+                raise ValueError("an array of Python objects")
+            declared = math.prod(shape) * dtype.itemsize
+            if declared > MAX_ARRAY_BYTES:
+                raise too_large(
+                    "Array is too large", where=str(path), limit=MAX_ARRAY_BYTES, got=declared, unit="bytes"
+                )
+            if declared != size - stream.tell():
+                raise ValueError(f"{size - stream.tell()} bytes of data where the header declares {declared}")
+            values = np.frombuffer(stream.read(declared), dtype=dtype)
+            return values.reshape(shape, order="F" if fortran_order else "C").copy()
+    except (ValueError, TypeError, SyntaxError, EOFError, OSError, OverflowError, tokenize.TokenError) as error:
+        raise RejectedInputError("unreadable", "Array cannot be read", where=str(path), got=str(error)) from error
+
+
+# A dictionary of long texts unpacks to far more than the file says. No text is longer than its column chunk, so that
+# so many rows at a time are the largest surprise.
+_BATCH_BYTES = 256 << 20
+_BATCH_ROWS = (64, 65_536)
+_FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError, MemoryError)
+"""ArrowException covers ArrowInvalid, ArrowNotImplementedError and ArrowMemoryError of a header that asks for too much."""
+
+
+def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
+    """A Parquet file as a table.
+
+    Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), too_large, unreadable.
+    """
+    local = regular_file(path)
+    try:
+        # No memory map: where somebody shortens the file meanwhile, a map ends in a signal instead of an error.
+        with pq.ParquetFile(local, memory_map=False) as file:
+            names = file.schema_arrow.names
+            missing = [column for column in columns or () if column not in names]
+            if missing:
+                raise RejectedInputError(
+                    "missing_column",
+                    "Parquet file lacks a column",
+                    where=str(path),
+                    expected=", ".join(missing),
+                    got="columns " + ", ".join(names),
+                )
+            wanted = None if columns is None else list(columns)
+            _check_size(file, wanted, path)
+            return _read(file, wanted, path)
+    except _FAULTS as error:
+        raise RejectedInputError(
+            "unreadable", "Parquet file cannot be read", where=str(path), got=str(error)
+        ) from error
+
+
+def column_names(path: AnyPath) -> list[str]:
+    """Names of a Parquet file's columns, from its footer.
+
+    Raises: RejectedInputError: missing_file, special_file, unreadable.
+    """
+    local = regular_file(path)
+    try:
+        return list(pq.read_schema(local, memory_map=False).names)
+    except _FAULTS as error:
+        raise RejectedInputError(
+            "unreadable", "Parquet file cannot be read", where=str(path), got=str(error)
+        ) from error
+
+
+def _check_size(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> None:
+    """By the footer: 8 bytes a value, which is what Arrow takes for numbers."""
+    footer = file.metadata
+    if footer.num_rows > MAX_ROWS:
+        raise too_large("Table has too many rows", where=str(path), limit=MAX_ROWS, got=footer.num_rows, unit="rows")
+    values = sum(max(count, 0) for count, _ in _chunks(file, columns))
+    if 8 * values > MAX_TABLE_BYTES:
+        raise too_large(
+            "Table has too many values", where=str(path), limit=MAX_TABLE_BYTES, got=8 * values, unit="bytes"
+        )
+
+
+def _chunks(file: pq.ParquetFile, columns: list[str] | None) -> Iterator[tuple[int, int]]:
+    """(values, bytes once decompressed) of the column chunks, as the footer has them."""
+    footer = file.metadata
+    for group in range(footer.num_row_groups):
+        row_group = footer.row_group(group)
+        for number in range(row_group.num_columns):
+            column = row_group.column(number)
+            if columns is None or column.path_in_schema.split(".")[0] in columns:
+                yield column.num_values, column.total_uncompressed_size
+
+
+def _read(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> pa.Table:
+    fields = [field for field in file.schema_arrow if columns is None or field.name in columns]
+    if not any(_holds_text(field.type) for field in fields):
+        return file.read(columns=columns, use_threads=False)
+    batches, total = [], 0
+    longest = max((size for _, size in _chunks(file, columns)), default=1)
+    rows = min(max(_BATCH_BYTES // max(longest, 1), _BATCH_ROWS[0]), _BATCH_ROWS[1])
+    for batch in file.iter_batches(rows, columns=columns, use_threads=False):
+        total += batch.nbytes
+        if total > MAX_TABLE_BYTES:
+            raise too_large("Table is too large", where=str(path), limit=MAX_TABLE_BYTES, got=total, unit="bytes")
+        batches.append(batch)
+    schema = file.schema_arrow
+    if columns is not None:
+        schema = pa.schema([schema.field(name) for name in columns], metadata=schema.metadata)
+    return pa.Table.from_batches([batch.select(schema.names) for batch in batches], schema)
+
+
+def _holds_text(kind: pa.DataType) -> bool:
+    if pa.types.is_nested(kind):
+        return any(_holds_text(kind.field(number).type) for number in range(kind.num_fields))
+    text = (pa.types.is_string, pa.types.is_binary, pa.types.is_large_string, pa.types.is_large_binary)
+    return any(is_kind(kind) for is_kind in text)

@@ -1,0 +1,210 @@
+"""meta/info.json of a LeRobot dataset, checked once so that readers may rely on it.
+
+The list of a LeRobot dataset's episodes, kept as columns: 10^6 episodes are 10^6 rows of Arrow, not of Python objects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.json
+
+from worldline_core.data.guards.limits import MAX_TEXT_BYTES, regular_file, too_large
+from worldline_core.data.guards.plain_files import column_names, read_json, read_table
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, note_file
+from worldline_core.errors import DataError
+
+
+def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> dict[str, Any]:
+    """The mapping, of the wanted version, with `fps`, `features` and `keys`.
+
+    Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
+    """
+    where = f"{root}, meta/info.json"
+    info = read_json(root / "meta" / "info.json")
+    if not isinstance(info, dict):
+        raise DataError("meta/info.json holds no mapping", where=str(root), got=type(info).__name__)
+    found = str(info.get("codebase_version"))
+    if found != version:
+        raise DataError("Dataset has another version", where=str(root), expected=version, got=found)
+    missing = [key for key in ("fps", "features", *keys) if key not in info]
+    if missing:
+        raise DataError("meta/info.json lacks a key", where=str(root), expected=", ".join(missing), got=", ".join(info))
+    fps = info["fps"]
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not (math.isfinite(fps) and 0 < fps <= 10_000):
+        raise DataError("Frame rate is no rate", where=where, expected="a number of frames a second", got=repr(fps))
+    features = info["features"]
+    if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
+        raise DataError("Features are no mapping of mappings", where=where, got=str(features)[:200])
+    for key in ("data_path", "video_path"):
+        if key in info and not isinstance(info[key], str | None):
+            raise DataError("Path template is no text", where=f"{where}, {key}", got=repr(info[key])[:200])
+    size = info.get("chunks_size", 1000)
+    if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+        raise DataError("Chunk size is no count", where=where, expected="a whole number from 1 on", got=repr(size))
+    return info
+
+
+class DescribedDataset:
+    """What `info.json` says of a dataset, whatever its version.
+
+    Attributes:
+        info: its content, checked by `read_info`.
+    """
+
+    info: dict[str, Any]
+
+    @property
+    def fps(self) -> float:
+        return float(self.info["fps"])
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        return self.info["features"]
+
+    @property
+    def video_keys(self) -> list[str]:
+        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
+
+
+INDEX = "episode_index"
+MAX_INDEX = 10**12
+_BLOCK_BYTES = 16 << 20
+
+
+class EpisodeTable:
+    """Rows by `episode_index`, made into a dict when asked for.
+
+    Args:
+        table: with a column `episode_index`; order and gaps do not matter.
+        where: named in messages. files: that the table was read from; every row is noted as read from them.
+
+    Raises: DataError when `episode_index` is not a column of whole numbers.
+    """
+
+    def __init__(self, table: pa.Table, where: object, files: Sequence[AnyPath] = ()) -> None:
+        self._where = str(where)
+        self._files = tuple(files)
+        if INDEX not in table.column_names:
+            raise DataError(
+                "Episode list lacks a column",
+                where=self._where,
+                expected=INDEX,
+                got=", ".join(table.column_names) or "none",
+            )
+        column = table[INDEX]
+        if not pa.types.is_integer(column.type) or column.null_count:
+            raise DataError(
+                "Episode list has rows without a number",
+                where=self._where,
+                expected=f"{INDEX}: a whole number in each row",
+                got=f"{column.type} with {column.null_count} empty rows",
+            )
+        numbers = column.to_numpy()
+        if len(numbers) and (numbers.min() < 0 or numbers.max() > MAX_INDEX):
+            raise DataError(
+                "Episode list numbers episodes out of range",
+                where=self._where,
+                expected=f"0..{MAX_INDEX}",
+                got=f"{numbers.min()}..{numbers.max()}",
+            )
+        order = np.argsort(numbers, kind="stable")
+        self.indices: np.ndarray = numbers[order].astype(np.int64)
+        in_order = bool((order[1:] > order[:-1]).all())
+        # One piece a column: looking up a row among a hundred pieces takes a millisecond.
+        self._table = (table if in_order else table.take(pa.array(order))).combine_chunks()
+
+    @classmethod
+    def from_parquet(cls, files: Sequence[AnyPath], where: object) -> EpisodeTable:
+        """From LeRobot v3's meta/episodes; the statistics (`stats/*`) are left out.
+
+        Raises: DataError when a file is unreadable or the files differ in their columns.
+        """
+        tables = []
+        for file in files:
+            wanted = [name for name in column_names(file) if not name.startswith("stats/")]
+            tables.append(read_table(file, wanted))
+        try:
+            return cls(pa.concat_tables(tables, promote_options="default"), where, files)
+        except pa.ArrowException as error:
+            raise DataError("Files of the episode list differ", where=str(where), got=str(error)) from error
+
+    @classmethod
+    def from_json_lines(cls, path: AnyPath) -> EpisodeTable:
+        """From LeRobot v2.1's meta/episodes.jsonl; of each line `episode_index` and `length`.
+
+        Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
+        """
+        file = regular_file(path)
+        size = file.stat().st_size
+        if size > MAX_TEXT_BYTES:
+            raise too_large("Episode list is too large", where=str(path), limit=MAX_TEXT_BYTES, got=size, unit="bytes")
+        schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
+        try:
+            table = pyarrow.json.read_json(
+                str(file),
+                read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
+                parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
+            )
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise RejectedInputError("unreadable", "File is not JSON lines", where=str(path), got=str(error)) from error
+        return cls(table, path, [path])
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def row(self, episode_index: int) -> dict[str, Any]:
+        """One episode's row.
+
+        Raises: DataError when it is not listed; RejectedInputError (duplicate_id) when it is listed twice, since which row
+            is meant cannot be told.
+        """
+        for file in self._files:
+            note_file(file)
+        first, last = (int(np.searchsorted(self.indices, episode_index, side)) for side in ("left", "right"))
+        if first == last:
+            raise DataError(
+                "No such episode",
+                where=self._where,
+                expected=f"one of {len(self)} episodes, {self._range()}",
+                got=str(episode_index),
+            )
+        if last - first > 1:
+            raise RejectedInputError(
+                "duplicate_id",
+                "Episode is listed more than once",
+                where=self._where,
+                expected="one row an episode",
+                got=f"{last - first} rows of {INDEX} {episode_index}",
+                evidence={"rows": last - first, INDEX: int(episode_index)},
+            )
+        return self._table.slice(first, 1).to_pylist()[0]
+
+    def _range(self) -> str:
+        return f"{self.indices[0]}..{self.indices[-1]}" if len(self) else "none"
+
+
+def whole_number(row: dict[str, Any], key: str, where: object) -> int:
+    """A count or a place out of a row of metadata.
+
+    Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
+    """
+    if key not in row:
+        raise RejectedInputError(
+            "missing_column", "Episode list lacks a column", where=str(where), expected=key, got=", ".join(row)
+        )
+    value = row[key]
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_INDEX:
+        raise RejectedInputError(
+            "unreadable",
+            "Episode list holds no usable number",
+            where=f"{where}, {key}",
+            expected="a whole number from 0 on",
+            got=repr(value),
+        )
+    return value

@@ -1,0 +1,304 @@
+"""One episode of an MCAP recording: its topics read, checked, and brought to the instants of a fixed rate."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.recorded_poses import repair_notes
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap import resampling
+from worldline_core.data.mcap.cameras import camera_tracks, read_calibration
+from worldline_core.data.mcap.episodes import Segment
+from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.mcap.images import ImageTrack, spoiled_frames
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind
+from worldline_core.data.mcap.resampling import Arrivals, TimeError, check_gaps, in_order
+from worldline_core.data.mcap.robot import RobotSignals, read_robot
+from worldline_core.data.mcap.streams import READING_MARGIN_NS, Stream, Timing, read_streams
+from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig, ViewTopics
+from worldline_core.data.mcap.transforms import TransformTree, read_tree
+from worldline_core.data.sources.source import LoadedEpisode, no_masks
+
+LAYOUT = "mcap topics"
+_KINDS: dict[str, tuple[Kind, ...]] = {
+    "images": IMAGE_KINDS,
+    "calibrations": ("calibration",),
+    "readings": ("joints", "numbers"),
+    "tool poses": ("pose",),
+    "transforms": ("transforms",),
+}
+_TOGETHER_NS = 1_000_000
+"""Topics that begin within a millisecond begin together: no image is left out for that."""
+
+
+def read_episode(
+    config: McapTopicsSourceConfig, file: McapFile, segment: Segment, episode_id: str, scene: str
+) -> LoadedEpisode:
+    """The episode; its images stay in the file until they are asked for.
+
+    Raises: RejectedInputError with the reason.
+    """
+    start_log, stop_log = segment.log_times(file)
+    streams = _streams(config, file, start_log, stop_log)
+    reference = config.arms[0].state.joints.topic
+    timing = Timing.of(streams, config.time, config.time_offsets_ms, config.max_clock_skew_ms, reference, file.shown)
+    robot = read_robot(config, streams, timing, file.shown)
+    images = {
+        view: in_order(
+            timing.times_ns(streams[topics.image]), f"{file.shown}, topic {topics.image}", config.max_disorder_s
+        )
+        for view, topics in config.views.items()
+    }
+    calibrations = {view: read_calibration(file, streams, topics) for view, topics in config.views.items()}
+    frames = {
+        view: (config.views[view].frame or calibration.frame or streams[config.views[view].image].frame).lstrip("/")
+        for view, calibration in calibrations.items()
+        if calibration is not None
+    }
+    tree = read_tree(config, file, streams, timing, start_log, [*frames.values(), *robot.frames])
+    clock = timing.to_clock_ns
+    extent = (
+        None if start_log is None else start_log - clock,
+        None if stop_log is None else stop_log - clock,
+    )
+    moving = [
+        times for frame in (*frames.values(), *robot.frames) for times in tree.moving_times(config.base_frame, frame)
+    ]
+    grid = _grid(config, file, images, robot, moving, extent)
+    chosen = {view: _chosen_images(config, file, view, arrivals, grid) for view, arrivals in images.items()}
+    cameras, recorded, lenses = camera_tracks(config, tree, calibrations, frames, grid, file)
+    state, action, outside = robot.vectors(grid)
+    tools = robot.tools(tree, config.base_frame, grid)
+    errors = {f"image {view}": TimeError.of(arrivals.times_ns, grid) for view, arrivals in images.items()}
+    errors |= robot.time_errors(grid)
+    if moving:
+        errors |= {"transforms": max((TimeError.of(times, grid) for times in moving), key=lambda error: error.max_ms)}
+    episode = Episode(
+        episode_id=episode_id,
+        source=config.label,
+        embodiment=config.embodiment,
+        scene=scene,
+        task_family=config.task_family,
+        instruction=(segment.instruction if segment.instruction is not None else config.instruction).strip(),
+        outcome=segment.outcome or config.outcome,
+        split=config.split,
+        fps=config.fps,
+        state=state.astype(np.float32),
+        action=action.astype(np.float32),
+        timestamps=(grid - grid[0]) / 1e9,
+        cameras=cameras,
+        T_base_ee=tools,
+        gripper=None if tools is None else state[:, robot.gripper_columns],
+        primary_view=config.timing_view,
+        state_names=robot.state_names,
+        conventions={
+            "layout": LAYOUT,
+            **timing.notes(),
+            **_resampling_notes(errors),
+            "interpolation_error_rad": round(robot.prediction_error_rad(), 9),
+            **_message_notes([*images.values(), *robot.arrivals()], tree),
+            "repeated_images": sum(int(len(numbers) - len(np.unique(numbers))) for numbers in chosen.values()),
+            "gripper_overshoot": outside,
+            "action": "commanded" if robot.commanded else "repeats the state: no commands are recorded",
+            **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+        },
+    )
+    around = (
+        None if start_log is None else max(start_log - READING_MARGIN_NS, 0),
+        None if stop_log is None else stop_log + READING_MARGIN_NS,
+    )
+    tracks = {
+        view: _track(streams[topics.image], images[view], chosen[view], around, file)
+        for view, topics in config.views.items()
+    }
+    reader = _ImageReader(file, tracks, cameras, config.views)
+    return LoadedEpisode(
+        episode, tuple(config.views), lambda view: np.stack(list(reader(view))), no_masks, lenses, images=reader
+    )
+
+
+def _streams(
+    config: McapTopicsSourceConfig, file: McapFile, start_log: int | None, stop_log: int | None
+) -> dict[str, Stream]:
+    """Every topic that the episode needs; transforms are optional here, who needs one will miss it.
+
+    Raises: RejectedInputError: missing_topic for one that is not in the file, or silent during the episode.
+    """
+    topics = config.topics
+    roles: dict[str, tuple[Kind, ...]] = {
+        topic: kinds for role, kinds in _KINDS.items() if role != "transforms" for topic in sorted(topics[role])
+    }
+    file.check_topics(roles)
+    needed = set(roles) - topics["calibrations"]
+    roles |= {topic: _KINDS["transforms"] for topic in config.transforms if topic in file.topics}
+    streams = read_streams(file, roles, start_log, stop_log)
+    silent = sorted(needed - set(streams))
+    if silent:
+        raise RejectedInputError(
+            "missing_topic",
+            "A topic has no messages during the episode",
+            where=file.shown,
+            expected=", ".join(silent),
+            got=", ".join(f"{topic}: {len(stream.log_ns)}" for topic, stream in sorted(streams.items()))
+            or "no messages",
+            evidence={"missing": silent},
+        )
+    return streams
+
+
+def _grid(
+    config: McapTopicsSourceConfig,
+    file: McapFile,
+    images: Mapping[str, Arrivals],
+    robot: RobotSignals,
+    moving: list[np.ndarray],
+    extent: tuple[int | None, int | None],
+) -> np.ndarray:
+    """(t,) instants [ns]: from the first image of the primary view that all topics have begun by, to where one ends.
+
+    Raises: RejectedInputError: time_gap for a topic that is silent for too long, too_short.
+    """
+    named = {f"topic {config.views[view].image}": arrivals.times_ns for view, arrivals in images.items()}
+    named |= {f"topic {signal.topic}": signal.times_ns for signal in robot.signals()}
+    start = min(times[0] for times in named.values()) if extent[0] is None else extent[0]
+    stop = max(times[-1] for times in named.values()) if extent[1] is None else extent[1]
+    of_images = {f"topic {topics.image}" for topics in config.views.values()}
+    for name, times in named.items():
+        # What may be missing between two images is decided by how far instants are from the nearest one.
+        max_gap = float("inf") if name in of_images else config.max_gap_s
+        check_gaps(times, int(start), int(stop), max_gap, config.max_trim_s, f"{file.shown}, {name}")
+    everything = [*named.values(), *moving]
+    first = max(int(start), *(int(times[0]) for times in everything))
+    last = min(int(stop), *(int(times[-1]) for times in everything))
+    primary = images[config.timing_view].times_ns
+    begin = int(np.searchsorted(primary, first - _TOGETHER_NS))
+    grid = resampling.instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
+    if len(grid) < 2:
+        raise RejectedInputError(
+            "too_short",
+            "Topics overlap for less than two frames",
+            where=file.shown,
+            expected=f"at least {1 / config.fps:.3f} s",
+            got=f"{max(last - first, 0) / 1e9:.3f} s",
+            next_step="if the topics' clocks differ, set time: log or time_offsets_ms",
+            evidence={"frames": len(grid)},
+        )
+    return grid
+
+
+def _chosen_images(
+    config: McapTopicsSourceConfig, file: McapFile, view: str, arrivals: Arrivals, grid: np.ndarray
+) -> np.ndarray:
+    """(t,) the nearest image of each instant.
+
+    Raises: RejectedInputError: wrong_fps for a camera that is slower than the wanted rate, time_gap where images are missing.
+    """
+    where = f"{file.shown}, topic {config.views[view].image}"
+    if arrivals.median_step_ns * config.fps > 1.25e9:
+        raise RejectedInputError(
+            "wrong_fps",
+            "Camera is slower than the wanted rate",
+            where=where,
+            expected=f"{config.fps} fps",
+            got=f"{1e9 / arrivals.median_step_ns:.2f} fps",
+            next_step="lower the source's fps",
+            evidence={"wanted_fps": config.fps, "measured_fps": float(1e9 / arrivals.median_step_ns)},
+        )
+    chosen = resampling.nearest(arrivals.times_ns, grid)
+    distance = np.abs(arrivals.times_ns[chosen] - grid) * config.fps / 1e9
+    if distance.max() > config.max_image_distance_frames:
+        worst = int(np.argmax(distance))
+        raise RejectedInputError(
+            "time_gap",
+            "Images are missing",
+            where=where,
+            expected=f"an image within {config.max_image_distance_frames} frames of every instant",
+            got=f"{distance.max():.2f} frames at {(grid[worst] - grid[0]) / 1e9:.3f} s",
+            evidence={
+                "view": view,
+                "gap_s": float(2 * distance.max() / config.fps),
+                "at_s": float((grid[worst] - grid[0]) / 1e9),
+                "instants_without": int(np.count_nonzero(distance > config.max_image_distance_frames)),
+            },
+        )
+    return chosen
+
+
+def _track(
+    stream: Stream, arrivals: Arrivals, chosen: np.ndarray, around: tuple[int | None, int | None], file: McapFile
+) -> ImageTrack:
+    """Raises: RejectedInputError (truncated_video) for frames of a video that a lost message spoils."""
+    keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
+    if keys is not None:
+        spoiled = spoiled_frames(arrivals.times_ns, arrivals.median_step_ns, keys)[chosen]
+        if spoiled.any():
+            first = int(np.argmax(spoiled))
+            raise RejectedInputError(
+                "truncated_video",
+                "Video frames depend on a message that is missing",
+                where=f"{file.shown}, topic {stream.topic}, frame {first}",
+                expected=f"a message every {arrivals.median_step_ns / 1e6:.1f} ms between key frames",
+                got=f"{int(spoiled.sum())} of {len(chosen)} frames after a gap, before the next key frame",
+                next_step="cut the recording at the gap",
+                evidence={"first_frame": first, "frames": int(spoiled.sum())},
+            )
+    return ImageTrack(stream.topic, stream.kind, *around, arrivals.order, chosen, keys)
+
+
+@dataclass(frozen=True)
+class _ImageReader:
+    """view -> its frames, one after the other."""
+
+    file: McapFile
+    tracks: Mapping[str, ImageTrack]
+    cameras: Mapping[str, CameraTrack]
+    views: Mapping[str, ViewTopics]
+
+    def __call__(self, view: str) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB.
+
+        Raises: RejectedInputError (missing_calibration) when the images are not of the size that is calibrated.
+        """
+        camera = self.cameras.get(view)
+        for image in self.tracks[view].frames(self.file):
+            if camera is not None and image.shape[:2] != (camera.height, camera.width):
+                raise RejectedInputError(
+                    "missing_calibration",
+                    "Calibration is of another image size",
+                    where=f"{self.file.shown}, topic {self.views[view].calibration}",
+                    expected=f"{image.shape[1]}x{image.shape[0]}",
+                    got=f"{camera.width}x{camera.height}",
+                    evidence={
+                        "view": view,
+                        "calibrated": [camera.height, camera.width],
+                        "images": list(image.shape[:2]),
+                    },
+                )
+            yield image
+
+
+def _resampling_notes(errors: Mapping[str, TimeError]) -> dict[str, str | float | int]:
+    return {
+        "resampling_max_ms": round(max(error.max_ms for error in errors.values()), 6),
+        "resampling_mean_ms": round(float(np.mean([error.mean_ms for error in errors.values()])), 6),
+        "resampling": json.dumps(
+            {
+                name: {"max_ms": round(error.max_ms, 6), "mean_ms": round(error.mean_ms, 6)}
+                for name, error in errors.items()
+            },
+            sort_keys=True,
+        ),
+    }
+
+
+def _message_notes(arrivals: list[Arrivals], tree: TransformTree) -> dict[str, str | float | int]:
+    return {
+        "messages_out_of_order": sum(each.disordered for each in arrivals) + tree.disordered,
+        "messages_repeated": sum(each.repeated for each in arrivals),
+        "messages_lost": sum(each.lost for each in arrivals),
+    }

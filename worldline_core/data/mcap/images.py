@@ -1,0 +1,230 @@
+"""Images of a topic: read from the file in order of time, each decoded only when an instant needs it.
+
+Memory holds the images that lie out of order in the file, and one decoded image; never all of an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import av
+import av.error
+import cv2
+import numpy as np
+from av.video.codeccontext import VideoCodecContext
+
+from worldline_core.data.guards.images import decode_image
+from worldline_core.data.guards.limits import check_image_size
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.mcap.messages import EncodedImage, Kind, RawImage
+
+_CODECS = {"h264": "h264", "h265": "hevc"}
+# ROS and Foxglove name -> bytes a pixel, and how OpenCV turns it into RGB.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+}
+
+
+@dataclass(frozen=True)
+class ImageTrack:
+    """Which images of a topic are which frames of an episode.
+
+    Attributes:
+        start_ns, stop_ns: log times within which the topic's messages were counted; None: the whole file.
+        order: (n,) which message, counted as they lie in the file, is the i-th in time.
+        chosen: (t,) which image, counted in time, is each frame; ascending, an image may repeat.
+        key_frames: of a video, (n,) in order of time, whether decoding can begin there.
+    """
+
+    topic: str
+    kind: Kind
+    start_ns: int | None
+    stop_ns: int | None
+    order: np.ndarray
+    chosen: np.ndarray
+    key_frames: np.ndarray | None = None
+
+    def frames(self, file: McapFile) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB of each frame, in order.
+
+        Raises: RejectedInputError: unreadable, truncated_video, too_large.
+        """
+        where = f"{file.shown}, topic {self.topic}"
+        decoded = self._video(file, where) if self.kind == "video" else self._images(file, where)
+        number, image = next(decoded)
+        shape = image.shape
+        for wanted in self.chosen:
+            while number < wanted:
+                number, image = next(decoded)
+            if image.shape != shape:
+                raise RejectedInputError(
+                    "unreadable",
+                    "Images of a topic differ in size",
+                    where=where,
+                    expected=f"{shape[1]}x{shape[0]}",
+                    got=f"{image.shape[1]}x{image.shape[0]}",
+                )
+            yield image
+
+    def _images(self, file: McapFile, where: str) -> Iterator[tuple[int, np.ndarray]]:
+        for number, value in self._in_time(file, np.unique(self.chosen)):
+            place = f"{where}, image {number}"
+            yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else decode_image(value.data, place)
+
+    def _video(self, file: McapFile, where: str) -> Iterator[tuple[int, np.ndarray]]:
+        """Frames from the last key frame before the first chosen one on."""
+        keys = (
+            np.flatnonzero(self.key_frames[: self.chosen[0] + 1]) if self.key_frames is not None else np.zeros(0, int)
+        )
+        if len(keys) == 0:
+            raise RejectedInputError(
+                "truncated_video",
+                "No key frame comes before the first frame of the episode",
+                where=where,
+                next_step="begin the episode later",
+                evidence={"first_frame": int(self.chosen[0])},
+            )
+        numbers = np.arange(keys[-1], self.chosen[-1] + 1)
+        expected = iter(numbers)
+        for number, image in _decoded(self._in_time(file, numbers), where):
+            if number != next(expected, None):
+                raise _lost_frame(where, number)
+            yield number, image
+        if next(expected, None) is not None:
+            raise _lost_frame(where, None)
+
+    def _in_time(self, file: McapFile, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
+        """(place in time, what the message says) for these places, ascending."""
+        place = {int(message): number for number, message in enumerate(self.order)}
+        waiting: dict[int, Any] = {}
+        wanted = [int(number) for number in numbers]
+        needed, done = set(wanted), 0
+        counted = file.messages([self.topic], self.start_ns, self.stop_ns)
+        for message, received in enumerate(counted):
+            number = place.get(message, -1)
+            if number in needed:
+                waiting[number] = received.message.value
+            while done < len(wanted) and wanted[done] in waiting:
+                yield wanted[done], waiting.pop(wanted[done])
+                done += 1
+            if done == len(wanted):
+                return
+        raise RejectedInputError(
+            "changed_while_reading",
+            "File holds fewer images than when it was first read",
+            where=f"{file.shown}, topic {self.topic}",
+            expected=len(wanted),
+            got=done,
+        )
+
+
+def is_key_frame(image: EncodedImage) -> bool:
+    """Whether decoding can begin with this video message: an IDR picture (H.264), or any random access point (H.265).
+
+    Looks at the first picture's NAL unit only; parameter sets before it do not count (ITU-T H.264 and H.265, 7.4).
+    """
+    data, position = image.data, 0
+    while (position := data.find(b"\x00\x00\x01", position)) >= 0 and position + 3 < len(data):
+        header = data[position + 3]
+        if image.format == "h265":
+            kind = (header >> 1) & 0x3F
+            if kind < 32:
+                return 16 <= kind <= 23
+        else:
+            kind = header & 0x1F
+            if 1 <= kind <= 5:
+                return kind == 5
+        position += 3
+    return False
+
+
+def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
+    """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
+
+    A decoder conceals the loss of a message without a word and shows something else until the next key frame, so the loss
+    is told from the times.
+    """
+    lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
+    last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
+    last_key = np.maximum.accumulate(np.where(key_frames, np.arange(len(lost)), -1))
+    return last_loss > last_key
+
+
+def _decoded(messages: Iterator[tuple[int, EncodedImage]], where: str) -> Iterator[tuple[int, np.ndarray]]:
+    """(place in time, RGB) of video messages, each one frame in Annex B.
+
+    Raises: RejectedInputError: unknown_schema for another codec, truncated_video for data that does not decode.
+    """
+    decoder: VideoCodecContext | None = None
+    try:
+        for number, image in messages:
+            if decoder is None:
+                if image.format not in _CODECS:
+                    raise RejectedInputError(
+                        "unknown_schema",
+                        "Video codec is not supported",
+                        where=where,
+                        expected=" or ".join(_CODECS),
+                        got=repr(image.format),
+                    )
+                decoder = cast("VideoCodecContext", VideoCodecContext.create(_CODECS[image.format], "r"))
+                decoder.thread_type = "NONE"
+            packet = av.Packet(image.data)
+            packet.pts = packet.dts = number
+            for frame in decoder.decode(packet):
+                yield _picture(frame, where)
+        for frame in decoder.decode(None) if decoder is not None else ():
+            yield _picture(frame, where)
+    except av.error.FFmpegError as error:
+        raise RejectedInputError(
+            "truncated_video", "Video cannot be decoded", where=where, got=str(error), evidence={"error": str(error)}
+        ) from error
+
+
+def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
+    check_image_size(frame.width, frame.height, where)
+    if frame.is_corrupt or frame.pts is None:
+        raise _lost_frame(where, frame.pts)
+    return int(frame.pts), frame.to_ndarray(format="rgb24")
+
+
+def _lost_frame(where: str, number: int | None) -> RejectedInputError:
+    return RejectedInputError(
+        "truncated_video",
+        "Video frames are missing or damaged",
+        where=where if number is None else f"{where}, frame {number}",
+        expected="one frame a message, each decodable from those before it",
+        next_step="cut the recording at the damage",
+        evidence={"frame": number},
+    )
+
+
+def _raw_pixels(image: RawImage, where: str) -> np.ndarray:
+    if image.encoding not in _ENCODINGS:
+        raise RejectedInputError(
+            "unreadable",
+            "Pixel encoding is not supported",
+            where=where,
+            expected=", ".join(_ENCODINGS),
+            got=repr(image.encoding),
+        )
+    channels, conversion = _ENCODINGS[image.encoding]
+    check_image_size(image.width, image.height, where)
+    if image.step < image.width * channels or len(image.data) != image.step * image.height:
+        raise RejectedInputError(
+            "unreadable",
+            "Image has another number of bytes than it states",
+            where=where,
+            expected=f"{image.height} rows of {image.step} bytes, at least {image.width * channels} each",
+            got=f"{len(image.data)} bytes",
+        )
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    pixels = rows[:, : image.width * channels].reshape(image.height, image.width, channels)
+    return np.ascontiguousarray(pixels) if conversion is None else cv2.cvtColor(pixels, conversion)

@@ -1,0 +1,350 @@
+"""What messages of ROS 2 and Foxglove schemas say, whatever they are encoded in (CDR, protobuf, JSON).
+
+Messages decoded by the schemas that the file itself holds.
+
+Fields of decoded messages, be they objects (ROS 2, protobuf) or mappings (JSON), as this project's messages.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from google.protobuf.message import DecodeError
+from mcap.exceptions import McapError
+from mcap.records import Channel, Schema
+from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
+from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
+
+from worldline_core.data.guards.plain_files import parse_json
+from worldline_core.data.guards.rejection import RejectedInputError
+
+Kind = Literal["image", "video", "raw_image", "calibration", "joints", "numbers", "transforms", "pose", "marker"]
+IMAGE_KINDS: tuple[Kind, ...] = ("image", "video", "raw_image")
+
+SCHEMA_KINDS: dict[str, Kind] = {
+    "sensor_msgs/CompressedImage": "image",
+    "sensor_msgs/Image": "raw_image",
+    "sensor_msgs/CameraInfo": "calibration",
+    "sensor_msgs/JointState": "joints",
+    "tf2_msgs/TFMessage": "transforms",
+    "geometry_msgs/TransformStamped": "transforms",
+    "geometry_msgs/PoseStamped": "pose",
+    "std_msgs/Float64MultiArray": "numbers",
+    "std_msgs/Float32MultiArray": "numbers",
+    "std_msgs/Float64": "numbers",
+    "std_msgs/Float32": "numbers",
+    "std_msgs/String": "marker",
+    "std_msgs/Bool": "marker",
+    "foxglove.CompressedImage": "image",
+    "foxglove.CompressedVideo": "video",
+    "foxglove.RawImage": "raw_image",
+    "foxglove.CameraCalibration": "calibration",
+    "foxglove.FrameTransform": "transforms",
+    "foxglove.FrameTransforms": "transforms",
+    "foxglove.PoseInFrame": "pose",
+    "foxglove.JointStates": "joints",
+    "worldline.JointStates": "joints",
+}
+"""Schema, without `/msg`, of every message that is understood; Foxglove's may also come as `foxglove_msgs`."""
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedImage:
+    """A JPEG or PNG image, or one frame of a video in Annex B; `format` as the message states it."""
+
+    frame: str
+    data: bytes
+    format: str
+
+
+@dataclass(frozen=True, slots=True)
+class RawImage:
+    """Uncompressed pixels, row after row of `step` bytes."""
+
+    frame: str
+    data: bytes
+    encoding: str
+    width: int
+    height: int
+    step: int
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """K and P row by row, the lens, binning and region of interest (x, y, width, height; zeros: the whole image)."""
+
+    frame: str
+    width: int
+    height: int
+    model: str
+    D: tuple[float, ...]
+    K: tuple[float, ...]
+    P: tuple[float, ...]
+    binning: tuple[int, int] = (0, 0)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Joints:
+    """Readings by joint; a field that a message leaves empty is empty here."""
+
+    names: tuple[str, ...]
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    effort: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Pose of `child` in `parent` [m], quaternion xyzw; the time is its own."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    values: tuple[float, ...]
+    """x, y, z, qx, qy, qz, qw."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """x, y, z [m], qx, qy, qz, qw in `frame`."""
+
+    frame: str
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message: the time that it states itself (None: its schema has no place for one) and what it says."""
+
+    stamp_ns: int | None
+    value: Any
+
+
+def schema_name(name: str) -> str:
+    """`sensor_msgs/msg/Image` and `foxglove_msgs/msg/RawImage` as `SCHEMA_KINDS` lists them."""
+    short = name.replace("/msg/", "/")
+    return short.replace("foxglove_msgs/", "foxglove.")
+
+
+def _get(raw: Any, *names: str) -> Any:
+    """The first of these fields that the message has, be it an object or a JSON mapping."""
+    for name in names:
+        if isinstance(raw, Mapping):
+            if name in raw:
+                return raw[name]
+        elif hasattr(raw, name):
+            return getattr(raw, name)
+    raise KeyError(" or ".join(names))
+
+
+def _has(raw: Any, name: str) -> bool:
+    return name in raw if isinstance(raw, Mapping) else hasattr(raw, name)
+
+
+def _is_set(raw: Any, name: str) -> bool:
+    """Whether an optional field has a value; protobuf shows an unset number as 0."""
+    return bool(raw.HasField(name)) if hasattr(raw, "HasField") else _has(raw, name)
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(_get(time, "sec", "seconds")) * 10**9 + int(_get(time, "nanosec", "nsec", "nanos"))
+
+
+def stated_time(raw: Any) -> int | None:
+    """Header time [ns]; None where the schema has none."""
+    if _has(raw, "header"):
+        return _nanoseconds(_get(_get(raw, "header"), "stamp"))
+    return _nanoseconds(_get(raw, "timestamp")) if _has(raw, "timestamp") else None
+
+
+def _frame(raw: Any) -> str:
+    return str(_get(_get(raw, "header"), "frame_id") if _has(raw, "header") else _get(raw, "frame_id"))
+
+
+def _bytes(raw: Any) -> bytes:
+    data = _get(raw, "data")
+    return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    return tuple(float(value) for value in ([values] if isinstance(values, int | float) else values))
+
+
+def _encoded(raw: Any) -> EncodedImage:
+    return EncodedImage(_frame(raw), _bytes(raw), str(_get(raw, "format")))
+
+
+def _raw_image(raw: Any) -> RawImage:
+    return RawImage(
+        _frame(raw),
+        _bytes(raw),
+        str(_get(raw, "encoding")),
+        int(_get(raw, "width")),
+        int(_get(raw, "height")),
+        int(_get(raw, "step")),
+    )
+
+
+def _calibration(raw: Any) -> Calibration:
+    binning, roi = (0, 0), (0, 0, 0, 0)
+    if _has(raw, "binning_x"):
+        binning = int(_get(raw, "binning_x")), int(_get(raw, "binning_y"))
+        region = _get(raw, "roi")
+        roi = tuple(int(_get(region, name)) for name in ("x_offset", "y_offset", "width", "height"))
+    return Calibration(
+        _frame(raw),
+        int(_get(raw, "width")),
+        int(_get(raw, "height")),
+        str(_get(raw, "distortion_model")),
+        _numbers(_get(raw, "D", "d")),
+        _numbers(_get(raw, "K", "k")),
+        _numbers(_get(raw, "P", "p")),
+        binning,
+        (roi[0], roi[1], roi[2], roi[3]),
+    )
+
+
+def _joints(raw: Any) -> Joints:
+    if _has(raw, "joints"):  # foxglove.JointStates: one record a joint, its readings optional
+        joints = list(_get(raw, "joints"))
+        readings = {
+            field: tuple(float(_get(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)
+            for field in ("position", "velocity", "effort")
+        }
+        return Joints(tuple(str(_get(joint, "name")) for joint in joints), **readings)
+    velocity, effort = (_numbers(_get(raw, field)) if _has(raw, field) else () for field in ("velocity", "effort"))
+    names = tuple(str(name) for name in _get(raw, "name"))
+    return Joints(names, _numbers(_get(raw, "position")), velocity, effort)
+
+
+def _pose_values(position: Any, orientation: Any) -> tuple[float, ...]:
+    return (*(float(_get(position, axis)) for axis in "xyz"), *(float(_get(orientation, axis)) for axis in "xyzw"))
+
+
+def _transform(raw: Any) -> Transform:
+    if _has(raw, "header"):  # geometry_msgs/TransformStamped
+        inner, stamp = _get(raw, "transform"), stated_time(raw)
+        parent = _frame(raw)
+    else:
+        inner, stamp, parent = raw, _nanoseconds(_get(raw, "timestamp")), str(_get(raw, "parent_frame_id"))
+    values = _pose_values(_get(inner, "translation"), _get(inner, "rotation"))
+    return Transform(parent.lstrip("/"), str(_get(raw, "child_frame_id")).lstrip("/"), stamp or 0, values)
+
+
+def _transforms(raw: Any) -> tuple[Transform, ...]:
+    return tuple(_transform(item) for item in (_get(raw, "transforms") if _has(raw, "transforms") else [raw]))
+
+
+def _pose(raw: Any) -> Pose:
+    pose = _get(raw, "pose")
+    return Pose(_frame(raw).lstrip("/"), _pose_values(_get(pose, "position"), _get(pose, "orientation")))
+
+
+def _marker(raw: Any) -> str:
+    value = _get(raw, "data")
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+READERS: dict[Kind, Callable[[Any], Any]] = {
+    "image": _encoded,
+    "video": _encoded,
+    "raw_image": _raw_image,
+    "calibration": _calibration,
+    "joints": _joints,
+    "numbers": lambda raw: _numbers(_get(raw, "data")),
+    "transforms": _transforms,
+    "pose": _pose,
+    "marker": _marker,
+}
+
+
+# What the decoders raise for bytes that are not of their schema; the ROS 2 parser raises plain subclasses of these.
+_FAULTS = (
+    McapError,
+    DecodeError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    EOFError,
+    RuntimeError,
+    NotImplementedError,
+    struct.error,
+    binascii.Error,
+)
+
+
+class MessageDecoder:
+    """Decodes the messages of one file's channels."""
+
+    def __init__(self, where: object) -> None:
+        self._where = where
+        self._factories = (Ros2DecoderFactory(), ProtobufDecoderFactory())
+        self._channels: dict[int, tuple[Kind, Callable[[bytes], Any]]] = {}
+
+    def kind(self, channel: Channel, schema: Schema | None) -> Kind:
+        """What a channel's messages say.
+
+        Raises: RejectedInputError (unknown_schema).
+        """
+        return self._channel(channel, schema)[0]
+
+    def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> Message:
+        """One message.
+
+        Raises: RejectedInputError: unknown_schema; unreadable where the bytes are not of the schema.
+        """
+        kind, decode = self._channel(channel, schema)
+        try:
+            raw = decode(data)
+            return Message(stated_time(raw), READERS[kind](raw))
+        except _FAULTS as error:
+            raise RejectedInputError(
+                "unreadable",
+                "Message cannot be decoded",
+                where=f"{self._where}, topic {channel.topic}",
+                expected=schema.name if schema else "a schema",
+                got=repr(error)[:200],
+            ) from error
+
+    def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
+        if channel.id not in self._channels:
+            name = schema.name if schema is not None else ""
+            kind = SCHEMA_KINDS.get(schema_name(name))
+            decoder = self._decoder(channel, schema) if kind is not None else None
+            if kind is None or decoder is None:
+                encoding = schema.encoding if schema is not None else "no schema"
+                raise RejectedInputError(
+                    "unknown_schema",
+                    "Messages of this schema are not understood",
+                    where=f"{self._where}, topic {channel.topic}",
+                    expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
+                    got=f"{name or 'no schema'} ({channel.message_encoding or 'no encoding'}, {encoding})",
+                    next_step="name another topic, or convert the recording",
+                    evidence={"topic": channel.topic, "schema": name, "encoding": channel.message_encoding},
+                )
+            self._channels[channel.id] = kind, decoder
+        return self._channels[channel.id]
+
+    def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if channel.message_encoding == "json":
+            return partial(parse_json, where=f"{self._where}, topic {channel.topic}")
+        try:
+            found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
+            return next((decoder for decoder in found if decoder is not None), None)
+        except _FAULTS as error:
+            raise RejectedInputError(
+                "unknown_schema",
+                "Schema definition cannot be read",
+                where=f"{self._where}, topic {channel.topic}",
+                expected=schema.name if schema else "a schema",
+                got=repr(error)[:200],
+            ) from error

@@ -1,0 +1,223 @@
+"""What the user says about MCAP recordings: which topic is which view, joint, command, frame; what may be missing."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from worldline_core.config import StrictModel
+from worldline_core.data.mcap.resampling import TimeSource
+from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange
+
+Resampling = Literal["linear", "hold"]
+
+
+class TopicReadings(StrictModel):
+    """Some numbers of a topic: joints by name, or columns of an array of numbers."""
+
+    topic: str
+    names: tuple[str, ...] | None = Field(default=None, description="joints, for JointState messages")
+    columns: tuple[int, ...] | None = Field(
+        default=None, description="positions, for messages that are a list of numbers"
+    )
+    field: Literal["position", "velocity", "effort"] = Field(default="position", description="of JointState messages")
+    resample: Resampling = Field(default="linear", description="hold: the last value counts until the next one")
+
+    @model_validator(mode="after")
+    def _one_choice(self) -> TopicReadings:
+        chosen = self.names if self.names is not None else self.columns
+        if (self.names is None) == (self.columns is None) or not chosen:
+            raise ValueError(f"{self.topic}: give either names or columns, at least one")
+        if len(set(chosen)) != len(chosen) or any(column < 0 for column in self.columns or ()):
+            raise ValueError(f"{self.topic}: names and columns must be different and not negative")
+        return self
+
+    @property
+    def width(self) -> int:
+        return len(self.names if self.names is not None else self.columns or ())
+
+
+class JointReadings(TopicReadings):
+    """The joints of an arm, in the order of the embodiment."""
+
+    unit: Literal["rad", "deg"] = "rad"
+
+
+class GripperReadings(TopicReadings):
+    """The gripper of an arm; several numbers (two fingers) are averaged."""
+
+    range: GripperRange = Field(description="what the readings are when the gripper is closed and when it is open")
+
+
+class ArmReadings(StrictModel):
+    """Joints and gripper of one arm, measured or commanded."""
+
+    joints: JointReadings
+    gripper: GripperReadings
+
+
+class ArmTopics(StrictModel):
+    """One arm. The tool is between the fingertips, +z out of the gripper (else: conventions.tool_offset_z_m)."""
+
+    name: Literal["left", "right"]
+    state: ArmReadings
+    command: ArmReadings | None = None
+    tool_frame: str | None = Field(default=None, description="frame of the transforms that is the tool")
+    tool_pose: str | None = Field(default=None, description="topic of tool poses (PoseStamped, PoseInFrame)")
+
+    @model_validator(mode="after")
+    def _one_tool(self) -> ArmTopics:
+        if self.tool_frame is not None and self.tool_pose is not None:
+            raise ValueError(f"arm {self.name}: give tool_frame or tool_pose, not both")
+        return self
+
+
+class ViewTopics(StrictModel):
+    """One camera."""
+
+    image: str = Field(description="topic of images, compressed or raw, or of video")
+    calibration: str | None = Field(
+        default=None, description="topic of CameraInfo or CameraCalibration; null: uncalibrated"
+    )
+    frame: str | None = Field(
+        default=None,
+        description="camera frame with OpenCV axes (ROS: ..._optical_frame); null: the one its messages name",
+    )
+    rectified: bool = Field(default=False, description="the images are rectified: P holds their K, and no lens is left")
+
+
+class WholeFiles(StrictModel):
+    """Every file is an episode."""
+
+    by: Literal["file"] = "file"
+
+
+class TimeRange(StrictModel):
+    """One episode inside of a file; seconds of log time since the file's first message."""
+
+    name: str = Field(min_length=1)
+    start_s: float = Field(ge=0)
+    stop_s: float = Field(gt=0)
+    file: str = Field(default="*", description="shell pattern of the files, counted from the source's folder")
+    instruction: str | None = None
+
+    @model_validator(mode="after")
+    def _forwards(self) -> TimeRange:
+        if self.stop_s <= self.start_s:
+            raise ValueError(f"range {self.name} ends before it starts")
+        return self
+
+
+class TimeRanges(StrictModel):
+    """Episodes are listed here."""
+
+    by: Literal["ranges"] = "ranges"
+    ranges: tuple[TimeRange, ...] = Field(min_length=1)
+
+
+class Markers(StrictModel):
+    """Episodes lie between messages of a topic (std_msgs String or Bool, whose values are the texts true and false)."""
+
+    by: Literal["markers"] = "markers"
+    topic: str
+    start: str = Field(
+        default=r"start(: *(?P<instruction>.*))?", description="pattern of the whole text that begins one"
+    )
+    stop: str = Field(
+        default=r"stop(: *(?P<outcome>success|failure))?", description="pattern of the text that ends one"
+    )
+
+    @model_validator(mode="after")
+    def _patterns(self) -> Markers:
+        for name, pattern in (("start", self.start), ("stop", self.stop)):
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise ValueError(f"episodes.{name}: {pattern!r} is no regular expression: {error}") from error
+        return self
+
+
+class McapTopicsSourceConfig(ForeignSourceConfig):
+    """MCAP files of other tools; nothing in them is guessed, so their topics are declared."""
+
+    kind: Literal["mcap_topics"] = "mcap_topics"
+    embodiment: str
+    fps: float = Field(gt=0, description="rate to which everything is brought")
+    views: dict[str, ViewTopics] = Field(min_length=1)
+    arms: tuple[ArmTopics, ...] = Field(min_length=1, max_length=2, description="left before right")
+    without_commands: Literal["refuse", "repeat_state"] = Field(
+        default="refuse", description="repeat_state: recordings without command topics get the measured state as action"
+    )
+    base_frame: str = Field(default="base_link", description="the robot's base in the transforms")
+    transforms: tuple[str, ...] = Field(default=("/tf",), description="topics of moving transforms")
+    static_transforms: tuple[str, ...] = Field(default=("/tf_static",), description="topics of transforms that stay")
+    episodes: Annotated[WholeFiles | TimeRanges | Markers, Field(discriminator="by")] = WholeFiles()
+    instruction: str = ""
+    time: TimeSource = Field(
+        default="header", description="which time of a message counts; messages without a header: their log time"
+    )
+    time_offsets_ms: dict[str, float] = Field(
+        default={}, description="topic -> what to add to its header times, where its clock is known to be off"
+    )
+    max_image_distance_frames: float = Field(
+        default=1.5,
+        gt=0,
+        description="largest distance of an image from its instant; 1.5 lets two images in a row be lost",
+    )
+    max_gap_s: float = Field(default=0.2, gt=0, description="largest interval between joint readings or transforms")
+    max_trim_s: float = Field(
+        default=1.0, ge=0, description="how much later a topic may begin, or earlier end, than the others"
+    )
+    max_disorder_s: float = Field(
+        default=1.0, gt=0, description="how late a message may come; more is a clock set back"
+    )
+    max_clock_skew_ms: float = Field(
+        default=200.0,
+        gt=0,
+        description="by how much the least delays (log time minus header time) of topics may differ",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> McapTopicsSourceConfig:
+        names = [arm.name for arm in self.arms]
+        if names not in (["left"], ["right"], ["left", "right"]):
+            raise ValueError(f"arms are {names}; expected left before right, each once")
+        commanded = [arm.command is not None for arm in self.arms]
+        if len(set(commanded)) > 1:
+            raise ValueError("either all arms have commands or none")
+        if not commanded[0] and self.without_commands == "refuse":
+            raise ValueError("no arm has commands: give their topics, or say without_commands: repeat_state")
+        if len({arm.tool_frame is None and arm.tool_pose is None for arm in self.arms}) > 1:
+            raise ValueError("either all arms have tool poses or none")
+        for arm in self.arms:
+            if arm.command is not None and arm.command.joints.width != arm.state.joints.width:
+                raise ValueError(
+                    f"arm {arm.name} has {arm.state.joints.width} joints and {arm.command.joints.width} commands"
+                )
+        if self.primary_view is not None and self.primary_view not in self.views:
+            raise ValueError(f"primary_view {self.primary_view} is none of {', '.join(self.views)}")
+        seen: dict[str, str] = {}
+        for role, topics in self.topics.items():
+            for topic in topics:
+                if seen.setdefault(topic, role) != role:
+                    raise ValueError(f"topic {topic} is declared both as {seen[topic]} and as {role}")
+        return self
+
+    @property
+    def timing_view(self) -> str:
+        """The view whose images the instants begin with: the primary one, else the head's, else the first declared."""
+        return self.primary_view or ("head" if "head" in self.views else next(iter(self.views)))
+
+    @property
+    def topics(self) -> dict[str, set[str]]:
+        """Declared topics by what they are expected to hold."""
+        readings = [each for arm in self.arms for each in (arm.state, arm.command) if each is not None]
+        return {
+            "images": {view.image for view in self.views.values()},
+            "calibrations": {view.calibration for view in self.views.values() if view.calibration is not None},
+            "readings": {topic for each in readings for topic in (each.joints.topic, each.gripper.topic)},
+            "tool poses": {arm.tool_pose for arm in self.arms if arm.tool_pose is not None},
+            "transforms": {*self.transforms, *self.static_transforms},
+        }

@@ -1,0 +1,203 @@
+"""What every episode source offers, and what their configurations share.
+
+Ids of episodes that are files: the label and the path, told apart where that is not enough.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Literal, Protocol
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from worldline_core.config import StrictModel
+from worldline_core.data.curation.checks import TRAINING_SPLITS
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import Episode, Outcome, Split, TaskFamily
+from worldline_core.data.guards.source_paths import SourceFolder
+from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.decode import Fit
+from worldline_core.errors import CalibrationError
+from worldline_core.geometry.distortion import Distortion, DistortionModel
+
+
+@dataclass(frozen=True)
+class LoadedEpisode:
+    """An episode at the source's own rate and image size.
+
+    A source whose views are videos names them in `clips` (`VideoClip.whole_file(path, num_frames, fps)`, or with
+    `from_time` inside of a joined file): curation then decodes them once, frame by frame, and stores them without
+    encoding where nothing changes. One whose images are single files or messages gives `images`, so that no view is ever
+    in memory as a whole. `frames` alone is enough for short recordings.
+
+    Attributes:
+        views: views that have images.
+        frames: view -> uint8 (episode.num_video_frames, H, W, 3); decodes when called.
+        robot_masks: view -> bool (N, H, W), or None where the source has none.
+        distortions: lenses of the views whose images are not those of a pinhole; K is then that of the lens.
+        clips: view -> its encoded video, of the views that are videos as they are.
+        images: view -> uint8 (H, W, 3) RGB frame by frame, for views that are no clips.
+    """
+
+    episode: Episode
+    views: tuple[str, ...]
+    frames: Callable[[str], np.ndarray]
+    robot_masks: Callable[[str], np.ndarray | None]
+    distortions: Mapping[str, Distortion] = field(default_factory=dict)
+    clips: Mapping[str, VideoClip] = field(default_factory=dict)
+    images: Callable[[str], Iterator[np.ndarray]] | None = None
+
+    def each_image(self, view: str) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB frame by frame, in the way that holds the least of them in memory.
+
+        Raises: RejectedInputError, while it is iterated, for whatever cannot be read.
+        """
+        if view in self.clips:
+            for picture in read_clip(self.clips[view]):
+                yield picture.rgb
+        elif self.images is not None:
+            yield from self.images(view)
+        else:
+            yield from self.frames(view)
+
+
+class EpisodeSource(Protocol):
+    """A collection of recordings. `load` raises a DataError for a bad episode; the others are not touched by it."""
+
+    def episode_ids(self) -> list[str]: ...
+
+    def load(self, episode_id: str) -> LoadedEpisode: ...
+
+
+class SourceConfigBase(StrictModel):
+    """Fields of every source."""
+
+    path: SourceFolder = Field(description="folder of the recordings, or a URL (s3://bucket/folder)")
+    name: str | None = Field(default=None, description="name of the source in the index; default: the folder's name")
+    include: tuple[str, ...] | None = Field(
+        default=None, description="shell patterns of the episode ids to read; null: all"
+    )
+    conventions: RecordedConventions = Field(
+        default=RecordedConventions(),
+        description="how these recordings depart from the contract; `worldline calibrate check` finds out",
+    )
+
+    license: str = Field(
+        default="unknown", description="licence of the recordings: an SPDX identifier (CC-BY-4.0), or its name"
+    )
+    redistribution: Literal["yes", "no", "unknown"] = Field(
+        default="unknown", description="whether the licence lets others have these recordings"
+    )
+    image_size: tuple[int, int] | None = Field(
+        default=None, description="(height, width) of this source's images; null: curate.image_size"
+    )
+    fit: Fit | None = Field(default=None, description="how they come to that size; null: curate.fit")
+    target_fps: float | None = Field(
+        default=None, gt=0, description="rate of this source's episodes in the set; null: curate.fps"
+    )
+    stride: int | None = Field(
+        default=None, ge=1, description="instead of a rate: keep every so many frames of this source"
+    )
+    primary_view: str | None = Field(
+        default=None,
+        description="task-facing view of this source; null: curate.primary_view, else what the recording says",
+    )
+
+    @model_validator(mode="after")
+    def _one_rate(self) -> SourceConfigBase:
+        if self.target_fps is not None and self.stride is not None:
+            raise ValueError("target_fps and stride both say how frames are thinned: give one of them")
+        return self
+
+    @property
+    def label(self) -> str:
+        return self.name or self.path.name
+
+    def includes(self, episode_id: str) -> bool:
+        """Whether the configuration asks for this episode."""
+        return self.include is None or any(fnmatchcase(episode_id, pattern) for pattern in self.include)
+
+
+class ForeignSourceConfig(SourceConfigBase):
+    """What foreign recordings do not say about themselves and the user therefore declares."""
+
+    split: Split = Field(default="test", description="never train without saying so")
+    scene: str | None = Field(default=None, description="scene of all episodes; default: one scene an episode folder")
+    task_family: TaskFamily = "unknown"
+    outcome: Outcome = "unknown"
+
+
+class EvaluationSourceConfig(ForeignSourceConfig):
+    """A source that results are compared on, and that therefore never trains or selects a model."""
+
+    @model_validator(mode="after")
+    def _not_for_training(self) -> EvaluationSourceConfig:
+        if self.split in TRAINING_SPLITS:
+            raise ValueError(
+                f"these recordings are for evaluation only: split {self.split} is refused, use test or ood_test"
+            )
+        return self
+
+
+class LensConfig(StrictModel):
+    """A lens that a format has no place for, declared by the user: OpenCV's model and coefficients."""
+
+    model: DistortionModel
+    coefficients: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _usable(self) -> LensConfig:
+        try:
+            _ = self.distortion
+        except CalibrationError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    @property
+    def distortion(self) -> Distortion:
+        return Distortion(self.model, self.coefficients)
+
+
+class GripperRange(StrictModel):
+    """Raw gripper readings at the two ends."""
+
+    closed: float
+    open: float
+
+    @model_validator(mode="after")
+    def _two_ends(self) -> GripperRange:
+        if not (np.isfinite(self.closed) and np.isfinite(self.open) and self.closed != self.open):
+            raise ValueError(f"closed ({self.closed}) and open ({self.open}) must be two different readings")
+        return self
+
+    def opening(self, raw: np.ndarray) -> tuple[np.ndarray, int]:
+        """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside."""
+        value = (np.asarray(raw, dtype=np.float64) - self.closed) / (self.open - self.closed)
+        return np.clip(value, 0.0, 1.0), int(np.count_nonzero((value < 0.0) | (value > 1.0)))
+
+
+def no_masks(view: str) -> None:
+    """Robot masks of a source that has none."""
+    del view
+
+
+def unique_names(names: Mapping[str, str]) -> dict[str, str]:
+    """Id -> file, from file -> wanted id.
+
+    Files that would share an id (a-b/c and a/b-c both give a-b-c) get a digest of their path behind it.
+    """
+    count = Counter(names.values())
+    return {
+        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(file).encode()).hexdigest()[:8]}": file
+        for file, name in names.items()
+    }
+
+
+def printable(name: str) -> str:
+    """A path whose bytes are no UTF-8 as text that can be stored."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")

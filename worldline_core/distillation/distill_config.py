@@ -1,0 +1,110 @@
+"""Configuration of Stage III: the clips, and one section for each of its three steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from worldline_core.config import StrictModel
+from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow
+from worldline_core.training.clip_sampler import ClipSampling
+from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
+from worldline_core.training.trainer import OptimizerConfig, TrainerConfig
+
+CYCLE = 6
+"""Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
+
+
+class TeacherForcingConfig(StrictModel):
+    """Step 1.
+
+    ``history_noise``: standard deviation of noise on the clean blocks a block sees (0 in the paper).
+    ``view_weights``: None trains all views jointly; otherwise what a step trains on is drawn by these weights ("joint"
+    or the name of a view), and a step on one view takes ``single_view_factor`` times the clips: cheap where compute is
+    short. The later steps are always joint.
+    """
+
+    trainer: TrainerConfig = TrainerConfig(steps=2000, optimizer=OptimizerConfig(learning_rate=3e-4))
+    sigma: SigmaSampling = SigmaSampling(shift=2.0)
+    weighting: LossWeighting = LossWeighting()
+    history_noise: float = Field(default=0.0, ge=0)
+    view_weights: dict[str, float] | None = None
+    single_view_factor: int = Field(default=1, ge=1)
+
+
+class TrajectoriesConfig(StrictModel):
+    """The offline trajectories of the frozen causal teacher.
+
+    ``substeps``: Euler steps of the teacher between neighbouring nodes; (1, 1, 1, 1) is the plain four-step sampler.
+    ``history``: what each block sees before it, the recorded blocks or the teacher's own.
+    """
+
+    clips: int = Field(default=512, ge=1)
+    clips_per_shard: int = Field(default=16, ge=1)
+    substeps: tuple[int, int, int, int] = (2, 2, 3, 9)
+    history: Literal["recorded", "generated"] = "recorded"
+    seed: int = Field(default=1, ge=0)
+
+
+class TrajectoryRegressionConfig(StrictModel):
+    """Step 2. Weights of the next node and of the clean end as in the paper."""
+
+    trainer: TrainerConfig = TrainerConfig(steps=1000, optimizer=OptimizerConfig(learning_rate=2e-4))
+    trajectories: TrajectoriesConfig = TrajectoriesConfig()
+    next_weight: float = Field(default=1.0, ge=0)
+    terminal_weight: float = Field(default=0.5, ge=0)
+    auxiliary: AuxiliaryWeights = AuxiliaryWeights()
+
+
+class DistributionMatchingConfig(StrictModel):
+    """Step 3.
+
+    ``fake_score_rate``: learning rate of the fake score as a multiple of the student's.
+    ``real_score``: "stage2" judges a rollout as one clip given the observed frame alone, so that errors piling up from
+    block to block are seen, and costs half the tokens of "causal_teacher", which judges every block given the rollout's
+    own earlier blocks and so takes their errors for granted.
+    ``target``: what the auxiliaries compare with: the clean end of the teacher's trajectory from the same noise (the
+    paper), or the recorded clip (fresh noise each time).
+    """
+
+    trainer: TrainerConfig = TrainerConfig(
+        steps=600,
+        log_every=30,
+        optimizer=OptimizerConfig(learning_rate=2e-5, betas=(0.0, 0.999), warmup_steps=12),
+    )
+    fake_score_rate: float = Field(default=4.0, gt=0)
+    real_score: Literal["stage2", "causal_teacher"] = "stage2"
+    sigma: SigmaSampling = SigmaSampling(shift=5.0)
+    sigma_range: tuple[float, float] = (0.02, 0.98)
+    weighting: LossWeighting = LossWeighting()
+    target: Literal["teacher", "recorded"] = "teacher"
+    auxiliary: AuxiliaryWeights = AuxiliaryWeights()
+
+    @model_validator(mode="after")
+    def _whole_cycles(self) -> Self:
+        if self.trainer.steps % CYCLE or self.trainer.log_every % CYCLE:
+            raise ValueError(
+                f"steps ({self.trainer.steps}) and log_every ({self.trainer.log_every}) must be multiples of {CYCLE}: "
+                "one student update and five fake-score updates make one cycle"
+            )
+        if not 0 < self.sigma_range[0] < self.sigma_range[1] <= 1:
+            raise ValueError(f"sigma_range {self.sigma_range} must rise within (0, 1]")
+        return self
+
+
+class DistillConfig(StrictModel):
+    """Stage III. ``block_size`` counts latent frames (4 in the paper: 16 video frames)."""
+
+    clips: ClipSampling = ClipSampling()
+    splits: list[str] = Field(default=["train"], min_length=1)
+    validation_splits: list[str] = Field(default=["validation"])
+    views: list[str] = Field(default=["head", "left_wrist", "right_wrist"], min_length=1)
+    block_size: int = Field(default=4, ge=1)
+    window: CacheWindow = CacheWindow()
+    teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
+    trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
+    distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()
+    lpips_weights: Path | None = Field(default=None, description="folder of the LPIPS weights; None: that term is off")

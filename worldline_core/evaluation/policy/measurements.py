@@ -1,0 +1,191 @@
+"""Measurements of a coloured thing in sampled frames: how far it rose, whether it is held, where it lies, what is left.
+
+Lengths are in units of the thing's own size (the root of its largest visible area), so that they hold for any camera
+distance and resolution. ``None`` means: not visible enough to say. Thresholds were chosen on training recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from worldline_core.evaluation.policy.coloured_things import ColouredThing, OwnColour, own_colour, thing_share
+
+LATE_COUNT = 3
+_HEAD = "head"
+_MIN_AREA_FRACTION = 0.0009  # of the frame: about 5.5 px at 64 x 96
+_VISIBLE = 0.12  # of the thing's largest area
+_CLEAR = 0.35
+HELD_TOUCH = 0.5  # of the thing's area lies within a third of its size of the robot
+HELD_WRIST_SHARE = 0.065  # of a wrist frame
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A thing in the head view of n frames: area [px], centre u, v [px], its shares (n, h, w), its own colour if seen."""
+
+    shares: np.ndarray
+    area: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    own: OwnColour | None
+
+    @property
+    def full_area(self) -> float:
+        """Its unoccluded area, as far as it was ever seen."""
+        return float(np.quantile(self.area, 0.9))
+
+    @property
+    def size(self) -> float:
+        return max(1.0, float(np.sqrt(self.full_area)))
+
+    def seen(self, fraction: float) -> np.ndarray:
+        """Frames (n,) in which at least this fraction of it is visible."""
+        least = _MIN_AREA_FRACTION * self.shares[0].size
+        return self.area > max(fraction * self.full_area, least)
+
+
+@dataclass(frozen=True)
+class LiftMeasurement:
+    """Attributes:
+    rise: the least of the late heights against the resting height, in sizes (up is positive).
+    peak: the most it ever rose.
+    held: share of the late frames in which it is held.
+    vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
+    """
+
+    rise: float | None
+    peak: float | None
+    held: float | None
+    vacated: float | None = None
+
+
+@dataclass(frozen=True)
+class PlaceMeasurement:
+    """distance: between object and destination in the end, in destination sizes; motion: of the object between the last
+    two frames, in its sizes."""
+
+    distance: float | None
+    motion: float | None
+
+
+@dataclass(frozen=True)
+class PushMeasurement:
+    """remaining: late share of the visible area that no robot covers; retreat: how far its near edge moved up, in sizes
+    (None when nothing of it is visible any more)."""
+
+    remaining: float | None
+    retreat: float | None
+
+
+def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
+    """Find a thing in head frames (n, h, w, 3)."""
+    own = own_colour(frames, thing.colour)
+    shares = thing_share(frames, thing.colour, own)
+    rows, columns = np.mgrid[: frames.shape[1], : frames.shape[2]]
+    area = shares.sum(axis=(1, 2))
+    safe = np.maximum(area, 1e-6)
+    u, v = ((shares * grid).sum(axis=(1, 2)) / safe for grid in (columns, rows))
+    return Sighting(shares, area, u, v, own)
+
+
+def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> LiftMeasurement:
+    """Rise and hold.
+
+    Args:
+        frames: by view, chosen frames (n, h, w, 3) in order.
+        robot_late: robot masks (LATE_COUNT, h, w) of the last frames of the head view.
+    """
+    head = sight(frames[_HEAD], thing)
+    clear, visible = head.seen(_CLEAR), head.seen(_VISIBLE)
+    late = np.arange(len(head.area)) >= len(head.area) - LATE_COUNT
+    rise = peak = vacated = None
+    if clear.any():
+        resting = float(np.quantile(head.v[clear], 0.85))
+        peak = (resting - float(head.v[clear].min())) / head.size
+        if (late & visible).any():
+            rise = (resting - float(head.v[late & visible].max())) / head.size
+        early = np.where(clear, head.area, 0.0)[: max(1, len(head.area) // 2)]
+        if early.max() > 0:
+            spot = head.shares[int(np.argmax(early))]
+            taken = np.maximum(head.shares[-LATE_COUNT:], robot_late)
+            vacated = 1.0 - float((spot * taken).sum(axis=(1, 2)).max()) / float(spot.sum())
+    return LiftMeasurement(rise, peak, _held(frames, thing, head, late & visible, robot_late), vacated)
+
+
+def measure_place(
+    frames: Mapping[str, np.ndarray], thing: ColouredThing, destination: ColouredThing
+) -> PlaceMeasurement:
+    """Where the object is in the end, against where the destination was seen best."""
+    item, place = sight(frames[_HEAD], thing), sight(frames[_HEAD], destination)
+    visible = item.seen(_VISIBLE)
+    late = visible.copy()
+    late[:-LATE_COUNT] = False
+    if not late.any() or not place.seen(_CLEAR).any():
+        return PlaceMeasurement(None, None)
+    best = int(np.argmax(place.area))
+    size = max(1.0, float(np.sqrt(place.area[best])))
+    # The centre of a thing that stands on a spot is seen a little above the spot.
+    du = float(item.u[late].mean()) - float(place.u[best])
+    dv = float(item.v[late].mean()) + 0.1 * item.size - float(place.v[best])
+    motion = None
+    if visible[-1] and visible[-2]:
+        motion = float(np.hypot(item.u[-1] - item.u[-2], item.v[-1] - item.v[-2])) / item.size
+    return PlaceMeasurement(float(np.hypot(du, dv)) / size, motion)
+
+
+def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> PushMeasurement:
+    """How much of a drawer still sticks out."""
+    head = sight(frames[_HEAD], thing)
+    best = int(np.argmax(head.area))
+    if not head.seen(_CLEAR)[best]:
+        return PushMeasurement(None, None)
+    late = head.area[-LATE_COUNT:]
+    covered = float((head.shares[best] * robot_late).sum(axis=(1, 2)).mean()) / float(head.area[best])
+    remaining = float(late.mean()) / float(head.area[best]) / max(1.0 - covered, 0.05)
+    edges = [_near_edge(share) for share in head.shares[-LATE_COUNT:][late > _MIN_AREA_FRACTION * head.shares[0].size]]
+    retreat = None
+    if edges:
+        retreat = (_near_edge(head.shares[best]) - float(np.mean(edges))) / float(np.sqrt(head.area[best]))
+    return PushMeasurement(remaining, retreat)
+
+
+def _held(
+    frames: Mapping[str, np.ndarray],
+    thing: ColouredThing,
+    head: Sighting,
+    late_visible: np.ndarray,
+    robot_late: np.ndarray,
+) -> float | None:
+    """Share of late frames in which the thing touches the robot and fills a wrist camera as only a held thing does.
+
+    0 when it is not held in the last one: a drop at the very end is a drop.
+    """
+    touching = np.full(LATE_COUNT, np.nan)
+    reach = max(1, round(head.size / 3))
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    for slot, index in enumerate(range(len(head.area) - LATE_COUNT, len(head.area))):
+        if late_visible[index]:
+            near = cv2.dilate(robot_late[slot].astype(np.uint8), kernel)
+            touching[slot] = float((near * head.shares[index]).sum()) / float(head.area[index])
+    wrists = [
+        thing_share(frames[view][-LATE_COUNT:], thing.colour, head.own).mean(axis=(1, 2))
+        for view in frames
+        if view != _HEAD
+    ]
+    in_hand = np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
+    signs = [np.minimum(values, 1.0) for values in (touching / HELD_TOUCH, in_hand) if not np.isnan(values).all()]
+    if not signs:
+        return None
+    # Both views have to agree where both can see: a gripper in front of a thing also touches it in the image.
+    holds = np.nanmin(signs, axis=0) >= 1.0
+    return float(holds.mean()) if holds[-1] else 0.0
+
+
+def _near_edge(share: np.ndarray) -> float:
+    """Row below which a tenth of the area lies."""
+    rows = np.cumsum(share.sum(axis=1))
+    return float(np.searchsorted(rows, 0.9 * rows[-1]))

@@ -1,0 +1,259 @@
+"""Static stretches: neither the robot nor the image moves.
+
+Resets: the robot goes back to where it began at once, as when two attempts were recorded into one file.
+
+Joint motion that no arm can make: readings that jump, and speeds beyond what the motors reach.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from pydantic import Field
+
+from worldline_core.config import StrictModel
+from worldline_core.filters.verdict import Curve, Numbers, Verdict, runs
+
+SPEED_WINDOW_S = 0.5
+
+
+class StaticConfig(StrictModel):
+    """A stretch is static when all three stay below their thresholds."""
+
+    max_joint_speed_rad_s: float = Field(
+        default=0.03, gt=0, description="range of a joint within half a second, a second: encoder noise hardly counts"
+    )
+    max_gripper_speed_per_s: float = Field(default=0.05, gt=0)
+    max_image_change: float = Field(
+        default=0.6, gt=0, description="mean absolute change a frame of the coarse image, of 255"
+    )
+    min_run_s: float = Field(default=1.5, gt=0, description="shorter pauses are part of manipulation")
+
+
+def range_speed(values: np.ndarray, fps: float) -> np.ndarray:
+    """(n,) largest range of a column within SPEED_WINDOW_S around each frame, per second.
+
+    A difference of neighbours would multiply encoder noise by the frame rate.
+
+    Args:
+        values: (n, j).
+    """
+    count = len(values)
+    if values.shape[1] == 0 or count < 2:
+        return np.zeros(count)
+    reach = max(1, round(SPEED_WINDOW_S * fps / 2))
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
+    return (windows.max(axis=-1) - windows.min(axis=-1)).max(axis=1) * fps / (2 * reach)
+
+
+def detect_static(
+    joint_speed: np.ndarray, gripper_speed: np.ndarray, image_change: np.ndarray, fps: float, config: StaticConfig
+) -> Verdict:
+    """Frames of static stretches.
+
+    Args:
+        joint_speed: (n,) `range_speed` of the joints [rad/s] (or tools [m/s] where poses are recorded).
+        gripper_speed: (n,) the same of the grippers, openings a second.
+        image_change: (n,) mean absolute change of the coarse task-facing image, of 255.
+    """
+    still = (joint_speed < config.max_joint_speed_rad_s) & (gripper_speed < config.max_gripper_speed_per_s)
+    # Half a window at either end saw the motion beside the stretch.
+    still = _widened(still, max(1, round(SPEED_WINDOW_S * fps / 2)))
+    still &= image_change < config.max_image_change
+    bad = np.zeros(len(still), dtype=bool)
+    longest = 0
+    for start, stop in runs(still):
+        longest = max(longest, stop - start)
+        if stop - start >= config.min_run_s * fps:
+            bad[start:stop] = True
+    return Verdict(
+        "static",
+        not bad.all(),
+        {
+            "static_share": float(bad.mean()),
+            "longest_still_s": longest / fps,
+            "max_joint_speed_rad_s": float(joint_speed.max()),
+            "max_image_change": float(image_change.max()),
+            "threshold_run_s": config.min_run_s,
+        },
+        bad,
+        {
+            "joint_range_rad_s": Curve(joint_speed, config.max_joint_speed_rad_s),
+            "coarse_image_change": Curve(image_change, config.max_image_change),
+        },
+    )
+
+
+def _widened(flags: np.ndarray, by: int) -> np.ndarray:
+    wide = flags.copy()
+    for start, stop in runs(flags):
+        wide[max(0, start - by) : stop + by] = True
+    return wide
+
+
+class ResetConfig(StrictModel):
+    """A reset covers most of the way back to the first pose within a moment, faster than the episode moves otherwise."""
+
+    min_jump_rad: float = Field(default=0.15, gt=0, description="a shorter way home is jitter")
+    home_share: float = Field(
+        default=0.2, gt=0, lt=1, description="distance to the first pose after, relative to before the way home"
+    )
+    max_return_s: float = Field(default=0.7, gt=0, description="a slower way home is motion like any other")
+    min_relative_step: float = Field(
+        default=1.15, ge=1, description="a single step home, relative to the episode's other steps (90th percentile)"
+    )
+    min_relative_speed: float = Field(
+        default=1.7, ge=1, description="mean speed of a way home of several steps, relative to the same"
+    )
+
+
+def way_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, int] | None:
+    """Frames (last before, first after) of the first way home, or None.
+
+    Args:
+        joints: (n, j) [rad].
+    """
+    steps = np.abs(np.diff(joints, axis=0)).max(axis=1) if len(joints) > 1 else np.zeros(0)
+    from_home = np.abs(joints - joints[0]).max(axis=1)
+    longest = min(max(1, round(config.max_return_s * fps)), len(steps))
+    for i, j in _candidates(from_home, steps, longest, config):
+        usual = _usual(np.concatenate([steps[:i], steps[j:]]))
+        if (from_home[i] - from_home[j]) / (j - i) > _least(j - i, config) * usual:
+            # The way home may have begun before the part of it that leads straight there.
+            begin = i
+            while begin > max(j - longest, 0) and steps[begin - 1] > usual:
+                begin -= 1
+            return begin, j
+    return None
+
+
+def _candidates(from_home: np.ndarray, steps: np.ndarray, longest: int, config: ResetConfig) -> list[tuple[int, int]]:
+    """Pairs of frames between which the robot comes home at a speed that may be unusual: earliest, then shortest, first."""
+    ordered = np.sort(steps)
+    pairs: list[tuple[int, int]] = []
+    for span in range(1, longest + 1):
+        # The slowest steps alone bound the usual speed of any others from below.
+        least = _least(span, config) * _usual(ordered[: len(ordered) - span])
+        before, after = from_home[:-span], from_home[span:]
+        home = (before > config.min_jump_rad) & (after < config.home_share * before)
+        quick = (before - after >= config.min_jump_rad) & ((before - after) / span > least)
+        pairs += [(int(i), int(i) + span) for i in np.flatnonzero(home & quick)]
+    return sorted(pairs, key=lambda pair: (pair[1], -pair[0]))
+
+
+def _usual(steps: np.ndarray) -> float:
+    return float(np.percentile(steps, 90)) if len(steps) else 0.0
+
+
+def _least(span: int, config: ResetConfig) -> float:
+    return config.min_relative_step if span == 1 else config.min_relative_speed
+
+
+def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict:
+    """Frames from the first way home on.
+
+    Args:
+        joints: (n, j) joint positions [rad], without grippers.
+    """
+    from_home = np.abs(joints - joints[0]).max(axis=1)
+    found = way_home(joints, fps, config)
+    bad = np.zeros(len(joints), dtype=bool)
+    if found is not None:
+        bad[found[0] + 1 :] = True
+    return Verdict(
+        "reset",
+        True,  # the attempt before the way home stays, if it is long enough
+        {
+            "furthest_from_home_rad": float(from_home.max()),
+            "reset_frame": None if found is None else found[0] + 1,
+            "way_home_rad": None if found is None else float(from_home[found[0]] - from_home[found[1]]),
+            "way_home_s": None if found is None else (found[1] - found[0]) / fps,
+            "threshold_return_s": config.max_return_s,
+        },
+        bad,
+        {"distance_from_home_rad": Curve(from_home, config.min_jump_rad)},
+    )
+
+
+_WINDOW = 4
+# A reading that jumps away and back makes two large steps; a third makes it motion.
+_LARGE_STEPS = 2
+
+
+class JointMotionConfig(StrictModel):
+    """Joint positions in radians. Arms of this size reach 2 to 4 rad/s (Panda 2.6, UR5e and xArm 3.1, ViperX 3.1)."""
+
+    min_jump_rad: float = Field(default=0.3, gt=0, description="smaller steps from frame to frame are no jump")
+    min_relative_step: float = Field(
+        default=3.0, gt=1, description="a jump, of the largest other step of the joint within four frames"
+    )
+    max_speed_rad_s: float = Field(default=7.0, gt=0, description="faster is no motion of an arm")
+
+
+def jump_steps(joints: np.ndarray, config: JointMotionConfig) -> np.ndarray:
+    """bool (n - 1, j): steps that stand alone among small ones.
+
+    Args:
+        joints: (n, j) [rad].
+    """
+    steps = np.abs(np.diff(joints, axis=0))
+    candidates = np.argwhere(steps > config.min_jump_rad)
+    jumps = np.zeros(steps.shape, dtype=bool)
+    for i, joint in candidates:
+        around = np.sort(steps[max(0, i - _WINDOW) : i + _WINDOW + 1, joint])
+        others = around[: len(around) - _LARGE_STEPS]
+        usual = float(others[-1]) if len(others) else 0.0
+        jumps[i, joint] = steps[i, joint] > config.min_relative_step * usual
+    return jumps
+
+
+def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
+    """Frames at which a reading jumps, and those between a jump and its way back.
+
+    Args:
+        joints: (n, j) joint positions [rad], without grippers.
+    """
+    bad = np.zeros(len(joints), dtype=bool)
+    steps = np.abs(np.diff(joints, axis=0))
+    jumps = jump_steps(joints, config) if len(joints) > 1 else np.zeros((0, joints.shape[1]), dtype=bool)
+    for joint in np.flatnonzero(jumps.any(axis=0)):
+        at = np.flatnonzero(jumps[:, joint])
+        bad[at + 1] = True
+        for first, second in pairwise(at):
+            returned = abs(joints[second + 1, joint] - joints[first, joint]) < 0.5 * steps[first, joint]
+            if returned and second - first <= _WINDOW:
+                bad[first + 1 : second + 1] = True
+    numbers: Numbers = {
+        "jumps": int(jumps.sum()),
+        "largest_jump_rad": float(steps[jumps].max()) if jumps.any() else 0.0,
+        "threshold_jump_rad": config.min_jump_rad,
+    }
+    curve = np.concatenate([[0.0], steps.max(axis=1)]) if len(steps) else np.zeros(len(joints))
+    return Verdict("joint_jump", True, numbers, bad, {"largest_step_rad": Curve(curve, config.min_jump_rad)})
+
+
+def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig) -> Verdict:
+    """Stretches of two frames or more above the speed limit; a single step is a jump, if anything.
+
+    Args:
+        joints: (n, j) joint positions [rad], without grippers.
+    """
+    speed = np.abs(np.diff(joints, axis=0)).max(axis=1) * fps if len(joints) > 1 else np.zeros(0)
+    bad = np.zeros(len(joints), dtype=bool)
+    jumps = jump_steps(joints, config).any(axis=1) if len(joints) > 1 else np.zeros(0, dtype=bool)
+    for start, stop in runs((speed > config.max_speed_rad_s) & ~jumps):
+        if stop - start >= 2:
+            bad[start + 1 : stop + 1] = True
+    return Verdict(
+        "joint_speed",
+        True,  # the rest of the episode stays, if it is long enough
+        {
+            "max_joint_speed_rad_s": float(speed.max()) if len(speed) else 0.0,
+            "frames_over": int(bad.sum()),
+            "threshold_rad_s": config.max_speed_rad_s,
+        },
+        bad,
+        {"joint_speed_rad_s": Curve(np.concatenate([[0.0], speed]), config.max_speed_rad_s)},
+    )

@@ -1,0 +1,137 @@
+"""What every video tokenizer offers, and how one is found on disk.
+
+Frames as stored (uint8) to tensors as models see them, and back; one place decides how frames are resized.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from worldline_core.errors import CheckpointError, DataError
+
+DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"
+FORMAT = "worldline.tokenizer"
+
+
+@runtime_checkable
+class VideoTokenizer(Protocol):
+    """Causal video codec. Latents are normalised to about unit scale; latent frame 0 codes RGB frame 0 alone."""
+
+    latent_channels: int
+    spatial_compression: int
+    temporal_compression: int
+
+    def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]: ...
+
+    def decode(
+        self, latents: Float[Tensor, "b c t_l h_l w_l"], reference: Float[Tensor, "b 3 h w"] | None = None
+    ) -> Float[Tensor, "b 3 t h w"]:
+        """Latents to video; ``reference``, the observed first frame, helps tokenizers that can use it."""
+        ...
+
+
+def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:
+    """Refuse a video whose length or size the tokenizer cannot code.
+
+    Raises:
+        DataError: it is not ``(b, 3, 1 + k * temporal, multiple of spatial, multiple of spatial)``.
+    """
+    space, time = tokenizer.spatial_compression, tokenizer.temporal_compression
+    if (
+        video.ndim != 5
+        or video.shape[1] != 3
+        or (video.shape[2] - 1) % time
+        or video.shape[3] % space
+        or video.shape[4] % space
+    ):
+        raise DataError(
+            "The tokenizer cannot code a video of this shape",
+            expected=f"(b, 3, 1 + k * {time}, multiple of {space}, multiple of {space})",
+            got=tuple(video.shape),
+        )
+
+
+def check_latents(tokenizer: VideoTokenizer, latents: Tensor) -> None:
+    """Refuse latents of another layout.
+
+    Raises:
+        DataError: not five axes, or another number of channels.
+    """
+    if latents.ndim != 5 or latents.shape[1] != tokenizer.latent_channels:
+        expected = f"(b, {tokenizer.latent_channels}, t, h, w)"
+        raise DataError("Not latents of this tokenizer", expected=expected, got=tuple(latents.shape))
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """The ``tokenizer.json`` of a folder.
+
+    Raises:
+        CheckpointError: it is missing, damaged, or of another format.
+    """
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        raise CheckpointError("No tokenizer here", where=folder, expected=f"a folder with {DESCRIPTION}")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError("The tokenizer description is not JSON", where=path, got=str(error)) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError("Not a tokenizer", where=path, expected=FORMAT, got=content)
+    return content
+
+
+def load_tokenizer(folder: Path) -> VideoTokenizer:
+    """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.
+
+    Raises:
+        CheckpointError: the folder holds none, or a damaged one.
+    """
+    from worldline_core.model.tokenizer.patch import PatchTokenizer
+    from worldline_core.model.tokenizer.wan import WanTokenizer
+
+    if (folder / "config.json").is_file() or (folder / "vae" / "config.json").is_file():
+        return WanTokenizer.load(folder)
+    kind = read_description(folder).get("kind")
+    if kind != PatchTokenizer.KIND:
+        raise CheckpointError("Unknown kind of tokenizer", where=folder, expected=PatchTokenizer.KIND, got=kind)
+    return PatchTokenizer.load(folder)
+
+
+def resize_frame(frame: np.ndarray, size: tuple[int, int], *, out: np.ndarray) -> None:
+    """``uint8 (H, W, 3)`` at ``size`` (H, W) into ``out``: area averages when shrinking, linear when enlarging."""
+    if frame.shape[:2] == tuple(size):
+        out[...] = frame
+        return
+    shrinking = size[0] <= frame.shape[0] and size[1] <= frame.shape[1]
+    cv2.resize(frame, (size[1], size[0]), dst=out, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+
+
+def frames_to_video(frames: np.ndarray, size: tuple[int, int] | None = None) -> Float[Tensor, "3 t h w"]:
+    """``uint8 (N, H, W, 3)`` RGB to float32 in [-1, 1], resized to ``size`` (H, W) by area averaging.
+
+    Raises:
+        DataError: the frames have another shape or type.
+    """
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
+        raise DataError("Not RGB frames", expected="uint8 (N, H, W, 3)", got=f"{frames.dtype} {frames.shape}")
+    if size is not None and frames.shape[1:3] != tuple(size):
+        resized = np.empty((len(frames), *size, 3), np.uint8)
+        for frame, target in zip(frames, resized, strict=True):
+            resize_frame(frame, size, out=target)
+        frames = resized
+    return rearrange(torch.from_numpy(np.ascontiguousarray(frames)), "t h w c -> c t h w").float() / 127.5 - 1.0
+
+
+def video_to_frames(video: Float[Tensor, "3 t h w"]) -> np.ndarray:
+    """[-1, 1] to ``uint8 (N, H, W, 3)`` RGB, clamped and rounded."""
+    levels = ((video.detach().float() + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8)
+    return rearrange(levels.cpu(), "c t h w -> t h w c").contiguous().numpy()

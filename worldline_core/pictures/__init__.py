@@ -1,0 +1,1 @@
+"""Labelled pictures: contact sheets, strips and side-by-side videos."""

@@ -1,0 +1,95 @@
+"""The configuration of a whole run: one section a verb. A preset is one YAML file of this form.
+
+The folders that curation reads, as inputs of its cache key: a changed recording means new work.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from worldline_core.actions.render_actions import RenderActionsConfig
+from worldline_core.config import StrictModel
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.distillation.distill import DistillConfig
+from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
+from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
+from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
+from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.model.cosmos3 import ImportBackboneConfig
+from worldline_core.report.report import ReportConfig
+from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.store.remote import is_remote
+from worldline_core.training.encode_latents import EncodeLatentsConfig
+from worldline_core.training.stage1 import Stage1Config
+from worldline_core.training.stage2 import Stage2Config
+
+
+class ModelPaths(StrictModel):
+    """Folders of the weights that a run starts from or compares with (relative to the project)."""
+
+    tokenizer: Path
+    base: Path | None = None
+    teacher: Path | None = None
+    segmenter: Path | None = None
+    stage2: Path | None = Field(
+        default=None, description="long-trained Stage II checkpoint to report beside this run's"
+    )
+    causal: Path | None = Field(default=None, description="long-trained causal checkpoint to report beside this run's")
+
+
+class RolloutRun(StrictModel):
+    """One named set of predicted videos."""
+
+    checkpoint: Literal["stage2", "causal", "shipped_stage2", "shipped_causal"] | None = Field(
+        default=None,
+        description="this run's checkpoints, or the long-trained ones; none for a baseline without a model",
+    )
+    episodes: Literal["recordings", "banks"] = "recordings"
+    config: RolloutConfig
+
+
+class PipelineConfig(StrictModel):
+    """Everything that `worldline pipeline` does."""
+
+    models: ModelPaths
+    import_backbone: ImportBackboneConfig | None = Field(default=None, description="only for `task import_backbone`")
+    curate: CurateConfig
+    curate_banks: CurateConfig | None = None
+    filter: FilterConfig
+    render_actions: RenderActionsConfig
+    encode_latents: EncodeLatentsConfig
+    train_stage1: Stage1Config
+    train_stage2: Stage2Config
+    distill: DistillConfig
+    rollouts: dict[str, RolloutRun]
+    evaluate_video: VideoEvaluationConfig
+    evaluate_policy: PolicyEvaluationConfig
+    evaluate_planning: PlanningConfig | None = None
+    report: ReportConfig
+    runner: RunnerConfig = Field(
+        default=RunnerConfig(), description="where work on many episodes runs; changes no result and no cache key"
+    )
+
+    @model_validator(mode="after")
+    def _references_exist(self) -> PipelineConfig:
+        for name, run in self.rollouts.items():
+            if run.episodes == "banks" and self.curate_banks is None:
+                raise ValueError(f"rollouts.{name} needs curate_banks")
+            shipped = {"shipped_stage2": self.models.stage2, "shipped_causal": self.models.causal}
+            if run.checkpoint in shipped and shipped[run.checkpoint] is None:
+                raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
+        return self
+
+
+def source_inputs(config: StrictModel, project: Path) -> dict[str, Path]:
+    """``source.<n>`` -> folder or location in an object store, in the order of the configuration. Relative folders are
+    taken from ``project``."""
+    sources = getattr(config, "sources", ())
+    return {
+        f"source.{number}": source.path if is_remote(source.path) else project / source.path
+        for number, source in enumerate(sources)
+    }

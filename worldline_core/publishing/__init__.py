@@ -1,0 +1,1 @@
+"""Pushing and pulling finished sets: the Hugging Face hub, folders, object stores."""
