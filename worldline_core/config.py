@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.errors import ConfigError
 
-CONFIG_ROOT = Path(__file__).resolve().parents[2] / "configs"
+CONFIG_ROOT = Path(__file__).resolve().parents[1] / "configs"
 
 
 class _StrictLoader(yaml.SafeLoader):
