@@ -24,8 +24,8 @@ from worldline_core.calibration.diagnosis import (
 )
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, corrupt
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import LoadedEpisode, no_masks
 from worldline_core.errors import ConfigError, DataError
 
 CLEAN, INVERTED = "ur5e_pair-test-s1-00000", "ur5e_pair-train-s1-00002"

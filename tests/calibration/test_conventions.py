@@ -21,9 +21,9 @@ from worldline_core.data.episodes.conventions import (
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.repaired import repair
-from worldline_core.data.sources.source import LoadedEpisode, no_masks
 
 COUNT = 12
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from worldline_core.data.curation.instructions import (
+from worldline_core.data.episodes.instructions import (
     RAW_INSTRUCTION,
     InstructionConfig,
     mentions_outcome,

@@ -18,12 +18,12 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.io import write_episode_mcap
 from worldline_core.data.mcap.reader import read_episode_mcap
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
 from worldline_core.data.sources.repaired import undistorted
-from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.geometry.distortion import Distortion
 
 Make = Callable[..., tuple]

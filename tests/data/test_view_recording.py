@@ -16,9 +16,9 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import LoadedEpisode, no_masks
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk, view_thumbnails
 from worldline_core.filters.examine import examine

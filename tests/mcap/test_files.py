@@ -14,9 +14,9 @@ from mcap.writer import Writer as RawWriter
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import open_source
-from worldline_core.data.sources.source import EpisodeSource, LoadedEpisode
 
 
 def source(declared: dict[str, Any]) -> EpisodeSource:

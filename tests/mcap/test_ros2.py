@@ -12,9 +12,9 @@ import pytest
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import open_source
-from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.errors import DataError
 
 

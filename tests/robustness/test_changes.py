@@ -17,9 +17,9 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import note_file, unchanged_files
-from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.store.digest import digest_folder
 

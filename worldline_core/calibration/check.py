@@ -25,8 +25,8 @@ from worldline_core.calibration.pictures import diagnosis_picture
 from worldline_core.config import apply_overrides, read_yaml, validate
 from worldline_core.data.curation.checks import check_camera, check_times, check_values
 from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.exports.rollout import safe_stem
 from worldline_core.pictures.labels import jpeg_bytes

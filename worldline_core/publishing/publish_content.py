@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from worldline_core.data.curation.checks import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.atomic import atomic_path

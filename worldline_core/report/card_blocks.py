@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from worldline_core.data.curation.instructions import mentions_outcome
 from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.report.dataset_facts import UNKNOWN, DatasetFacts, hours_of
 
 MOST_INSTRUCTIONS = 15

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from worldline_core.data.curation.instructions import RAW_INSTRUCTION
 from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON
 from worldline_core.data.curation.rules import CURATION_FILE
 from worldline_core.data.curation.source_table import SourceFacts, read_source_table
@@ -21,6 +20,7 @@ from worldline_core.data.episodes.episode_index import (
     read_index,
     read_quarantine,
 )
+from worldline_core.data.episodes.instructions import RAW_INSTRUCTION
 from worldline_core.report.artifacts import JsonObject, read_json, read_rows, read_table
 from worldline_core.report.inspect_pictures import linked_folder
 

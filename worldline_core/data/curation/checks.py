@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.episodes.recorded_poses import camera_pose
+from worldline_core.data.episodes.episode import TRAINING_SPLITS, CameraTrack, Episode
+from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError
 
@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 # No joint of a manipulator turns further; larger numbers are degrees or encoder ticks.
 MAX_JOINT_RAD = 4 * np.pi
 _GRIPPER_MARGIN = 0.05
-TRAINING_SPLITS = ("train", "validation")
-EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
-"""Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
-EVALUATION_ONLY = "evaluation_only"
-"""Noted in the conventions of episodes of other layouts that never do either."""
-_DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
-
-
-def says_droid(*names: str) -> bool:
-    """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
-    return any(_DROID.search(name) for name in names)
 
 
 def check_split(episode: Episode) -> None:
@@ -168,21 +157,6 @@ def check_camera(episode: Episode, camera: CameraTrack) -> None:
     where = f"episode {episode.episode_id}, view {camera.view}"
     check_intrinsics(camera, where)
     camera_pose(camera.view, camera.T_base_camera, where=where)
-
-
-def check_intrinsics(camera: CameraTrack, where: str) -> None:
-    """Raises: RejectedInputError (singular_intrinsics)."""
-    K = camera.K
-    pinhole = np.isfinite(K).all() and K[0, 0] > 1e-6 and K[1, 1] > 1e-6 and np.allclose(K[2], [0, 0, 1], atol=1e-6)
-    if not pinhole or abs(np.linalg.det(K)) < 1e-9:
-        raise RejectedInputError(
-            "singular_intrinsics",
-            "Camera matrix cannot be inverted",
-            where=where,
-            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
-            got=K.tolist(),
-            evidence={"view": camera.view, "K": [None if not np.isfinite(v) else float(v) for v in K.reshape(-1)]},
-        )
 
 
 def stride_to(episode: Episode, fps: float | None) -> int:

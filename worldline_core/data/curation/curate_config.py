@@ -5,10 +5,10 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.data.curation.instructions import InstructionConfig
 from worldline_core.data.curation.near_duplicates import NearDuplicateConfig
 from worldline_core.data.curation.scenes import LeakageConfig, Splits
 from worldline_core.data.curation.source_weights import SourceSampling
+from worldline_core.data.episodes.instructions import InstructionConfig
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.video.decode import Fit

@@ -25,12 +25,12 @@ from worldline_core.data.curation.checks import (
     stride_to,
 )
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.instructions import with_instruction
 from worldline_core.data.curation.scenes import with_split
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.instructions import with_instruction
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import LoadedEpisode
 from worldline_core.data.video.decode import fitted
 from worldline_core.data.video.thumbnails import ViewThumbnails
 

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.data.curation.checks import EVALUATION_LAYOUTS
 from worldline_core.data.episodes.episode import Episode, Split
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS
 
 
 class SceneSplits(StrictModel):

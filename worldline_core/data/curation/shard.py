@@ -12,10 +12,10 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.recorded_episode import check_episode, prepare_episode
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.rejection import RejectedInputError, check_id
 from worldline_core.data.guards.source_paths import AnyPath, parse_location, portable_text, unchanged_files, watch_run
 from worldline_core.data.sources.open import open_source
-from worldline_core.data.sources.source import EpisodeSource
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.scale.mapping import crash_evidence, ends_the_run, portable_message
 from worldline_core.scale.shard_manifest import InputRow, write_shard_manifest

@@ -20,6 +20,8 @@ VIEWS = ("head", "left_wrist", "right_wrist")
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
 Outcome = Literal["success", "failure", "unknown"]
 Split = Literal["train", "validation", "test", "ood_test", "bank"]
+TRAINING_SPLITS = ("train", "validation")
+"""Splits that train or select a model."""
 StateKind = Literal["joints", "ee_pose", "none"]
 
 

@@ -36,7 +36,7 @@ from worldline_core.data.episodes.episode_parts import (
 from worldline_core.data.episodes.sidecar import write_sidecar
 from worldline_core.data.episodes.view_recording import RecordedView, VideoMode, VideoSettings
 from worldline_core.data.guards.source_paths import safe_name
-from worldline_core.data.lerobot.v3_writer import write_dataset
+from worldline_core.data.lerobot.v3_writer import DatasetEpisode, EpisodeVideo, write_dataset
 from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
@@ -213,7 +213,7 @@ class EpisodeSetWriter:
             used[embodiment] = used.get(embodiment, 0) + 1
             name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
             dataset = self.root / "datasets" / name
-            write_dataset(dataset, members, video_megabytes=self.video_megabytes)
+            write_dataset(dataset, [_dataset_episode(part) for part in members], video_megabytes=self.video_megabytes)
             write_sidecar(dataset, members)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
         write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
@@ -235,6 +235,31 @@ def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
     copied = sum(video["copied"] for video in videos)
     codecs = Counter(f"{video['codec']} {video['pixel_format']}" for video in videos)
     return {"copied": copied, "encoded": len(videos) - copied, "codecs": dict(sorted(codecs.items()))}
+
+
+def _dataset_episode(part: Part) -> DatasetEpisode:
+    videos = {
+        view: EpisodeVideo(
+            path=part.video(view),
+            size=part.image_sizes[view],
+            codec=part["videos"][view]["codec"],
+            pixel_format=part["videos"][view]["pixel_format"],
+            copied=part["videos"][view]["copied"],
+            histogram=part.arrays[f"histogram.{view}"],
+            thumbnails=part.thumbnails(view),
+        )
+        for view in part.views
+    }
+    return DatasetEpisode(
+        instruction=part["instruction"],
+        embodiment=part["embodiment"],
+        fps=part["fps"],
+        num_frames=part["video_frames"],
+        state=part.arrays["state"][: part["video_frames"]],
+        action=part.arrays["action"][: part["video_frames"]],
+        state_names=part["state_names"],
+        videos=videos,
+    )
 
 
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:

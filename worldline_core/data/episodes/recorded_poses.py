@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
@@ -61,6 +61,21 @@ def camera_pose(
     build = CameraPose.from_camera_to_base if extrinsics == "camera_to_base" else CameraPose.from_base_to_camera
     with rejected_as("invalid_extrinsics", where, {"view": view, **_deviation(matrices)}):
         return build(matrices, axes=axes, where=f"view {view}")
+
+
+def check_intrinsics(camera: CameraTrack, where: str) -> None:
+    """Raises: RejectedInputError (singular_intrinsics)."""
+    K = camera.K
+    pinhole = np.isfinite(K).all() and K[0, 0] > 1e-6 and K[1, 1] > 1e-6 and np.allclose(K[2], [0, 0, 1], atol=1e-6)
+    if not pinhole or abs(np.linalg.det(K)) < 1e-9:
+        raise RejectedInputError(
+            "singular_intrinsics",
+            "Camera matrix cannot be inverted",
+            where=where,
+            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
+            got=K.tolist(),
+            evidence={"view": camera.view, "K": [None if not np.isfinite(v) else float(v) for v in K.reshape(-1)]},
+        )
 
 
 def repair_notes(repairs: Mapping[str, RotationRepair]) -> dict[str, str | int | float]:

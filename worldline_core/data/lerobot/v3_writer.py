@@ -1,18 +1,18 @@
-"""Assemble waiting episodes into a LeRobotDataset v3.0 (LeRobot 0.6 opens it with its own class)."""
+"""Assemble episodes into a LeRobotDataset v3.0 (LeRobot 0.6 opens it with its own class)."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from worldline_core.data.episodes.episode_parts import Part
-from worldline_core.data.episodes.view_recording import as_json, image_statistics, vector_statistics
+from worldline_core.data.lerobot.statistics import as_json, image_statistics, vector_statistics
 from worldline_core.data.lerobot.v3 import (
     DATA_PATH,
     EPISODES_PATH,
@@ -30,48 +30,89 @@ _DATA_MEGABYTES = 100
 _VIDEO_MEGABYTES = 200
 
 
-def write_dataset(root: Path, parts: Sequence[Part], *, video_megabytes: int = _VIDEO_MEGABYTES) -> None:
-    """Write the dataset of parts with equal signatures; episode i is parts[i].
+@dataclass(frozen=True)
+class EpisodeVideo:
+    """The finished video of one view.
+
+    Attributes:
+        size: (height, width).
+        codec, pixel_format: as FFmpeg names them.
+        copied: whether it holds the packets of the recording, and so shares no file with other episodes.
+        histogram: (3, 256) counts of sampled pixels, from `ImageSampler`.
+        thumbnails: file of the thumbnails of a copied video.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    codec: str
+    pixel_format: str
+    copied: bool
+    histogram: np.ndarray
+    thumbnails: Path
+
+
+@dataclass(frozen=True)
+class DatasetEpisode:
+    """One episode of a dataset.
+
+    Attributes:
+        num_frames: of state, action and every video.
+        state, action: (num_frames, J) float32; J may be 0.
+        videos: by view, in the order of the dataset's features.
+    """
+
+    instruction: str
+    embodiment: str
+    fps: float
+    num_frames: int
+    state: np.ndarray
+    action: np.ndarray
+    state_names: list[str] | None
+    videos: Mapping[str, EpisodeVideo]
+
+
+def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megabytes: int = _VIDEO_MEGABYTES) -> None:
+    """Write the dataset of episodes that have the same features and rate.
 
     A rerun over a half-written folder overwrites each file with the same bytes.
     """
-    first = parts[0]
-    fps = first["fps"]
-    lengths = [part["video_frames"] for part in parts]
+    first = episodes[0]
+    fps = first.fps
+    lengths = [episode.num_frames for episode in episodes]
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int)
-    instructions = list(dict.fromkeys(part["instruction"] for part in parts))
+    instructions = list(dict.fromkeys(episode.instruction for episode in episodes))
     task_of = {text: index for index, text in enumerate(instructions)}
 
-    table = _data_table(parts, starts, task_of)
+    table = _data_table(episodes, starts, task_of)
     data_files = _files_by_size([24 * length * max(table.num_columns, 1) for length in lengths], _DATA_MEGABYTES)
-    places = {view: _write_videos(root, view, parts, video_megabytes) for view in first.views}
-    episodes = []
+    places = {view: _write_videos(root, view, episodes, video_megabytes) for view in first.videos}
+    rows = []
     for file in sorted(set(data_files)):
         members = [index for index, other in enumerate(data_files) if other == file]
         begin, end = int(starts[members[0]]), int(starts[members[-1] + 1])
         path = root / DATA_PATH.format(chunk_index=file // _CHUNK_SIZE, file_index=file % _CHUNK_SIZE)
         write_table(path, table.slice(begin, end - begin), rows_per_group=[lengths[index] for index in members])
-    for index, part in enumerate(parts):
-        statistics = _episode_statistics(part, table.slice(int(starts[index]), lengths[index]))
+    for index, episode in enumerate(episodes):
+        statistics = _episode_statistics(episode, table.slice(int(starts[index]), lengths[index]))
         row: dict[str, Any] = {
             "episode_index": index,
-            "tasks": [part["instruction"]],
+            "tasks": [episode.instruction],
             "length": lengths[index],
             "data/chunk_index": data_files[index] // _CHUNK_SIZE,
             "data/file_index": data_files[index] % _CHUNK_SIZE,
             "dataset_from_index": int(starts[index]),
             "dataset_to_index": int(starts[index + 1]),
         }
-        for view in first.views:
+        for view in first.videos:
             row |= places[view][index]
         for key, feature in statistics.items():
             row |= {f"stats/{key}/{name}": value.tolist() for name, value in feature.items()}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        episodes.append(row)
-    write_table(root / EPISODES_PATH.format(chunk_index=0, file_index=0), pa.Table.from_pylist(episodes))
+        rows.append(row)
+    write_table(root / EPISODES_PATH.format(chunk_index=0, file_index=0), pa.Table.from_pylist(rows))
     write_table(root / "meta" / "tasks.parquet", _tasks_table(instructions))
-    write_json_atomic(root / "meta" / "stats.json", as_json(_dataset_statistics(parts, table)))
-    write_json_atomic(root / "meta" / "info.json", _info(parts, len(instructions), video_megabytes, fps))
+    write_json_atomic(root / "meta" / "stats.json", as_json(_dataset_statistics(episodes, table)))
+    write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions), video_megabytes, fps))
 
 
 def _files_by_size(sizes: Sequence[float], megabytes: int) -> list[int]:
@@ -85,19 +126,19 @@ def _files_by_size(sizes: Sequence[float], megabytes: int) -> list[int]:
     return files
 
 
-def _data_table(parts: Sequence[Part], starts: np.ndarray, task_of: dict[str, int]) -> pa.Table:
+def _data_table(episodes: Sequence[DatasetEpisode], starts: np.ndarray, task_of: dict[str, int]) -> pa.Table:
     columns: dict[str, list[np.ndarray]] = {}
-    for index, part in enumerate(parts):
-        length, fps = part["video_frames"], part["fps"]
+    for index, episode in enumerate(episodes):
+        length, fps = episode.num_frames, episode.fps
         frame_index = np.arange(length, dtype=np.int64)
         values = {
-            "observation.state": part.arrays["state"][:length],
-            "action": part.arrays["action"][:length],
+            "observation.state": episode.state,
+            "action": episode.action,
             "timestamp": (frame_index / fps).astype(np.float32),
             "frame_index": frame_index,
             "episode_index": np.full(length, index, dtype=np.int64),
             "index": frame_index + int(starts[index]),
-            "task_index": np.full(length, task_of[part["instruction"]], dtype=np.int64),
+            "task_index": np.full(length, task_of[episode.instruction], dtype=np.int64),
         }
         for name, value in values.items():
             if value.size:  # an episode without states has no such columns: LeRobot knows no empty feature
@@ -110,55 +151,55 @@ def _data_table(parts: Sequence[Part], starts: np.ndarray, task_of: dict[str, in
     return pa.table(arrays)
 
 
-def _video_files(parts: Sequence[Part], view: str, megabytes: int) -> list[list[Part]]:
+def _video_files(episodes: Sequence[DatasetEpisode], view: str, megabytes: int) -> list[list[DatasetEpisode]]:
     """Which episodes share a file: those encoded here up to a size, none where the video was copied as it was recorded.
 
     Copied videos may differ in parameter sets, and have frames stored out of order: joined they could not be found again
     exactly.
     """
-    files: list[list[Part]] = []
+    files: list[list[DatasetEpisode]] = []
     filled, open_to_more = 0, False
-    for part in parts:
-        size = part.video(view).stat().st_size
-        joins = open_to_more and not part.copied(view) and filled + size <= megabytes * 2**20
+    for episode in episodes:
+        size = episode.videos[view].path.stat().st_size
+        joins = open_to_more and not episode.videos[view].copied and filled + size <= megabytes * 2**20
         if joins:
-            files[-1].append(part)
+            files[-1].append(episode)
         else:
-            files.append([part])
+            files.append([episode])
         filled = filled + size if joins else size
-        open_to_more = not part.copied(view)
+        open_to_more = not episode.videos[view].copied
     return files
 
 
-def _write_videos(root: Path, view: str, parts: Sequence[Part], megabytes: int) -> list[dict[str, Any]]:
+def _write_videos(root: Path, view: str, episodes: Sequence[DatasetEpisode], megabytes: int) -> list[dict[str, Any]]:
     """Join the clips of one view; returns the videos/<key>/* columns of each episode."""
     key = IMAGE_PREFIX + view
     rows: list[dict[str, Any]] = []
-    for file, members in enumerate(_video_files(parts, view, megabytes)):
+    for file, members in enumerate(_video_files(episodes, view, megabytes)):
         chunk_index, file_index = file // _CHUNK_SIZE, file % _CHUNK_SIZE
         target = root / VIDEO_PATH.format(video_key=key, chunk_index=chunk_index, file_index=file_index)
         with atomic_path(target) as temporary:
-            if members[0].copied(view):
-                _link(members[0].video(view), temporary)
+            if members[0].videos[view].copied:
+                _link(members[0].videos[view].path, temporary)
             else:
                 concatenate_videos(
-                    temporary, [(part.video(view), part["video_frames"]) for part in members], members[0]["fps"]
+                    temporary, [(episode.videos[view].path, episode.num_frames) for episode in members], members[0].fps
                 )
-        if members[0].copied(view):
+        if members[0].videos[view].copied:
             thumbnails = cache_path(root.parents[1], target)
             thumbnails.parent.mkdir(parents=True, exist_ok=True)
-            _link(members[0].thumbnails(view), thumbnails)
+            _link(members[0].videos[view].thumbnails, thumbnails)
         frame = 0
-        for part in members:
+        for episode in members:
             rows.append(
                 {
                     f"videos/{key}/chunk_index": chunk_index,
                     f"videos/{key}/file_index": file_index,
-                    f"videos/{key}/from_timestamp": frame / part["fps"],
-                    f"videos/{key}/to_timestamp": (frame + part["video_frames"]) / part["fps"],
+                    f"videos/{key}/from_timestamp": frame / episode.fps,
+                    f"videos/{key}/to_timestamp": (frame + episode.num_frames) / episode.fps,
                 }
             )
-            frame += part["video_frames"]
+            frame += episode.num_frames
     return rows
 
 
@@ -178,18 +219,18 @@ def _column(table: pa.Table, name: str) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _episode_statistics(part: Part, table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
+def _episode_statistics(episode: DatasetEpisode, table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
     statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
-    for view in part.views:
-        statistics[IMAGE_PREFIX + view] = image_statistics([part.arrays[f"histogram.{view}"]], part["video_frames"])
+    for view in episode.videos:
+        statistics[IMAGE_PREFIX + view] = image_statistics([episode.videos[view].histogram], episode.num_frames)
     return statistics
 
 
-def _dataset_statistics(parts: Sequence[Part], table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
+def _dataset_statistics(episodes: Sequence[DatasetEpisode], table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
     statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
-    for view in parts[0].views:
-        histograms = [part.arrays[f"histogram.{view}"] for part in parts]
-        statistics[IMAGE_PREFIX + view] = image_statistics(histograms, sum(part["video_frames"] for part in parts))
+    for view in episodes[0].videos:
+        histograms = [episode.videos[view].histogram for episode in episodes]
+        statistics[IMAGE_PREFIX + view] = image_statistics(histograms, sum(episode.num_frames for episode in episodes))
     return statistics
 
 
@@ -209,14 +250,15 @@ def _tasks_table(instructions: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(metadata)})
 
 
-def _info(parts: Sequence[Part], total_tasks: int, video_megabytes: int, fps: float) -> dict[str, Any]:
-    first = parts[0]
-    width = first.arrays["state"].shape[1]
-    names = first["state_names"] or [f"state_{index}" for index in range(width)]
+def _info(episodes: Sequence[DatasetEpisode], total_tasks: int, video_megabytes: int, fps: float) -> dict[str, Any]:
+    first = episodes[0]
+    width = first.state.shape[1]
+    names = first.state_names or [f"state_{index}" for index in range(width)]
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": [width], "names": names} for key in ("observation.state", "action") if width
     }
-    for view, (image_height, image_width) in first.image_sizes.items():
+    for view, video in first.videos.items():
+        image_height, image_width = video.size
         features[IMAGE_PREFIX + view] = {
             "dtype": "video",
             "shape": [image_height, image_width, 3],
@@ -224,8 +266,8 @@ def _info(parts: Sequence[Part], total_tasks: int, video_megabytes: int, fps: fl
             "info": {
                 "video.height": image_height,
                 "video.width": image_width,
-                "video.codec": first["videos"][view]["codec"],
-                "video.pix_fmt": first["videos"][view]["pixel_format"],
+                "video.codec": video.codec,
+                "video.pix_fmt": video.pixel_format,
                 "video.fps": int(fps) if fps == int(fps) else fps,
                 "video.channels": 3,
                 "has_audio": False,
@@ -237,15 +279,15 @@ def _info(parts: Sequence[Part], total_tasks: int, video_megabytes: int, fps: fl
         features[name] = {"dtype": "int64", "shape": [1], "names": None}
     return {
         "codebase_version": VERSION,
-        "robot_type": first["embodiment"],
-        "total_episodes": len(parts),
-        "total_frames": sum(part["video_frames"] for part in parts),
+        "robot_type": first.embodiment,
+        "total_episodes": len(episodes),
+        "total_frames": sum(episode.num_frames for episode in episodes),
         "total_tasks": total_tasks,
         "chunks_size": _CHUNK_SIZE,
         "data_files_size_in_mb": _DATA_MEGABYTES,
         "video_files_size_in_mb": video_megabytes,
         "fps": int(fps) if fps == int(fps) else fps,
-        "splits": {"train": f"0:{len(parts)}"},
+        "splits": {"train": f"0:{len(episodes)}"},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH,
         "features": features,

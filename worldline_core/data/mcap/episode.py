@@ -10,6 +10,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
+from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap import resampling
 from worldline_core.data.mcap.cameras import camera_tracks, read_calibration
@@ -22,7 +23,6 @@ from worldline_core.data.mcap.robot import RobotSignals, read_robot
 from worldline_core.data.mcap.streams import READING_MARGIN_NS, Stream, Timing, read_streams
 from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig, ViewTopics
 from worldline_core.data.mcap.transforms import TransformTree, read_tree
-from worldline_core.data.sources.source import LoadedEpisode, no_masks
 
 LAYOUT = "mcap topics"
 _KINDS: dict[str, tuple[Kind, ...]] = {

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange
 from worldline_core.data.mcap.resampling import TimeSource
-from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange
 
 Resampling = Literal["linear", "hold"]
 

@@ -1,5 +1,5 @@
 """Readers of recordings: each turns its own format, units and conventions into `Episode`."""
 
-from worldline_core.data.sources.source import EpisodeSource, LoadedEpisode
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
 
 __all__ = ["EpisodeSource", "LoadedEpisode"]

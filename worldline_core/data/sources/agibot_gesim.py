@@ -19,11 +19,11 @@ from pydantic import Field
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.data.guards.images import read_image
 from worldline_core.data.guards.plain_files import read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
-from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.geometry.cameras import CameraPose
 from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw

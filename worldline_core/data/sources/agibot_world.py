@@ -22,6 +22,7 @@ from pydantic import Field
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -32,7 +33,6 @@ from worldline_core.data.sources.agibot_gesim import (
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
-from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_video, video_size
 from worldline_core.geometry.cameras import CameraPose

@@ -27,11 +27,11 @@ from pydantic import Field, ValidationError, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
+from worldline_core.data.episodes.source import LensConfig
 from worldline_core.data.guards.limits import regular_file, too_large
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.sources.source import LensConfig
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 

@@ -12,14 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.curation.checks import EVALUATION_LAYOUTS
-from worldline_core.data.curation.instructions import one_annotation
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.instructions import one_annotation
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EvaluationSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.guards.plain_files import read_json, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
-from worldline_core.data.sources.source import EvaluationSourceConfig, LoadedEpisode, no_masks
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_video, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz

@@ -8,9 +8,9 @@ from typing import Literal
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import with_rigid_poses
+from worldline_core.data.episodes.source import LoadedEpisode, SourceConfigBase
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.sources.source import LoadedEpisode, SourceConfigBase
 
 
 class EpisodeSetSourceConfig(SourceConfigBase):

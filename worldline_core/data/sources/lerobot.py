@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.curation.checks import EVALUATION_ONLY, TRAINING_SPLITS, says_droid
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
+from worldline_core.data.episodes.source import EVALUATION_ONLY, LoadedEpisode, no_masks, says_droid
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
@@ -27,7 +27,6 @@ from worldline_core.data.sources.calibration_file import (
     read_calibration,
 )
 from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, flat_names
-from worldline_core.data.sources.source import LoadedEpisode, no_masks
 from worldline_core.errors import ConfigError, DataError
 
 _RATE_TOLERANCE = 1e-2

@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.data.curation.checks import TRAINING_SPLITS
+from worldline_core.data.episodes.episode import TRAINING_SPLITS
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import ForeignSourceConfig, GripperRange
 from worldline_core.errors import ConfigError
 
 ReadColumn = Callable[[str], np.ndarray]

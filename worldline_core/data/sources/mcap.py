@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+from worldline_core.data.episodes.source import LoadedEpisode, SourceConfigBase
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.mcap.episode import read_episode
@@ -19,7 +20,6 @@ from worldline_core.data.mcap.episodes import Segment, segments
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.reader import read_episode_id, read_episode_mcap
 from worldline_core.data.mcap.topics_config import Markers, McapTopicsSourceConfig
-from worldline_core.data.sources.source import LoadedEpisode, SourceConfigBase
 from worldline_core.errors import DataError
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
@@ -16,7 +17,6 @@ from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapT
 from worldline_core.data.sources.repaired import PinholeSource, RepairedSource
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
-from worldline_core.data.sources.source import EpisodeSource
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
 from worldline_core.errors import DataError
 

@@ -10,11 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldline_core.data.curation.checks import check_intrinsics
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
-from worldline_core.data.episodes.recorded_poses import rejected_as
+from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.source import EpisodeSource, LoadedEpisode
 from worldline_core.geometry.distortion import Distortion
 
 

@@ -18,15 +18,20 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.curation.checks import EVALUATION_LAYOUTS
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.episodes.source import (
+    EVALUATION_LAYOUTS,
+    EvaluationSourceConfig,
+    GripperRange,
+    LoadedEpisode,
+    no_masks,
+)
 from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.images import image_size
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.source import EvaluationSourceConfig, GripperRange, LoadedEpisode, no_masks
 from worldline_core.geometry.cameras import CameraPose
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 

@@ -22,11 +22,11 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode, no_masks, printable, unique_names
 from worldline_core.data.guards.limits import MAX_TEXT_BYTES, regular_file, too_large
 from worldline_core.data.guards.plain_files import read_json, read_json_lines
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.source import ForeignSourceConfig, LoadedEpisode, no_masks, printable, unique_names
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import decode_video, frame_times, video_size
 from worldline_core.errors import ConfigError, DataError

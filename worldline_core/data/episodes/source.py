@@ -6,6 +6,7 @@ Ids of episodes that are files: the label and the path, told apart where that is
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,14 +17,19 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.data.curation.checks import TRAINING_SPLITS
 from worldline_core.data.episodes.conventions import RecordedConventions
-from worldline_core.data.episodes.episode import Episode, Outcome, Split, TaskFamily
+from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.decode import Fit
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.distortion import Distortion, DistortionModel
+
+EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
+"""Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
+EVALUATION_ONLY = "evaluation_only"
+"""Noted in the conventions of episodes of other layouts that never do either."""
+_DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
 
 
 @dataclass(frozen=True)
@@ -179,6 +185,11 @@ class GripperRange(StrictModel):
         """Opening in 0 closed .. 1 open, clipped, and how many readings lay outside."""
         value = (np.asarray(raw, dtype=np.float64) - self.closed) / (self.open - self.closed)
         return np.clip(value, 0.0, 1.0), int(np.count_nonzero((value < 0.0) | (value > 1.0)))
+
+
+def says_droid(*names: str) -> bool:
+    """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
+    return any(_DROID.search(name) for name in names)
 
 
 def no_masks(view: str) -> None:
