@@ -23,10 +23,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from worldline_core.data.curation.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
 from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, find_near_duplicates
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
 from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.thumbnails import view_thumbnails

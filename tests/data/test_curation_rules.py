@@ -135,7 +135,7 @@ def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) 
 
 
 def described_parts(samples: list[tuple]) -> list[dict[str, Any]]:
-    from worldline_core.data.curation.fingerprint import fingerprint
+    from worldline_core.data.episodes.fingerprint import fingerprint
 
     return [
         {

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.fingerprint import MINHASHES, Fingerprint, fingerprint, motion_hashes
 from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.fingerprint import MINHASHES, Fingerprint, fingerprint, motion_hashes
 from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.errors import DataError
 

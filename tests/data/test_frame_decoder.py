@@ -19,6 +19,7 @@ from worldline_core.data.video.encoder import concatenate_videos, encode_video
 from worldline_core.data.video.frame_decoder import (
     FrameDecoder,
     PyavDecoder,
+    TorchcodecDecoder,
     describe_decoders,
     open_decoder,
     torchcodec_fault,
@@ -188,8 +189,6 @@ def test_open_files_are_bounded(decoder: FrameDecoder, tmp_path: Path) -> None:
 
 @needs_torchcodec
 def test_torchcodec_leaves_approximate_seeking_where_it_misses(tmp_path: Path) -> None:
-    from worldline_core.data.video.torchcodec_decoder import TorchcodecDecoder
-
     # The rate in the header is the mean of two: frame numbers computed from it are wrong nearly everywhere.
     times = [*range(30), *range(30, 120, 3)]
     path = write(tmp_path / "variable.mp4", moving(60), times=times, g="12")

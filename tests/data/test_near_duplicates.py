@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint
 from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, find_near_duplicates
+from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint
 
 VIEWS = ("head", "left_wrist")
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config import StrictModel
-from worldline_core.data.curation.fingerprint import MINHASHES, MOMENTS, Fingerprint
+from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint
 
 _BAND = 3
 _HALF_BITS = np.uint64(0xFFFFFFFF)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.fingerprint import Fingerprint
 from worldline_core.data.curation.near_duplicates import NearDuplicate, find_near_duplicates
 from worldline_core.data.curation.scenes import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
 from worldline_core.data.episodes.episode_index import QuarantineRow
+from worldline_core.data.episodes.fingerprint import Fingerprint
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
 

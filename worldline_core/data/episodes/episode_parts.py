@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.curation.fingerprint import fingerprint
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.thumbnails import ViewThumbnails, write_thumbnails

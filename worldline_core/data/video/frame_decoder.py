@@ -10,25 +10,32 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cache
 from itertools import pairwise
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import av
 import av.error
 import numpy as np
-from av.container import InputContainer
-from av.video.stream import VideoStream
 
+from worldline_core.data.guards.limits import check_image_size
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import local_file
 from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, undecodable, wrong_count
+from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import DataError, UnavailableError
+
+if TYPE_CHECKING:
+    from torchcodec.decoders import VideoDecoder
 
 logger = logging.getLogger(__name__)
 
 DecoderChoice = Literal["auto", "torchcodec", "pyav"]
+_CHUNK_BYTES = 8 << 20
+"""torchcodec's frames are fetched in chunks of this size, so that the allocator hands out the same warm memory again: for
+whole clips of 480 x 640 the page faults of fresh memory cost about a third of the decoding."""
 FFMPEG_ADVICE = "install FFmpeg's libraries (apt-get install ffmpeg), or take decoder pyav, which carries its own"
 
 
@@ -66,8 +73,6 @@ def open_decoder(choice: DecoderChoice = "auto", *, open_files: int = 16) -> Fra
         return PyavDecoder(open_files=open_files)
     fault = torchcodec_fault()
     if fault is None:
-        from worldline_core.data.video.torchcodec_decoder import TorchcodecDecoder
-
         decoder = TorchcodecDecoder(open_files=open_files)
         logger.info("Videos are decoded with %s.", decoder.name)
         return decoder
@@ -120,49 +125,48 @@ def frame_times(clip: VideoClip, indices: Sequence[int]) -> list[float]:
     return [clip.start_time + index / clip.fps for index in indices]
 
 
-def lost_frame(clip: VideoClip, wanted: int, found: int, cause: str | None = None) -> RejectedInputError:
-    """The rejection of a clip of which only ``found`` of ``wanted`` frames can be decoded."""
-    return wrong_count(clip.path, wanted, found, cause or "a frame is not where it should be")
+def _lost_frame(clip: VideoClip, wanted: int, found: int) -> RejectedInputError:
+    return wrong_count(clip.path, wanted, found, "a frame is not where it should be")
 
 
-class OpenFiles[F]:
-    """A bounded number of open things by path, the longest unused closed first."""
+class _OpenFiles[F]:
+    """A bounded number of open files by path; the least recently used one is closed first.
 
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
+    Args:
+        limit: how many stay open at most.
+        close: what closes one.
+    """
+
+    def __init__(self, limit: int, close: Callable[[F], object]) -> None:
+        self._limit = limit
+        self._close = close
         self._open: OrderedDict[str, F] = OrderedDict()
 
-    def get(self, path: object) -> F | None:
-        """What is open for a path, now the most recently used, or None."""
-        key = str(path)
-        if key in self._open:
-            self._open.move_to_end(key)
-        return self._open.get(key)
+    def get(self, clip: VideoClip, open_file: Callable[[VideoClip], F]) -> F:
+        """The clip's file, opened by `open_file` unless it still is."""
+        key = str(clip.path)
+        if key not in self._open:
+            self._open[key] = open_file(clip)
+            while len(self._open) > self._limit:
+                self._close(self._open.popitem(last=False)[1])
+        self._open.move_to_end(key)
+        return self._open[key]
 
-    def add(self, path: object, value: F) -> list[F]:
-        """Keep one more; returns those that have to be closed for it."""
-        self._open[str(path)] = value
-        return [self._open.popitem(last=False)[1] for _ in range(len(self._open) - self.limit)]
+    def drop(self, clip: VideoClip) -> None:
+        """Close a file that failed: it is opened afresh next time."""
+        file = self._open.pop(str(clip.path), None)
+        if file is not None:
+            self._close(file)
 
-    def remove(self, path: object) -> F | None:
-        """Forget one."""
-        return self._open.pop(str(path), None)
-
-    def clear(self) -> list[F]:
-        """Forget all and return them."""
-        values = list(self._open.values())
-        self._open.clear()
-        return values
-
-    def __len__(self) -> int:
-        return len(self._open)
+    def clear(self) -> None:
+        """Close all files."""
+        while self._open:
+            self._close(self._open.popitem()[1])
 
 
 class _PyavFile:
     def __init__(self, clip: VideoClip) -> None:
         self._stack = ExitStack()
-        self.container: InputContainer
-        self.stream: VideoStream
         self.container, self.stream = self._stack.enter_context(open_video(clip.path))
         # dav1d starts threads of its own unless told otherwise: processes are parallel already.
         self.stream.codec_context.thread_count = 1
@@ -177,13 +181,13 @@ class PyavDecoder:
     name = f"PyAV {importlib.metadata.version('av')}"
 
     def __init__(self, *, open_files: int = 16) -> None:
-        self._files: OpenFiles[_PyavFile] = OpenFiles(open_files)
+        self._files: _OpenFiles[_PyavFile] = _OpenFiles(open_files, _PyavFile.close)
 
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
         times = frame_times(clip, indices)
         found = 0
         try:
-            file = self._file(clip)
+            file = self._files.get(clip, _PyavFile)
             for frame in seek_before(file.container, file.stream, times[0]):
                 if frame.time is None or frame.pts is None:
                     continue
@@ -197,28 +201,77 @@ class PyavDecoder:
                 if found == len(times):
                     return
         except av.error.FFmpegError as error:
-            self._drop(clip)
+            self._files.drop(clip)
             raise undecodable(clip.path, error) from error
-        self._drop(clip)
-        raise lost_frame(clip, len(times), found)
+        self._files.drop(clip)
+        raise _lost_frame(clip, len(times), found)
 
     def close(self) -> None:
-        for file in self._files.clear():
-            file.close()
+        self._files.clear()
 
-    def _file(self, clip: VideoClip) -> _PyavFile:
-        file = self._files.get(clip.path)
-        if file is None:
-            file = _PyavFile(clip)
-            for old in self._files.add(clip.path, file):
-                old.close()
-        return file
 
-    def _drop(self, clip: VideoClip) -> None:
-        """A file that failed is opened afresh next time."""
-        file = self._files.remove(clip.path)
-        if file is not None:
-            file.close()
+class TorchcodecDecoder:
+    """torchcodec on the CPU, one thread per file.
+
+    Files are opened in its approximate mode, which reads the header alone, while the exact mode first reads through the
+    whole file (hundreds of megabytes where episodes are joined). Approximate is only where it looks for a frame: the
+    times of the decoded frames are compared with the wanted ones, and where one differs (variable frame rates), the file
+    is opened again in exact mode, and stays so (`exact_files`).
+    """
+
+    def __init__(self, *, open_files: int = 16) -> None:
+        self.name = torchcodec_name()
+        self._files: _OpenFiles[VideoDecoder] = _OpenFiles(open_files, lambda _: None)
+        self.exact_files: set[str] = set()
+
+    def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        times = frame_times(clip, indices)
+        done = 0
+        while done < len(times):
+            decoder = self._files.get(clip, self._opened)
+            frame_bytes = 3 * (decoder.metadata.width or 0) * (decoder.metadata.height or 0)
+            wanted = times[done : done + max(1, _CHUNK_BYTES // max(1, frame_bytes))]
+            pictures = _frames_at(decoder, clip, wanted)
+            if pictures is None:
+                self._files.drop(clip)
+                if str(clip.path) in self.exact_files:
+                    raise _lost_frame(clip, len(times), done)
+                self.exact_files.add(str(clip.path))
+                continue
+            yield from pictures
+            done += len(wanted)
+
+    def close(self) -> None:
+        self._files.clear()
+
+    def _opened(self, clip: VideoClip) -> VideoDecoder:
+        from torchcodec.decoders import VideoDecoder
+
+        file = check_video_header(local_file(clip.path))
+        try:
+            decoder = VideoDecoder(
+                str(file),
+                dimension_order="NHWC",
+                num_ffmpeg_threads=1,
+                seek_mode="exact" if str(clip.path) in self.exact_files else "approximate",
+                device="cpu",
+            )
+        except (RuntimeError, ValueError) as error:
+            raise undecodable(clip.path, str(error).splitlines()[0]) from error
+        check_image_size(decoder.metadata.width or 0, decoder.metadata.height or 0, str(clip.path))
+        return decoder
+
+
+def _frames_at(decoder: VideoDecoder, clip: VideoClip, times: list[float]) -> np.ndarray | None:
+    """uint8 (n, H, W, 3) of the frames at `times` [s]; None where torchcodec does not find them in its present mode."""
+    # A little after a frame begins: rounding must not name the frame before.
+    inside = [time + FRAME_TOLERANCE / clip.fps for time in times]
+    try:
+        batch = decoder.get_frames_played_at(inside)
+    except (RuntimeError, IndexError, ValueError):
+        return None
+    late = (batch.pts_seconds.numpy() - np.asarray(times)) * clip.fps
+    return batch.data.numpy() if bool((np.abs(late) <= FRAME_TOLERANCE).all()) else None
 
 
 def describe_decoders() -> dict[str, Any]:
