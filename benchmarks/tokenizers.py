@@ -16,7 +16,8 @@ from torch import Tensor
 
 from worldline_core.model.tokenizer.patch import PatchTokenizer
 from worldline_core.model.tokenizer.tokenizer import VideoTokenizer
-from worldline_core.model.tokenizer.train_tokenizer import (
+from worldline_core.model.tokenizer.wan import WanTokenizer
+from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     clip_of,
     decoder_batch,
@@ -25,7 +26,6 @@ from worldline_core.model.tokenizer.train_tokenizer import (
     reconstruction_metrics,
     select_episodes,
 )
-from worldline_core.model.tokenizer.wan import WanTokenizer
 
 
 def small_wan(latent_channels: int = 32) -> WanTokenizer:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.video.metrics import end_effector_error, frame_iou, video_iou
+from worldline_core.evaluation.metrics import end_effector_error, frame_iou, video_iou
 
 EMPTY = np.zeros((4, 6), dtype=bool)
 LEFT = EMPTY.copy()

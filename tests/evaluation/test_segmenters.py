@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
+from worldline_core.evaluation.metrics import video_iou
 from worldline_core.evaluation.segmenters import train_segmenter as train
 from worldline_core.evaluation.segmenters.augmentation import augment
 from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.evaluation.segmenters.train_segmenter import SegmenterConfig, train_segmenter
-from worldline_core.evaluation.video.metrics import video_iou
 
 CONFIG = SegmenterConfig(
     widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, evaluate_splits=("test",), frame_stride=4

@@ -4,8 +4,8 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.evaluation.video.lpips import BACKBONE_FILE, HEADS_FILE, load_lpips
-from worldline_core.evaluation.video.metrics import MAX_PSNR_DB, frames_to_unit, psnr, ssim
+from worldline_core.evaluation.metrics import MAX_PSNR_DB, frames_to_unit, psnr, ssim
+from worldline_core.model.lpips import BACKBONE_FILE, HEADS_FILE, load_lpips
 
 
 @pytest.fixture

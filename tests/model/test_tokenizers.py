@@ -12,14 +12,14 @@ import torch
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.tokenizer.patch import PatchTokenizer
 from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
-from worldline_core.model.tokenizer.train_tokenizer import (
+from worldline_core.model.tokenizer.wan import WAN22_MEAN, WAN22_STD, WanTokenizer
+from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     decoder_batch,
     disturb,
     fit_patch_tokenizer,
     train_decoder,
 )
-from worldline_core.model.tokenizer.wan import WAN22_MEAN, WAN22_STD, WanTokenizer
 
 
 def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
@@ -144,7 +144,7 @@ def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path, monkeyp
         return decoder_batch(videos, config, step)
 
     with monkeypatch.context() as patch:
-        patch.setattr("worldline_core.model.tokenizer.train_tokenizer.decoder_batch", failing)
+        patch.setattr("worldline_core.training.train_tokenizer.decoder_batch", failing)
         with pytest.raises(KeyboardInterrupt, match="stopped at step 3"):
             train_decoder(fresh(), videos, config, tmp_path / "cut")
     resumed = fresh()

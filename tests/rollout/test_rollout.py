@@ -18,13 +18,13 @@ from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.tokenizer.train_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import RolloutConfig, rollout
 from worldline_core.rollout.rollout_config import shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.digest import digest_folder
+from worldline_core.training.train_tokenizer import fit_patch_tokenizer
 
 SIZE = (32, 48)
 N = 33

@@ -147,7 +147,7 @@ _STEPS = (
     Step(
         "train_tokenizer",
         1,
-        "worldline_core.model.tokenizer.train_tokenizer",
+        "worldline_core.training.train_tokenizer",
         "train_tokenizer",
         "TokenizerConfig",
         ("episodes",),

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from worldline_core.errors import ArtifactError
-from worldline_core.evaluation.video.metrics import frames_to_unit
+from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 _GROUPS = 8

@@ -142,7 +142,7 @@ def _batch(
     """Frames, other frames of the same videos, masks."""
     import torch
 
-    from worldline_core.evaluation.video.metrics import frames_to_unit
+    from worldline_core.evaluation.metrics import frames_to_unit
 
     generator = np.random.default_rng([seed, step])
     chosen = [videos[index] for index in generator.integers(0, len(videos), size)]
@@ -237,9 +237,9 @@ def _measure(episodes: EpisodeSet, config: SegmenterConfig, state: dict[str, Ten
     """Mean video IoU by split and embodiment, on sharp true frames and on degraded ones."""
     import torch
 
+    from worldline_core.evaluation.metrics import frames_to_unit, video_iou
     from worldline_core.evaluation.segmenters.augmentation import degrade
     from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
-    from worldline_core.evaluation.video.metrics import frames_to_unit, video_iou
 
     network = UNet(config.widths)
     network.load_state_dict({name: value.to(torch.float16).float() for name, value in state.items()})

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from worldline_core.errors import DataError
+from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
 from worldline_core.evaluation.recordings import Recordings, tool_points
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
-from worldline_core.evaluation.video.lpips import LPIPS
-from worldline_core.evaluation.video.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.model.lpips import LPIPS
 
 if TYPE_CHECKING:
     from worldline_core.actions.track_store import ActionTracks

@@ -122,7 +122,7 @@ def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
 
 
 def _open_lpips(folder: Path | None) -> tuple[Any | None, str | None]:
-    from worldline_core.evaluation.video.lpips import load_lpips
+    from worldline_core.model.lpips import load_lpips
 
     try:
         return load_lpips(folder), None
