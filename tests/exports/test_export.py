@@ -15,7 +15,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.mcap.reader import read_episode_mcap
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.export import export
-from worldline_core.publishing.publish_content import set_files
+from worldline_core.publishing.content import set_files
 
 FRAMES = 20
 

@@ -12,11 +12,11 @@ import pytest
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
-from worldline_core.publishing.publish_content import FILE_LIST
-from worldline_core.publishing.publish_hub import HubLocation, pull_from_hub, push_to_hub
+from worldline_core.publishing.content import FILE_LIST
+from worldline_core.publishing.publish import pull, push
 from worldline_core.store.digest import digest_folder
 
-PLACE = HubLocation("lab/toy")
+PLACE = "hf://datasets/lab/toy"
 
 
 def make_set(root: Path, *, episodes: int = 2, conventions: dict[str, Any] | None = None) -> Path:
@@ -50,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_path: Path) -> None:
-    pushed = push_to_hub(folder, PLACE, title="Toy arms")
+    pushed = push(folder, PLACE, title="Toy arms")
     repository = hub.repositories["lab/toy"]
     assert repository.private
     assert hub.tokens == {"hf_test"}
@@ -59,7 +59,7 @@ def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_
     assert not [path for path in repository.files if path.startswith("run/")]
     video = next(path for path in repository.files if path.endswith(".mp4"))
     assert repository.files[video][1]  # through LFS
-    pulled = pull_from_hub(PLACE, tmp_path / "back")
+    pulled = pull(PLACE, tmp_path / "back")
     assert (pulled.commit, pulled.files, pulled.num_bytes) == (pushed.commit, pushed.files, pushed.num_bytes)
     assert digest_folder(tmp_path / "back") == digest_folder(folder)
     assert (tmp_path / "back/run/card/README.md").read_text() == readme
@@ -67,33 +67,33 @@ def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_
         EpisodeSet.open(tmp_path / "back").frames(1, "head"), EpisodeSet.open(folder).frames(1, "head")
     )
     with pytest.raises(ArtifactError, match="Folder exists already"):
-        pull_from_hub(PLACE, tmp_path / "back")
+        pull(PLACE, tmp_path / "back")
 
 
 def test_lerobot_reads_what_was_pulled(hub: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
 
-    push_to_hub(folder, PLACE)
-    pull_from_hub(PLACE, tmp_path / "back")
+    push(folder, PLACE)
+    pull(PLACE, tmp_path / "back")
     dataset = LeRobotV3Dataset(tmp_path / "back/datasets/toy")
     assert len(dataset.episodes) == 2
 
 
 def test_a_second_push_sends_only_what_changed_and_removes_what_is_gone(hub: Any, folder: Path, tmp_path: Path) -> None:
-    push_to_hub(folder, PLACE)
+    push(folder, PLACE)
     uploads = hub.count("PUT", "/lfs/")
     assert uploads > 0
-    push_to_hub(folder, PLACE)
+    push(folder, PLACE)
     assert hub.count("PUT", "/lfs/") == uploads
     other = make_set(tmp_path / "other", episodes=1)
     declare(other)
     (other / "extra.txt").write_text("new")
-    push_to_hub(other, PLACE)
+    push(other, PLACE)
     assert "extra.txt" in hub.repositories["lab/toy"].files
     (other / "extra.txt").unlink()
-    push_to_hub(other, PLACE)
+    push(other, PLACE)
     assert "extra.txt" not in hub.repositories["lab/toy"].files
-    pull_from_hub(PLACE, tmp_path / "back")
+    pull(PLACE, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(other)
 
 
@@ -108,11 +108,11 @@ def test_an_interrupted_push_is_not_a_set_and_continues(hub: Any, folder: Path, 
 
     hub.refuse = refuse_second_object
     with pytest.raises(ArtifactError, match=r"(?s)did not finish the push.*continues where it stopped"):
-        push_to_hub(folder, PLACE)
+        push(folder, PLACE)
     first = set(hub.objects)
     hub.refuse = lambda method, path: None
     with pytest.raises(ArtifactError, match=r"(?s)No finished EpisodeSet is published.*push it again"):
-        pull_from_hub(PLACE, tmp_path / "early")
+        pull(PLACE, tmp_path / "early")
     assert not (tmp_path / "early").exists()
     commits = len(hub.repositories["lab/toy"].commits)
 
@@ -122,15 +122,15 @@ def test_an_interrupted_push_is_not_a_set_and_continues(hub: Any, folder: Path, 
 
     hub.refuse = refuse_last_commit
     with pytest.raises(ArtifactError, match="did not finish the push"):
-        push_to_hub(folder, PLACE)
+        push(folder, PLACE)
     with pytest.raises(ArtifactError, match="No finished EpisodeSet"):
-        pull_from_hub(PLACE, tmp_path / "early")
+        pull(PLACE, tmp_path / "early")
     hub.refuse = lambda method, path: None
     hub.requests.clear()
-    push_to_hub(folder, PLACE)
+    push(folder, PLACE)
     again = {path.removeprefix("/lfs/") for method, path in hub.requests if method == "PUT"}
     assert not again & first
-    pull_from_hub(PLACE, tmp_path / "back")
+    pull(PLACE, tmp_path / "back")
     assert digest_folder(tmp_path / "back") == digest_folder(folder)
 
 
@@ -138,47 +138,48 @@ def test_a_hub_that_fails_now_and_then_is_asked_again(hub: Any, folder: Path, tm
     failed: set[str] = set()
 
     def once(method: str, path: str) -> int | None:
-        if method in ("PUT", "HEAD") and path not in failed and len(failed) < 2:
-            failed.add(path)
-            return 503
-        return None
+        kind = "upload" if method == "PUT" else "download" if method == "GET" and "/resolve/" in path else None
+        if kind is None or kind in failed:
+            return None
+        failed.add(kind)
+        return 503
 
     hub.refuse = once
-    push_to_hub(folder, PLACE)
-    pull_from_hub(PLACE, tmp_path / "back")
-    assert len(failed) == 2
+    push(folder, PLACE)
+    pull(PLACE, tmp_path / "back")
+    assert failed == {"upload", "download"}
     assert digest_folder(tmp_path / "back") == digest_folder(folder)
 
 
 def test_a_pull_continues_and_a_changed_file_is_found(hub: Any, folder: Path, tmp_path: Path) -> None:
-    push_to_hub(folder, PLACE)
+    push(folder, PLACE)
     repository = hub.repositories["lab/toy"]
     video = next(path for path in repository.files if path.endswith(".mp4"))
     hub.refuse = lambda method, path: 400 if method == "GET" and path.endswith(".mp4") else None
     with pytest.raises(ArtifactError, match="did not finish the pull"):
-        pull_from_hub(PLACE, tmp_path / "back")
+        pull(PLACE, tmp_path / "back")
     assert not (tmp_path / "back").exists()
     hub.refuse = lambda method, path: None
     hub.requests.clear()
-    pull_from_hub(PLACE, tmp_path / "back")
+    pull(PLACE, tmp_path / "back")
     assert hub.count("GET", "/resolve/") < len(repository.files)  # the rest had arrived
     content, lfs = repository.files[video]
     repository.files[video] = content[:-1] + bytes([content[-1] ^ 1]), lfs
     repository.files["stray.txt"] = b"?", False
     repository.commits.append("f" * 40)
     with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*mp4 differs.*stray\.txt is not of the set"):
-        pull_from_hub(PLACE, tmp_path / "changed")
+        pull(PLACE, tmp_path / "changed")
     assert not (tmp_path / "changed").exists()
 
 
 def test_a_list_that_leads_out_of_the_folder_is_refused(hub: Any, folder: Path, tmp_path: Path) -> None:
-    push_to_hub(folder, PLACE)
+    push(folder, PLACE)
     repository = hub.repositories["lab/toy"]
     listed = json.loads(repository.files[FILE_LIST][0])
     listed["files"][0]["path"] = "../outside"
     repository.files[FILE_LIST] = json.dumps(listed).encode(), False
     with pytest.raises(DataError, match="Path leads outside"):
-        pull_from_hub(PLACE, tmp_path / "back")
+        pull(PLACE, tmp_path / "back")
 
 
 @pytest.mark.parametrize(
@@ -200,9 +201,9 @@ def test_licences_are_kept(
     if declared is not None:
         declare(root, **declared)
     with pytest.raises(DataError, match=f"(?s){message}.*--allow-restricted"):
-        push_to_hub(root, PLACE, public=public)
+        push(root, PLACE, public=public)
     assert hub.requests == []  # nothing was sent, not even the repository made
-    push_to_hub(root, PLACE, public=public, allow_restricted=True)
+    push(root, PLACE, public=public, allow_restricted=True)
     assert hub.repositories["lab/toy"].private is not public
 
 
@@ -217,25 +218,40 @@ def test_evaluation_sources_are_not_handed_on(hub: Any, tmp_path: Path) -> None:
         writer.add(episode, {"head": np.zeros((4, 16, 16, 3), np.uint8)})
     declare(root)
     with pytest.raises(DataError, match="for evaluation only"):
-        push_to_hub(root, PLACE)
+        push(root, PLACE)
     assert hub.requests == []
 
 
 def test_visibility_rights_tokens_and_names(hub: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    push_to_hub(folder, PLACE, public=True)
+    push(folder, PLACE, public=True)
     with pytest.raises(ArtifactError, match=r"(?s)another visibility.*expected: private.*got: public"):
-        push_to_hub(folder, PLACE)
+        push(folder, PLACE)
     with pytest.raises(ArtifactError, match=r"(?s)did not finish the push.*HF_TOKEN"):
-        push_to_hub(folder, HubLocation("lab/forbidden"))
+        push(folder, "hf://datasets/lab/forbidden")
     with pytest.raises(ArtifactError, match="did not finish the pull"):
-        pull_from_hub(HubLocation("lab/nothing"), folder.with_name("x"))
+        pull("hf://datasets/lab/nothing", folder.with_name("x"))
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(UnavailableError, match="HF_TOKEN"):
-        push_to_hub(folder, PLACE)
-    for text in ("hf://lab/toy", "hf://datasets/toy", "https://x/y", "hf://datasets/a/b/c"):
+        push(folder, PLACE)
+    for text in ("hf://lab/toy", "hf://datasets/toy", "hf://https://x/y", "hf://datasets/a/b/c"):
         with pytest.raises(ConfigError, match="Not a place on the hub"):
-            HubLocation.parse(text)
-    assert HubLocation.parse("hf://datasets/lab/toy@v1") == HubLocation("lab/toy", "v1")
+            pull(text, folder.with_name("x"))
+
+
+def test_a_revision_is_a_branch_of_its_own(hub: Any, folder: Path, tmp_path: Path) -> None:
+    push(folder, f"{PLACE}@v1")
+    assert hub.count("POST", "/branch/v1") == 1
+    assert {path.rpartition("/")[2] for method, path in hub.requests if "/commit/" in path} == {"v1"}
+    pull(f"{PLACE}@v1", tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(folder)
+
+
+def test_files_of_others_in_a_repository_are_left_alone(hub: Any, folder: Path) -> None:
+    push(folder, PLACE)
+    hub.repositories["lab/toy"].files["thesis.txt"] = b"keep", False
+    with pytest.raises(ArtifactError, match=r"(?s)files that are not of this set.*thesis\.txt"):
+        push(folder, PLACE)
+    assert hub.repositories["lab/toy"].files["thesis.txt"][0] == b"keep"
 
 
 def test_sets_that_need_another_artifact_are_not_pushed(
@@ -249,5 +265,5 @@ def test_sets_that_need_another_artifact_are_not_pushed(
     linked.mkdir()
     write_index(linked, [replace(row, dataset=f"../{folder.name}/{row.dataset}") for row in read_index(folder)])
     with pytest.raises(ArtifactError, match=r"(?s)datasets of another artifact.*worldline export"):
-        push_to_hub(linked, PLACE)
+        push(linked, PLACE)
     assert hub.requests == []

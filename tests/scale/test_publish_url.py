@@ -13,8 +13,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location
 from worldline_core.errors import ArtifactError
+from worldline_core.publishing.content import FILE_LIST
 from worldline_core.publishing.publish import pull, push
-from worldline_core.publishing.publish_content import FILE_LIST
 from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
 from worldline_core.store.remote import UnreachableInputError
@@ -71,12 +71,31 @@ def test_an_interrupted_push_is_no_set_and_goes_on(tmp_path: Path, finished: Pat
     assert digest_folder(tmp_path / "back") == digest_folder(finished)
 
 
+def test_an_interrupted_second_push_goes_on(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
+    """Files of the first push that the second set lacks are removed, also when the second one was interrupted."""
+    store.upload(tmp_path / "nothing", "x")
+    where = f"s3://{BUCKET}/again"
+    (finished / "first.txt").write_text("of the first push alone")
+    push(finished, where)
+    (finished / "first.txt").unlink()
+    (finished / "second.txt").write_text("of the second push alone")
+    store.misbehave = lambda method, path: "broken" if method == "PUT" and "/again/" in path else None
+    with pytest.raises(UnreachableInputError, match="A store could not be reached"):
+        push(finished, where)
+    store.misbehave = lambda method, path: None
+    with pytest.raises(ArtifactError, match="No finished EpisodeSet is published here"):
+        pull(where, tmp_path / "back")
+    push(finished, where)
+    pull(where, tmp_path / "back")
+    assert digest_folder(tmp_path / "back") == digest_folder(finished)
+
+
 def test_a_changed_object_is_noticed(tmp_path: Path, finished: Path, store: ObjectStore) -> None:
     store.upload(tmp_path / "nothing", "x")
     where = parse_location(f"s3://{BUCKET}/changed")
     push(finished, str(where))
     (where / "index.parquet").write_bytes(b"other")
-    with pytest.raises(ArtifactError, match="A published file is not that of the set"):
+    with pytest.raises(ArtifactError, match=r"(?s)not those of the set.*index\.parquet differs"):
         pull(str(where), tmp_path / "back")
     assert not (tmp_path / "back").exists()
 

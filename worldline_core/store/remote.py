@@ -52,6 +52,7 @@ _PASSING_CLASSES = frozenset(
         ("aiohttp.client_exceptions", "ClientConnectionError"),
         ("aiohttp.client_exceptions", "ClientPayloadError"),
         ("http.client", "IncompleteRead"),
+        ("httpx", "TransportError"),
     }
 )
 """By name, so that nobody has to install the libraries of a store that is not used."""
@@ -77,9 +78,9 @@ def is_transient(error: BaseException | None) -> bool:
 
 
 def _busy_answer(error: BaseException) -> bool:
-    """botocore's ClientError and aiohttp's ClientResponseError with a status of 5xx or 429."""
+    """botocore's ClientError, aiohttp's ClientResponseError and the hub's errors with a status of 5xx or 429."""
     response = getattr(error, "response", None)
-    status = getattr(error, "status", None)
+    status = getattr(error, "status", getattr(response, "status_code", None))
     if isinstance(response, dict):
         status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
     return isinstance(status, int) and (status >= 500 or status == 429)

@@ -37,16 +37,32 @@ class PublishedFile:
     sha256: str
     place: Place = "content"
 
+    def is_at(self, path: Path) -> bool:
+        """Whether a file of this machine has this content."""
+        return path.is_file() and path.stat().st_size == self.size and digest_file(path) == self.sha256
+
+    def below(self, folder: Path) -> Path:
+        """Where a copy keeps it: a card goes to run/card, so that the folder's content is that of the set.
+
+        Raises: RejectedInputError (path_traversal) for a path that leads out of the copy.
+        """
+        return inside(folder / VOLATILE_FOLDER / "card" if self.place == "card" else folder, self.path)
+
 
 @dataclass(frozen=True)
 class FileList:
-    """All files of a published set but the list itself, by path."""
+    """All files of a published set except the list itself, by path."""
 
     files: Mapping[str, PublishedFile]
 
     @property
     def num_bytes(self) -> int:
         return sum(file.size for file in self.files.values())
+
+    def foreign(self, names: Iterable[str]) -> list[str]:
+        """Which of these names are not of the set; what a hub or its client adds does not count."""
+        own = {*self.files, FILE_LIST, ".gitattributes"}
+        return sorted(name for name in names if name not in own and not name.startswith(".cache/"))
 
     def write(self, path: Path) -> None:
         """As JSON, whole or not at all; equal lists give equal bytes."""
@@ -58,15 +74,8 @@ class FileList:
     def read(cls, path: Path, where: object) -> FileList:
         """The list of a copy.
 
-        Raises: ArtifactError when there is none (the publication was not finished), or it is not understood.
+        Raises: ArtifactError when it is not understood.
         """
-        if not path.is_file():
-            raise ArtifactError(
-                "No finished EpisodeSet is published here",
-                where=where,
-                expected=FILE_LIST,
-                next_step="push it again: an interrupted push continues",
-            )
         try:
             content = json.loads(path.read_text())
             if content["version"] != FILE_LIST_VERSION:
@@ -78,41 +87,12 @@ class FileList:
             ) from error
         return cls({file.path: file for file in files})
 
-    def check(self, root: Path) -> None:
-        """Compare a copy with the list.
-
-        Raises: ArtifactError naming files that are missing, different, or not of the list; RejectedInputError
-            (path_traversal) for a listed path that leads out of the copy.
-        """
-        wrong: list[str] = []
-        for file in self.files.values():
-            path = inside(root, file.path)
-            if not path.is_file():
-                wrong.append(f"{file.path} is missing")
-            elif path.stat().st_size != file.size or digest_file(path) != file.sha256:
-                wrong.append(f"{file.path} differs")
-        present = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
-        wrong += [f"{name} is not of the set" for name in sorted(present - set(self.files)) if not _ignored(name)]
-        if wrong:
-            raise ArtifactError(
-                "Published files are not those of the set",
-                where=root,
-                expected=f"{len(self.files)} files with the digests of {FILE_LIST}",
-                got="; ".join(wrong[:5]) + (f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""),
-                next_step="pull again; if it stays, push the set again",
-            )
-
 
 def _published_file(row: Mapping[str, Any]) -> PublishedFile:
     place = row["place"]
     if place not in ("content", "card") or not isinstance(row["path"], str):
         raise ValueError(f"entry {dict(row)}")
     return PublishedFile(row["path"], int(row["size"]), str(row["sha256"]), place)
-
-
-def _ignored(name: str) -> bool:
-    """What a hub or a client adds of itself."""
-    return name in (FILE_LIST, ".gitattributes") or name.startswith(".cache/")
 
 
 def set_files(folder: Path) -> dict[str, Path]:
@@ -139,13 +119,12 @@ def set_files(folder: Path) -> dict[str, Path]:
 
 def listed(files: Mapping[str, Path], card: Mapping[str, Path]) -> FileList:
     """Sizes and digests of what is published."""
-    places: list[tuple[Place, Mapping[str, Path]]] = [("content", files), ("card", card)]
-    found = [
-        PublishedFile(name, path.stat().st_size, digest_file(path), place)
-        for place, members in places
-        for name, path in members.items()
-    ]
-    return FileList({file.path: file for file in found})
+    return FileList(
+        {
+            name: PublishedFile(name, path.stat().st_size, digest_file(path), "card" if name in card else "content")
+            for name, path in {**files, **card}.items()
+        }
+    )
 
 
 def card_files(folder: Path, taken: Iterable[str], title: str | None) -> dict[str, Path]:
