@@ -22,8 +22,7 @@ from worldline_core.exports.rerun_recording import RecordingContent, write_rerun
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
 from worldline_core.exports.rollout import Format as RolloutFormat
 from worldline_core.exports.rollout import export_rollout, safe_stem
-from worldline_core.report.inspect import kind_of
-from worldline_core.report.inspect_pictures import linked_folder
+from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import write_json_atomic
 
 EPISODE_FORMATS = ("lerobot", "mcap", "rrd")

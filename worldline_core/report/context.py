@@ -2,23 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldline_core.pictures.labels import jpeg_bytes, png_bytes
-from worldline_core.report.artifacts import JsonObject, ReportInputs, read_json
 from worldline_core.report.config import ReportConfig
 from worldline_core.report.markup import Child, Html, element, join
 from worldline_core.report.video_scores import VideoScores
+from worldline_core.store.artifact_files import JsonObject, read_json
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.pictures.labels import Picture
     from worldline_core.rollout.rollout_set import RolloutSet
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """Artifact folders by name: a step (`curate`) or a step and a variant (`rollout.stage2`, `curate.banks`)."""
+
+    folders: Mapping[str, Path]
+
+    def get(self, name: str) -> Path | None:
+        """The folder of a name, or None."""
+        return self.folders.get(name)
+
+    def variants(self, step: str) -> dict[str, Path]:
+        """All folders of a step: variant -> folder; the plain name has the variant ""."""
+        found = {"": self.folders[step]} if step in self.folders else {}
+        prefix = f"{step}."
+        found |= {
+            name.removeprefix(prefix): path for name, path in sorted(self.folders.items()) if name.startswith(prefix)
+        }
+        return found
+
+    def manifest(self, name: str) -> JsonObject:
+        """An artifact's manifest, or an empty object for a folder without one."""
+        folder = self.folders.get(name)
+        return read_json(folder / "manifest.json") if folder is not None else {}
 
 
 @dataclass(frozen=True)

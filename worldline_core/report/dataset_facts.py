@@ -21,8 +21,7 @@ from worldline_core.data.episodes.episode_index import (
     read_quarantine,
 )
 from worldline_core.data.episodes.instructions import RAW_INSTRUCTION
-from worldline_core.report.artifacts import JsonObject, read_json, read_rows, read_table
-from worldline_core.report.inspect_pictures import linked_folder
+from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows, read_table
 
 FINDINGS_FILE = "findings.parquet"
 CALIBRATION_DETECTORS = ("calibration", "projection", "doctor", "time_alignment")

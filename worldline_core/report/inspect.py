@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldline_core.errors import ArtifactError
-from worldline_core.report.artifacts import read_json, read_rows, read_table
+from worldline_core.store.artifact_files import kind_of, read_json, read_rows
 
 
 @dataclass(frozen=True)
@@ -28,40 +27,6 @@ class Inspection:
     def __str__(self) -> str:
         written = [f"wrote {path}" for path in self.written]
         return "\n".join([self.kind, *(f"  {line}" for line in self.lines), *written])
-
-
-def kind_of(folder: Path) -> str:
-    """The kind of an artifact, told by its files.
-
-    Raises:
-        ArtifactError: the folder is not there, or is of no known kind.
-    """
-    if not folder.is_dir():
-        raise ArtifactError("No such artifact folder", where=folder, next_step="give the folder of a finished artifact")
-    if (folder / "scores.parquet").is_file():
-        return "Scores"
-    if (folder / "checkpoint.json").is_file():
-        return "Checkpoint"
-    if (folder / "index.html").is_file():
-        return "Report"
-    index = read_table(folder / "index.parquet")
-    columns = set() if index is None else set(index.column_names)
-    for kind, needed in (
-        ("RolloutSet", {"episode_id", "method", "seed"}),
-        ("EpisodeSet", {"episode_id", "dataset", "outcome"}),
-        ("ActionTracks", {"episode_id", "arms", "shard"}),
-        ("Latents", {"episode_id"}),
-    ):
-        if needed <= columns:
-            return kind
-    if (folder / "quarantine.parquet").is_file():
-        return "Quarantine"
-    raise ArtifactError(
-        "Not an artifact of a known kind",
-        where=folder,
-        expected="index.parquet, scores.parquet, checkpoint.json, quarantine.parquet or index.html",
-        got=", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder",
-    )
 
 
 def inspect(

@@ -17,8 +17,8 @@ from worldline_core.exports.rollout import safe_stem
 from worldline_core.pictures.clip_strip import ClipStrip, clip_strip, stacked
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
-from worldline_core.report.artifacts import read_json, read_rows
 from worldline_core.report.filters_page import ReasonGroup, filters_page
+from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:

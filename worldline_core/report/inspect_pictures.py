@@ -13,9 +13,9 @@ from tqdm import tqdm
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture, png_bytes
-from worldline_core.report.artifacts import read_json, read_rows
 from worldline_core.report.inspect_sheets import MOMENTS, episode_sheet, rollout_sheet, tracks_sheet
 from worldline_core.report.refusals import episode_of
+from worldline_core.store.artifact_files import linked_folder, read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
@@ -89,18 +89,6 @@ def write_pictures(
     if wanted.page is not None:
         written.append(subject.write_page(output / "page", wanted.page))
     return written, notes
-
-
-def linked_folder(folder: Path, name: str) -> Path | None:
-    """The folder of an input that an artifact's manifest names, where it is still there.
-
-    Manifests name inputs relative to the root of the artifacts, two folders up.
-    """
-    entry = read_json(folder / "manifest.json").get("inputs", {}).get(name)
-    if not isinstance(entry, dict) or not isinstance(entry.get("path"), str):
-        return None
-    path = folder.resolve().parent.parent / entry["path"]
-    return path if path.is_dir() else None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture
-from worldline_core.report.artifacts import read_rows
+from worldline_core.store.artifact_files import read_rows
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks

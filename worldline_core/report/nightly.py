@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from worldline_core.errors import ArtifactError
-from worldline_core.report.artifacts import read_json, read_json_lines
+from worldline_core.store.artifact_files import read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
@@ -80,9 +80,8 @@ def compare_with_history(scores: Mapping[str, Path], history: Path, night: str |
     Raises:
         ArtifactError: nothing was measured, or the history is damaged.
     """
-    from worldline_core.report.artifacts import ReportInputs
     from worldline_core.report.config import ReportConfig
-    from worldline_core.report.context import ReportContext
+    from worldline_core.report.context import ReportContext, ReportInputs
     from worldline_core.report.page import render_page, run_script
     from worldline_core.report.sections.planning import planning_section
     from worldline_core.report.sections.policy import policy_section

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from worldline_core.report.artifacts import JsonObject, read_rows
+from worldline_core.store.artifact_files import JsonObject, read_rows
 
 QUARANTINED = "quarantined"
 NOT_STAGE2 = "kept for Stage I only"

@@ -31,8 +31,7 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     """
     from tqdm import tqdm
 
-    from worldline_core.report.artifacts import ReportInputs
-    from worldline_core.report.context import ReportContext
+    from worldline_core.report.context import ReportContext, ReportInputs
     from worldline_core.report.page import render_page, run_script
     from worldline_core.report.sections.actions import actions_section
     from worldline_core.report.sections.data import data_section

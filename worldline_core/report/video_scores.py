@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from worldline_core.report.artifacts import JsonObject, read_json, read_rows
 from worldline_core.report.methods import Method, in_order
+from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
 
 SPLIT_ORDER = ("test", "ood_test", "validation", "train", "bank")
 SPLIT_LABELS = {

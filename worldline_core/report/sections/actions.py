@@ -12,9 +12,9 @@ from worldline_core.actions.overlay_views import overlay_sheet
 from worldline_core.actions.overlays import SIGMA_PX_REFERENCE, OverlayStyle, heat_picture
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.report.artifacts import read_json
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, table
+from worldline_core.store.artifact_files import read_json
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks

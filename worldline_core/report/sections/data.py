@@ -10,12 +10,12 @@ import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.report.artifacts import JsonObject, read_rows
 from worldline_core.report.card_blocks import Heading, duplicate_blocks, source_blocks
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.dataset_card import block_html
 from worldline_core.report.dataset_facts import DatasetFacts
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, table
+from worldline_core.store.artifact_files import JsonObject, read_rows
 
 TITLE = "Data"
 

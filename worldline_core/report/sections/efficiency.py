@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from statistics import median
 
-from worldline_core.report.artifacts import JsonObject, read_json
 from worldline_core.report.charts import Series, line_chart
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, element, join, number, paragraph, table
 from worldline_core.report.methods import method
+from worldline_core.store.artifact_files import JsonObject, read_json
 
 TITLE = "Cost"
 SPEED_FILE = "speed.json"

@@ -12,7 +12,6 @@ from worldline_core.actions.overlays import draw_overlay
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture
-from worldline_core.report.artifacts import read_rows
 from worldline_core.report.charts import funnel_chart
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, element, figure, join, notice, number, paragraph, table
@@ -24,6 +23,7 @@ from worldline_core.report.refusals import (
     first_of_each_episode,
     quarantine_refusals,
 )
+from worldline_core.store.artifact_files import read_rows
 
 TITLE = "Filters"
 MOMENTS = 5

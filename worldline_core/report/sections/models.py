@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from worldline_core.report.artifacts import read_json
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markdown import markdown
 from worldline_core.report.markup import Column, element, join, number, table
+from worldline_core.store.artifact_files import read_json
 
 TITLE = "Models"
 CARD = "MODEL_CARD.md"

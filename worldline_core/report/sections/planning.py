@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from worldline_core.report.artifacts import JsonObject
 from worldline_core.report.charts import Series, line_chart
 from worldline_core.report.context import ReportContext, Section, evaluation_section
 from worldline_core.report.markup import Column, Html, element, interval, join, number, paragraph, table
 from worldline_core.report.methods import TRUE_METHOD, Method, in_order, without_truth
 from worldline_core.report.tiles import Tile, bounds
+from worldline_core.store.artifact_files import JsonObject
 
 TITLE = "Planning"
 STEP = "evaluate_planning"

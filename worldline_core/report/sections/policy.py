@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from worldline_core.report.artifacts import JsonObject
 from worldline_core.report.charts import Dot, interval_chart
 from worldline_core.report.context import ReportContext, Section, evaluation_section
 from worldline_core.report.markup import Column, Html, element, interval, join, notice, number, table
 from worldline_core.report.methods import TRUE_METHOD, Method, without_truth
 from worldline_core.report.tiles import Tile, bounds
 from worldline_core.report.video_scores import SPLIT_LABELS
+from worldline_core.store.artifact_files import JsonObject
 
 TITLE = "Policy evaluation"
 STEP = "evaluate_policy"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from worldline_core.report.artifacts import read_rows
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import element, join, notice, number
 from worldline_core.report.methods import GROUP_LABELS, Method
@@ -11,6 +10,7 @@ from worldline_core.report.sections.planning import planning_tiles
 from worldline_core.report.sections.policy import policy_tiles
 from worldline_core.report.tiles import Tile, bounds, render_tile
 from worldline_core.report.video_scores import SPLIT_LABELS, VideoScores
+from worldline_core.store.artifact_files import read_rows
 
 TITLE = "In short"
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from worldline_core.report.artifacts import JsonObject, read_json_lines
 from worldline_core.report.charts import Dot, Series, interval_chart, line_chart
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.markup import Column, Html, code, element, join, notice, number, table
+from worldline_core.store.artifact_files import JsonObject, read_json_lines
 
 TITLE = "Training"
 STAGES = {

@@ -1,10 +1,9 @@
-"""The finished artifacts that a report is made of, found by the name of their step."""
+"""The files of finished artifacts: their JSON and Parquet read with errors that name the file, and what kind they are."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,31 +13,6 @@ import pyarrow.parquet as pq
 from worldline_core.errors import ArtifactError
 
 JsonObject = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class ReportInputs:
-    """Artifact folders by name: a step (`curate`) or a step and a variant (`rollout.stage2`, `curate.banks`)."""
-
-    folders: Mapping[str, Path]
-
-    def get(self, name: str) -> Path | None:
-        """The folder of a name, or None."""
-        return self.folders.get(name)
-
-    def variants(self, step: str) -> dict[str, Path]:
-        """All folders of a step: variant -> folder; the plain name has the variant ""."""
-        found = {"": self.folders[step]} if step in self.folders else {}
-        prefix = f"{step}."
-        found |= {
-            name.removeprefix(prefix): path for name, path in sorted(self.folders.items()) if name.startswith(prefix)
-        }
-        return found
-
-    def manifest(self, name: str) -> JsonObject:
-        """An artifact's manifest, or an empty object for a folder without one."""
-        folder = self.folders.get(name)
-        return read_json(folder / "manifest.json") if folder is not None else {}
 
 
 def read_json(path: Path) -> JsonObject:
@@ -101,3 +75,49 @@ def read_rows(path: Path) -> list[JsonObject]:
     """The rows of a Parquet table as objects; no file means no rows."""
     found = read_table(path)
     return [] if found is None else found.to_pylist()
+
+
+def kind_of(folder: Path) -> str:
+    """The kind of an artifact, told by its files.
+
+    Raises:
+        ArtifactError: the folder is not there, or is of no known kind.
+    """
+    if not folder.is_dir():
+        raise ArtifactError("No such artifact folder", where=folder, next_step="give the folder of a finished artifact")
+    if (folder / "scores.parquet").is_file():
+        return "Scores"
+    if (folder / "checkpoint.json").is_file():
+        return "Checkpoint"
+    if (folder / "index.html").is_file():
+        return "Report"
+    index = read_table(folder / "index.parquet")
+    columns = set() if index is None else set(index.column_names)
+    for kind, needed in (
+        ("RolloutSet", {"episode_id", "method", "seed"}),
+        ("EpisodeSet", {"episode_id", "dataset", "outcome"}),
+        ("ActionTracks", {"episode_id", "arms", "shard"}),
+        ("Latents", {"episode_id"}),
+    ):
+        if needed <= columns:
+            return kind
+    if (folder / "quarantine.parquet").is_file():
+        return "Quarantine"
+    raise ArtifactError(
+        "Not an artifact of a known kind",
+        where=folder,
+        expected="index.parquet, scores.parquet, checkpoint.json, quarantine.parquet or index.html",
+        got=", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder",
+    )
+
+
+def linked_folder(folder: Path, name: str) -> Path | None:
+    """The folder of an input that an artifact's manifest names, where it is still there.
+
+    Manifests name inputs relative to the root of the artifacts, two folders up.
+    """
+    entry = read_json(folder / "manifest.json").get("inputs", {}).get(name)
+    if not isinstance(entry, dict) or not isinstance(entry.get("path"), str):
+        return None
+    path = folder.resolve().parent.parent / entry["path"]
+    return path if path.is_dir() else None
