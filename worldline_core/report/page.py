@@ -16,7 +16,7 @@ POLICY = "default-src 'none'; img-src 'self' data: file:; media-src 'self' file:
 
 def asset(name: str) -> str:
     """The text of a file beside this module."""
-    return files("worldline_core.report").joinpath(name).read_text(encoding="utf-8")
+    return files("worldline_core.pages").joinpath(name).read_text(encoding="utf-8")
 
 
 def render_page(title: str, subtitle: Child, hero: Child, sections: Sequence[Section]) -> str:

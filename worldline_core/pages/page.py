@@ -1,0 +1,135 @@
+"""Static pages from templates: every text is escaped, styles and scripts are inside the page, media lie beside it.
+
+Templates lie beside the code that fills them and are named from the package's root: `report/planning.html`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markdown_it import MarkdownIt
+from markupsafe import Markup
+
+PACKAGE = Path(__file__).parents[1]
+NARROW_SPACE, MINUS = "\u202f", "\u2212"
+
+
+@cache
+def environment() -> Environment:
+    """The templates of the whole package; an unknown name in one of them is an error."""
+    found = Environment(
+        loader=FileSystemLoader(PACKAGE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.globals |= {"asset": asset, "interval": interval}
+    found.filters |= {"number": number, "percent": percent, "words": words, "markdown": markdown}
+    return found
+
+
+def render(template: str, **values: object) -> Markup:
+    """A template filled with values; plain text among them is escaped, what was rendered before is not."""
+    return Markup(environment().get_template(template).render(**values))  # noqa: S704  # escaped by the environment
+
+
+def render_macro(template: str, macro: str, **values: object) -> Markup:
+    """One macro of a template, for pieces that Python puts together."""
+    return getattr(environment().get_template(template).module, macro)(**values)
+
+
+@cache
+def asset(name: str) -> Markup:
+    """A style sheet or a script of this package, to be put into a page as it is."""
+    return Markup((PACKAGE / name).read_text(encoding="utf-8"))  # noqa: S704  # a file of this package
+
+
+@cache
+def _markdown_reader(pictures: bool) -> MarkdownIt:
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink"])
+    if not pictures:
+        reader.disable("image")
+    reader.add_render_rule("table_open", lambda *_: '<div class="table-wrap" tabindex="0"><table>\n')
+    reader.add_render_rule("table_close", lambda *_: "</table></div>\n")
+    return reader
+
+
+def markdown(text: str, *, heading: int = 4, pictures: bool = False) -> Markup:
+    """Markdown as HTML: raw HTML and links stay text; pictures only of texts that this project wrote.
+
+    Args:
+        heading: level of the text's first level of headings.
+    """
+    reader = _markdown_reader(pictures)
+    tokens = reader.parse(text)
+    for token in tokens:
+        if token.type in ("heading_open", "heading_close"):
+            token.tag = f"h{min(6, int(token.tag[1]) + heading - 1)}"
+    return Markup(reader.renderer.render(tokens, reader.options, {}))  # noqa: S704  # raw HTML is switched off
+
+
+def number(value: object, digits: int = 2, *, signed: bool = False) -> str:
+    """A number for readers: fixed digits for reals, grouped thousands for integers, anything else as it is."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    sign = "+" if signed and value > 0 else ""
+    if isinstance(value, int):
+        return sign + f"{value:,}".replace(",", NARROW_SPACE).replace("-", MINUS)
+    return sign + f"{value:.{digits}f}".replace("-", MINUS)
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """A share as `64 %`."""
+    return f"{100 * share:.{digits}f}{NARROW_SPACE}%"
+
+
+def words(name: object) -> str:
+    """A name of the code as words: `held_out` as `held out`."""
+    return str(name).replace("_", " ")
+
+
+def interval(measured: dict[str, float] | None, digits: int = 2, *, signed: bool = False) -> Markup | None:
+    """`{"mean", "low", "high"}` as a value with its interval in smaller type, `0.52 [0.48, 0.56]`; None stays None."""
+    if measured is None:
+        return None
+    shown = Markup('<span class="value">{}</span>').format(number(float(measured["mean"]), digits, signed=signed))
+    bounds = [number(float(measured[key]), digits) for key in ("low", "high")]
+    return shown + Markup('<span class="interval">[{}, {}]</span>').format(*bounds)
+
+
+def code(text: object) -> Markup:
+    """Inline code."""
+    return Markup("<code>{}</code>").format(text)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the first cell of each row is its heading, None is shown as a dash.
+
+    Attributes:
+        numeric: positions of the columns with numbers, aligned right.
+        emphasise: numbers of the rows to set in bold.
+        dense: intervals stand below their values, for tables of many columns.
+    """
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    numeric: Iterable[int] = ()
+    caption: str = ""
+    emphasise: Iterable[int] = ()
+    dense: bool = False
+
+    def __post_init__(self) -> None:
+        wrong = next((row for row in self.rows if len(row) != len(self.headings)), None)
+        if wrong is not None:
+            raise ValueError(f"a row of {len(wrong)} cells in a table of {len(self.headings)} columns: {list(wrong)}")
+
+    def __html__(self) -> Markup:
+        return render_macro(
+            "pages/parts.html", "table", shown=self, numeric=set(self.numeric), bold=set(self.emphasise)
+        )

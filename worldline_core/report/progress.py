@@ -1,0 +1,157 @@
+"""The page of a run that is not finished yet: what is done, what is running, what is coming and for how long.
+
+It is written anew after every node and reloads itself; the finished report takes its place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from worldline_core.pages.page import number, render
+from worldline_core.store.artifact_files import read_json
+from worldline_core.store.atomic import write_bytes_atomic
+
+RELOAD_SECONDS = 5
+MOST_FACTS = 6
+PICTURES = ("previews/*.png", "previews/*.jpg", "media/*.jpg")
+SHARES: Mapping[str, float] = {
+    "curate": 28, "filter": 20, "render_actions": 8, "encode_latents": 5, "train_stage1": 136, "train_stage2": 147,
+    "distill": 269, "rollout": 37, "evaluate_video": 85, "evaluate_policy": 24, "evaluate_planning": 56, "report": 36,
+}  # fmt: skip
+"""Seconds per node of each step in the demo on two cores: only their ratios are used, until something was measured."""
+
+
+@dataclass(frozen=True)
+class DoneNode:
+    """A finished node: its name in the plan, its artifact, and the seconds that it took in this run (0 when cached)."""
+
+    name: str
+    folder: Path
+    seconds: float
+    cached: bool = False
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Seconds left, and what they are estimated from."""
+
+    seconds: float
+    basis: str
+
+
+def recorded_seconds(artifacts: Path, step: str) -> float | None:
+    """Wall seconds of the step's latest finished artifact in a store; None where there is none."""
+    manifests = [read_json(path) for path in sorted((artifacts / step).glob("*/manifest.json"))]
+    timed = [m for m in manifests if isinstance(m.get("wall_seconds"), (int, float)) and not m.get("resumed")]
+    return float(max(timed, key=lambda m: str(m.get("finished_at")))["wall_seconds"]) if timed else None
+
+
+def estimate_left(
+    artifacts: Path,
+    done: Sequence[DoneNode],
+    running: Sequence[str],
+    to_come: Sequence[str],
+    seconds_of_running: float = 0.0,
+) -> Estimate:
+    """Time left: what each step took the last time in this store, else its share of the demo at this machine's pace.
+
+    Args:
+        artifacts: the root of the store.
+        running, to_come: names of nodes, `step` or `step.variant`.
+        seconds_of_running: how long the running nodes have been at it.
+    """
+    steps = [name.partition(".")[0] for name in (*running, *to_come)]
+    recorded = {step: recorded_seconds(artifacts, step) for step in set(steps)}
+    worked = [node for node in done if not node.cached and node.name.partition(".")[0] in SHARES]
+    expected = sum(SHARES[node.name.partition(".")[0]] for node in worked)
+    pace = sum(node.seconds for node in worked) / expected if expected else 1.0
+    seconds = 0.0
+    for step in steps:
+        known = recorded[step]
+        seconds += known if known is not None else pace * SHARES.get(step, 30.0)
+    without = sum(recorded[step] is None for step in steps)
+    if not without:
+        basis = "from the time that the same steps took before in this store"
+    elif worked:
+        basis = f"rough: {without} of {len(steps)} steps never ran in this store; taken from the demo's shares at this machine's pace"
+    else:
+        basis = f"rough: {without} of {len(steps)} steps never ran in this store; taken from the demo on two cores"
+    return Estimate(max(0.0, seconds - seconds_of_running), basis)
+
+
+def write_progress_page(
+    folder: Path,
+    done: Sequence[DoneNode],
+    running: Sequence[str],
+    to_come: Sequence[str],
+    seconds_so_far: float,
+    estimate: Estimate | None = None,
+    failed: str = "",
+) -> Path:
+    """Write `folder/index.html` (`artifacts/report/latest`), which reloads itself until the report replaces it.
+
+    Args:
+        failed: the error that ended the run, which the page then shows instead of reloading.
+    """
+    steps = [_shown(folder, node) for node in done]
+    total = len(done) + len(running) + len(to_come)
+    page = render(
+        "report/progress.html", title="WorldLine: this run", done=steps, running=list(running), to_come=list(to_come),
+        share=round(100 * len(done) / total) if total else 0, elapsed=duration(seconds_so_far),
+        left=None if estimate is None else duration(estimate.seconds), basis="" if estimate is None else estimate.basis,
+        failed=failed, reload=0 if failed else RELOAD_SECONDS,
+    )  # fmt: skip
+    write_bytes_atomic(folder / "index.html", page.encode())
+    return folder / "index.html"
+
+
+def write_finished_page(folder: Path, report: Path) -> Path:
+    """Let `folder/index.html` lead to a finished report: a page that redirects, which works from any file system."""
+    page = render(
+        "report/redirect.html",
+        title="WorldLine: the report",
+        target=_address(folder, report / "index.html"),
+        key=report.name,
+    )
+    write_bytes_atomic(folder / "index.html", page.encode())
+    return folder / "index.html"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words that a reader takes in at once."""
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
+def _shown(folder: Path, node: DoneNode) -> dict[str, Any]:
+    pictures = [path for pattern in PICTURES for path in sorted(node.folder.glob(pattern))]
+    metrics = read_json(node.folder / "manifest.json").get("metrics") or {}
+    return {
+        "name": node.name,
+        "time": "found in the store" if node.cached else duration(node.seconds),
+        "folder": _address(folder, node.folder),
+        "facts": _facts(metrics),
+        "picture": _address(folder, pictures[0]) if pictures else None,
+    }
+
+
+def _facts(metrics: Mapping[str, Any]) -> str:
+    """The first numbers that the step measured, in words."""
+    shown = [
+        f"{name.replace('_', ' ')} {number(value, 3)}"
+        for name, value in metrics.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    ]
+    return " · ".join(shown[:MOST_FACTS])
+
+
+def _address(folder: Path, target: Path) -> str:
+    """A relative address that a browser follows from a page in `folder`."""
+    return quote(os.path.relpath(target.resolve(), folder.resolve()).replace(os.sep, "/"))
