@@ -167,11 +167,17 @@ def _task(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from worldline_core.config import read_yaml
-    from worldline_core.recorder.record_command import record_command
+    from worldline_core.config import load_config, read_yaml
+    from worldline_core.recorder.banks import RecordBanksConfig, record_banks
+    from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
 
-    kind = "banks" if "banks" in read_yaml(arguments.config) else "episodes"
-    print(record_command(kind, arguments.config, arguments.overrides, arguments.output))
+    path, overrides, output = arguments.config, arguments.overrides, arguments.output
+    if "banks" in read_yaml(path):
+        config = load_config(RecordBanksConfig, path=path, overrides=overrides)
+        print(record_with_manifest("record_banks", record_banks, config, output))
+    else:
+        config = load_config(RecordConfig, path=path, overrides=overrides)
+        print(record_with_manifest("record_episodes", record, config, output))
 
 
 def _inspect(arguments: argparse.Namespace) -> None:

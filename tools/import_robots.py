@@ -265,13 +265,6 @@ def load_arm_and_hand(package: Path, arm: str, hand: str) -> tuple[dict[str, Bod
     return extract(arm_model, "base", 1), extract(hand_model, first, 1)
 
 
-def chain_to(bodies: dict[str, Body], joints: list[str]) -> None:
-    """Keep the names of the arm's joints; every other joint would be a mistake."""
-    found = [b.joint["name"] for b in bodies.values() if b.joint is not None]
-    if found != joints:
-        raise ValueError(f"joints {found}, expected {joints}")
-
-
 def viperx(package: Path) -> Body:
     model = mujoco.MjModel.from_xml_path(str(package / "gym_aloha/assets/bimanual_viperx_transfer_cube.xml"))
     bodies = extract(model, "vx300s_left", None)

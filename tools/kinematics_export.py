@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from worldline_core.recorder.record import prepare_rendering
-from worldline_core.recorder.rendering import OPENCV_AXES, look_at
-from worldline_core.recorder.robots import ROBOTS, Robot
+from worldline_core.recorder.rendering import OPENCV_AXES, prepare_rendering, wrist_camera_pose
+from worldline_core.recorder.robots import ROBOTS
 from worldline_core.recorder.scene_model import SceneModel, build_scene_model
 
 # Capsule radii [m] of the kinematic robot masks (links, hand, fingers), fitted to the exact masks of recordings.
@@ -78,37 +77,29 @@ def kinematics_xml(scene: SceneModel) -> str:
     return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
 
 
-def wrist_camera_pose(scene: SceneModel, arm: int) -> np.ndarray:
-    """T_ee_camera (4, 4), OpenCV axes, of an arm's wrist camera in its ``ee`` body."""
-    import mujoco
-
-    robot: Robot = scene.robot
-    site = scene.tool_sites[arm]
-    flat = np.zeros(9)
-    mujoco.mju_quat2Mat(flat, scene.model.site_quat[site])
-    rotation = flat.reshape(3, 3)
-    eye, target = np.asarray(robot.wrist.eye), np.asarray(robot.wrist.target)
+def T_ee_camera(scene: SceneModel, arm: int) -> np.ndarray:  # noqa: N802
+    """(4, 4), OpenCV axes, of an arm's wrist camera in its ``ee`` body."""
+    position, rotation = wrist_camera_pose(scene, arm)
     pose = np.eye(4)
-    pose[:3, :3] = rotation @ look_at(eye, target, np.array([-1.0, 0.0, 0.0])) @ OPENCV_AXES
-    pose[:3, 3] = scene.model.site_pos[site] + rotation @ eye
+    pose[:3, :3] = rotation @ OPENCV_AXES
+    pose[:3, 3] = position
     return pose
 
 
 def embodiment_yaml(scene: SceneModel) -> str:
     """YAML text of the embodiment's description."""
     model, robot = scene.model, scene.robot
-    by_address = {int(model.joint(j).qposadr[0]): model.joint(j).name for j in range(model.njnt)}
     closed, opened = robot.finger_travel
     link_radius, hand_radius, gripper_radius = RADII[robot.name]
     arms = []
-    for number, arm in enumerate(robot.arms):
-        site = scene.tool_sites[number]
+    for number, (arm, indices) in enumerate(zip(robot.arms, scene.arms, strict=True)):
+        site = indices.tool_site
         ee = f"{arm.name}/ee"
         arms.append(
             {
                 "name": arm.name,
-                "joints": [by_address[int(a)] for a in scene.joint_qpos[number]],
-                "limits": [[round(float(v), 6) for v in pair] for pair in scene.limits[number]],
+                "joints": list(indices.joint_names),
+                "limits": [[round(float(v), 6) for v in pair] for pair in indices.limits],
                 "end_effector_link": ee,
                 "T_link_tool": {
                     "translation": [round(float(v), 9) for v in model.site_pos[site]],
@@ -119,15 +110,12 @@ def embodiment_yaml(scene: SceneModel) -> str:
                     "closed": 0.0,
                     "open": 1.0,
                     "finger_joints": [
-                        {"name": by_address[int(a)], "closed": closed, "open": opened}
-                        for a in scene.finger_qpos[number]
+                        {"name": name, "closed": closed, "open": opened} for name in indices.finger_names
                     ],
                 },
                 "wrist_camera": {
                     "link": ee,
-                    "T_link_camera": [
-                        [round(float(v), 9) + 0.0 for v in row] for row in wrist_camera_pose(scene, number)
-                    ],
+                    "T_link_camera": [[round(float(v), 9) + 0.0 for v in row] for row in T_ee_camera(scene, number)],
                 },
                 "link_radius": link_radius,
                 "hand_radius": hand_radius,

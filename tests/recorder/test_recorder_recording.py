@@ -16,8 +16,8 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS
-from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, prepare_rendering, record
-from worldline_core.recorder.rendering import SceneRenderer
+from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
+from worldline_core.recorder.rendering import SceneRenderer, prepare_rendering
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion, Recording
 
 
@@ -62,8 +62,8 @@ def test_cameras_are_exact(recorder: EpisodeRecorder) -> None:
     assert motion is not None
     still = Motion(motion.state[:1], motion.action[:1], motion.qpos[:1], motion.outcome)
     # With the arms moved out of the way below the floor, nothing hides the cube.
-    for joints in recorder.scene.joint_qpos:
-        still.qpos[0, joints[1]] = np.pi
+    for arm in recorder.scene.arms:
+        still.qpos[0, arm.qpos[1]] = np.pi
     filmed = recorder.film(
         layout, still, episode_id="e", scene_id="scene_05", split="train", jitter=np.random.default_rng(0)
     )
@@ -109,11 +109,11 @@ def test_robot_masks_cover_dark_arms_on_a_bright_table(recording: Recording) -> 
 def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     groups = (RecordGroup(embodiment="so101", count=2, families=("lift", "play")),)
     config = RecordConfig(groups=groups, seed=5, num_frames=17, workers=1, defects={"so101": {"frozen_camera": 1}})
-    counts = record(config, {}, tmp_path / "whole")
+    counts = record(config, tmp_path / "whole")
     assert counts["episodes"] == 2
     # What a kill leaves behind: one finished episode, given in another order.
     _record_job((plan_jobs(config)[-1], config, tmp_path / "resumed"))
-    record(config, {}, tmp_path / "resumed")
+    record(config, tmp_path / "resumed")
     assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
     rows = EpisodeSet.open(tmp_path / "whole").rows
     assert [row.embodiment for row in rows] == ["so101", "so101"]
@@ -123,7 +123,7 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
 def test_bank_outcomes_are_sealed(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     spec = BankSpec(name="bank", embodiment="aloha_viperx", family="state_change", scene="scene_12", layout=1)
     config = RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, success_range=(0.25, 0.75))
-    record_banks(config, {}, tmp_path / "banks")
+    record_banks(config, tmp_path / "banks")
     episodes = EpisodeSet.open(tmp_path / "banks")
     assert {row.outcome for row in episodes.rows} == {"unknown"}
     assert [row.candidate for row in episodes.rows] == [0, 1, 2, 3]

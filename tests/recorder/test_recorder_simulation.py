@@ -12,12 +12,18 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from tools.kinematics_export import embodiment_yaml, kinematics_xml
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.recorder.controllers import Waypoint, plan_waypoints, sample_waypoints
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, tool_rotation
+from worldline_core.recorder.controllers import (
+    InverseKinematics,
+    Waypoint,
+    plan_waypoints,
+    sample_waypoints,
+    tool_rotation,
+)
+from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES
 from worldline_core.recorder.robots import ROBOTS
 from worldline_core.recorder.scene_model import CUBE_HALF, DRAWER_TRAVEL, SceneModel, build_scene_model
-from worldline_core.recorder.simulate import EpisodeRecorder, state_names
-from worldline_core.recorder.task_layout import SCENES, TEST_SCENES, TRAIN_SCENES, apply_layout, outcome, sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder
+from worldline_core.recorder.task_layout import apply_layout, outcome, sample_layout
 
 EMBODIMENTS = Path(__file__).resolve().parents[2] / "configs" / "embodiments"
 
@@ -28,7 +34,7 @@ def scene(request: pytest.FixtureRequest) -> SceneModel:
 
 
 def random_joints(scene: SceneModel, random: np.random.Generator) -> list[np.ndarray]:
-    return [random.uniform(*limits.T) for limits in scene.limits]
+    return [random.uniform(*arm.limits.T) for arm in scene.arms]
 
 
 def test_committed_kinematics_equal_the_full_model(scene: SceneModel) -> None:
@@ -38,12 +44,13 @@ def test_committed_kinematics_equal_the_full_model(scene: SceneModel) -> None:
     random = np.random.default_rng(3)
     for _ in range(5):
         for arm, joints in enumerate(random_joints(scene, random)):
-            full.qpos[scene.joint_qpos[arm]] = joints
+            full.qpos[scene.arms[arm].qpos] = joints
             for name, value in zip(embodiment.arms[arm].joints, joints, strict=True):
                 small.qpos[kinematics.joint(name).qposadr[0]] = value
         mujoco.mj_kinematics(kinematics, small)
         mujoco.mj_kinematics(scene.model, full)
-        for arm, site in zip(scene.robot.arms, scene.tool_sites, strict=True):
+        for arm, indices in zip(scene.robot.arms, scene.arms, strict=True):
+            site = indices.tool_site
             np.testing.assert_allclose(small.site(f"{arm.name}/tool").xpos, full.site_xpos[site], atol=1e-9)
             np.testing.assert_allclose(small.site(f"{arm.name}/tool").xmat, full.site_xmat[site], atol=1e-9)
 
@@ -54,12 +61,12 @@ def test_arm_kinematics_of_the_embodiment_equal_mujoco(scene: SceneModel) -> Non
     data = mujoco.MjData(scene.model)
     columns: list[float] = []
     for arm, joints in enumerate(random_joints(scene, np.random.default_rng(4))):
-        data.qpos[scene.joint_qpos[arm]] = joints
+        data.qpos[scene.arms[arm].qpos] = joints
         columns += [*joints, 0.5]
     mujoco.mj_kinematics(scene.model, data)
     poses = ArmKinematics(load_embodiment(scene.robot.name)).tool_poses(torch.tensor([columns], dtype=torch.float64))
-    for arm, site in enumerate(scene.tool_sites):
-        np.testing.assert_allclose(np.asarray(poses)[0, arm, :3, 3], data.site_xpos[site], atol=1e-6)
+    for arm, indices in enumerate(scene.arms):
+        np.testing.assert_allclose(np.asarray(poses)[0, arm, :3, 3], data.site_xpos[indices.tool_site], atol=1e-6)
 
 
 def test_committed_descriptions_are_what_the_recorder_writes(scene: SceneModel) -> None:
@@ -72,7 +79,7 @@ def test_state_columns_follow_the_embodiment(scene: SceneModel) -> None:
     expected: list[str] = []
     for arm in load_embodiment(scene.robot.name).arms:
         expected += [*arm.joints, f"{arm.name}/gripper"]
-    assert list(state_names(scene)) == expected
+    assert list(scene.state_names) == expected
 
 
 def test_inverse_kinematics_reaches_the_table(scene: SceneModel) -> None:
@@ -137,7 +144,7 @@ def test_arms_follow_their_commands_closely() -> None:
     recorder = EpisodeRecorder("xarm7_pair")
     motion = recorder.move(recorder.layout("play", np.random.default_rng(1)), np.random.default_rng(2), 33)
     assert motion is not None
-    joints = [column for column, name in enumerate(state_names(recorder.scene)) if not name.endswith("gripper")]
+    joints = [column for column, name in enumerate(recorder.scene.state_names) if not name.endswith("gripper")]
     assert np.abs(motion.state[:, joints] - motion.action[:, joints]).max() < 0.15
     # Both arms travel: otherwise following commands could not be seen.
     assert np.ptp(motion.state[:, joints[:7]], axis=0).max() > 0.3

@@ -1,12 +1,11 @@
 """Candidate banks: one initial state, one instruction, N control sequences, and what each of them leads to.
 
-Every candidate is executed and filmed; its outcome goes to ``sealed_outcomes.parquet`` only, so that whatever
-chooses among candidates cannot read it from the index.
+Every candidate is executed and filmed; its outcome goes to ``sealed_outcomes.parquet`` only, so that whatever chooses
+among candidates cannot read it from the index.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,10 @@ from pydantic import Field
 from tqdm import tqdm
 
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment, prepare_rendering
+from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment
+from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion
 from worldline_core.recorder.task_layout import Layout
@@ -42,8 +43,8 @@ class RecordBanksConfig(StrictModel):
     """Banks of ``candidates`` control sequences each.
 
     Attributes:
-        success_range: direct-execution success of a bank must lie in this range; the next initial state is tried
-            otherwise (at most 20).
+        success_range: the share of a bank's candidates that succeed must lie in this range; otherwise the next initial
+            state is tried (at most 20).
     """
 
     banks: tuple[BankSpec, ...] = Field(min_length=1)
@@ -57,7 +58,7 @@ class RecordBanksConfig(StrictModel):
 def draw_bank(recorder: EpisodeRecorder, spec: BankSpec, config: RecordBanksConfig) -> tuple[Layout, list[Motion]]:
     """Layout and executed candidates of a bank.
 
-    Raises: DataError when no initial state in 20 gives a success rate inside of the wanted range.
+    Raises: DataError when none of 20 initial states gives a success rate in the wanted range.
     """
     low, high = config.success_range
     for trial in range(20):
@@ -78,15 +79,13 @@ def draw_bank(recorder: EpisodeRecorder, spec: BankSpec, config: RecordBanksConf
     )
 
 
-def record_banks(config: RecordBanksConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
     """Record candidate banks into ``output`` (an EpisodeSet with sealed outcomes); finished episodes survive a kill.
 
-    Returns the number of candidates and successes by bank.
+    Returns the number of candidates and successes per bank.
 
     Raises: UnavailableError without MuJoCo; DataError when a bank cannot be drawn.
     """
-    from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-
     prepare_rendering()
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
     sealed: list[dict[str, str]] = []

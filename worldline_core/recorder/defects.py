@@ -1,7 +1,6 @@
-"""Defective recordings, so that the filters have something honest to drop.
+"""Defects: a healthy recording spoiled in one known way, for the filters to find.
 
-A healthy recording is spoiled in one known way. The true defect is kept apart (``injected_defects.json``) and never
-read by a filter.
+Which recording has which defect is written to ``injected_defects.json``, which no filter reads.
 """
 
 from __future__ import annotations

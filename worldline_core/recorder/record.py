@@ -1,4 +1,4 @@
-"""Step `record`: simulated robots, scenes and noisy controllers into an EpisodeSet.
+"""`worldline record`: simulated robots, scenes and scripted controllers into an EpisodeSet with a manifest.
 
 Deterministic per (seed, embodiment, split, number): any number of processes, a kill and a restart give the same
 bytes. Needs the optional dependency MuJoCo and an OpenGL library for off-screen rendering.
@@ -6,11 +6,10 @@ bytes. Needs the optional dependency MuJoCo and an OpenGL library for off-screen
 
 from __future__ import annotations
 
-import importlib
+import importlib.metadata
 import multiprocessing
-import os
-import sys
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,8 +19,14 @@ from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import UnavailableError
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
+from worldline_core.recorder.rendering import prepare_rendering
+from worldline_core.recorder.scene_model import FRAME_RATE
+from worldline_core.recorder.simulate import EpisodeRecorder
+from worldline_core.store.atomic import remove_unfinished, write_json_atomic
+from worldline_core.store.digest import MANIFEST_NAME, digest_folder
+from worldline_core.store.store import describe_environment
 
 Embodiment = Literal["aloha_viperx", "ur5e_pair", "xarm7_pair", "panda_pair", "so101"]
 Family = Literal["lift", "place", "state_change", "play"]
@@ -34,6 +39,10 @@ Defect = Literal[
     "inverted_extrinsics",
     "intrinsics_of_other_size",
 ]
+
+# The random streams of embodiments and splits: once released, a number never changes.
+EMBODIMENT_STREAM = {"aloha_viperx": 0, "ur5e_pair": 1, "xarm7_pair": 2, "panda_pair": 3, "so101": 4}
+SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4}
 
 
 class RecordGroup(StrictModel):
@@ -54,7 +63,7 @@ class RecordConfig(StrictModel):
         workers: processes.
         video_crf: x264 quality of the stored videos.
         mcap: also write every episode as an MCAP file under ``mcap/``.
-        defects: by embodiment, how many of the first training recordings are spoiled in which way (see
+        defects: per embodiment, how many of the first training recordings are spoiled in which way (see
             ``defects.py``); what was done to which episode is written to ``injected_defects.json``.
     """
 
@@ -87,80 +96,48 @@ class Job:
     defect: str | None = None
 
 
-# Streams keep the draws of splits and embodiments apart; numbers never change once released.
-EMBODIMENT_STREAM = {"aloha_viperx": 0, "ur5e_pair": 1, "xarm7_pair": 2, "panda_pair": 3, "so101": 4}
-SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4}
-
-
 def plan_jobs(config: RecordConfig) -> list[Job]:
     """All episodes of a configuration, embodiments mixed so that an interrupted run holds some of each."""
-    columns: list[list[tuple[float, Job]]] = []
-    spoiled = {
+    defects = {
         embodiment: [name for name, count in wanted.items() for _ in range(count)]
         for embodiment, wanted in config.defects.items()
     }
-    numbers: dict[tuple[str, str], int] = {}
+    recorded: Counter[tuple[str, str]] = Counter()
+    jobs: list[tuple[int, Job]] = []
     for group in config.groups:
-        column: list[tuple[float, Job]] = []
         for position in range(group.count):
-            key = (group.embodiment, group.split)
-            number = numbers.get(key, 0)
-            numbers[key] = number + 1
-            waiting = spoiled.get(group.embodiment, []) if group.split == "train" else []
+            number = recorded[group.embodiment, group.split]
+            recorded[group.embodiment, group.split] += 1
+            left = defects.get(group.embodiment, []) if group.split == "train" else []
             job = Job(
                 episode_id=f"{group.embodiment}-{group.split}-s{config.seed}-{number:05d}",
                 embodiment=group.embodiment,
                 split=group.split,
                 family=group.families[position % len(group.families)],
                 entropy=(config.seed, EMBODIMENT_STREAM[group.embodiment], SPLIT_STREAM[group.split], number),
-                defect=waiting.pop(0) if waiting else None,
+                defect=left.pop(0) if left else None,
             )
-            column.append((position / group.count, job))
-        columns.append(column)
-    # Tenths of every group in turn, so that a worker keeps its compiled model for a while.
-    merged = sorted(
-        (round(share * 10), job.embodiment, job.split, job.episode_id, job) for c in columns for share, job in c
-    )
-    return [item[-1] for item in merged]
+            jobs.append((round(10 * position / group.count), job))
+    # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
+    jobs.sort(key=lambda item: (item[0], item[1].embodiment, item[1].split, item[1].episode_id))
+    return [job for _, job in jobs]
 
 
-def prepare_rendering() -> None:
-    """Choose the off-screen OpenGL back end; ``MUJOCO_GL`` decides where it is set, otherwise EGL.
-
-    Raises: UnavailableError when MuJoCo is not installed.
-    """
-    chosen = "MUJOCO_GL" in os.environ
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise UnavailableError(
-            "Recording needs MuJoCo",
-            got=str(error),
-            next_step="install the extra: uv sync --extra sim; on Debian also libegl1 libegl-mesa0 libgl1-mesa-dri",
-        ) from error
-    if not chosen:
-        # MuJoCo reads the variable once, at import: where it was imported earlier, it has settled on a window.
-        for name in ("mujoco.rendering.classic.gl_context", "mujoco.gl_context"):
-            if name in sys.modules:
-                importlib.reload(sys.modules[name])
+# One recorder per process: a compiled model and its renderers are reused while the embodiment stays the same.
+_RECORDERS: dict[str, EpisodeRecorder] = {}
 
 
-_RECORDERS: dict[str, Any] = {}
+def _close_recorders() -> None:
+    for recorder in _RECORDERS.values():
+        recorder.close()
+    _RECORDERS.clear()
 
 
-def _record_job(task: tuple[Job, RecordConfig, Path]) -> tuple[str, str, str]:
+def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     """Record one episode into the set's parts; runs in a worker process."""
-    from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-    from worldline_core.recorder.defects import DEFECTS
-    from worldline_core.recorder.scene_model import FRAME_RATE
-    from worldline_core.recorder.simulate import EpisodeRecorder
-
     job, config, output = task
     if job.embodiment not in _RECORDERS:
-        for recorder in _RECORDERS.values():
-            recorder.close()
-        _RECORDERS.clear()
+        _close_recorders()
         _RECORDERS[job.embodiment] = EpisodeRecorder(job.embodiment)
     recording = _RECORDERS[job.embodiment].record(
         episode_id=job.episode_id,
@@ -178,43 +155,34 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> tuple[str, str, str]:
         write_episode_mcap(path, recording.episode, recording.frames, robot_masks=recording.robot_masks)
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
     writer.add(recording.episode, recording.frames, recording.robot_masks)
-    return job.embodiment, job.family, recording.episode.outcome
 
 
-def run_jobs(jobs: list[Job], config: RecordConfig, output: Path) -> Iterator[tuple[str, str, str]]:
-    """Record in ``config.workers`` processes; yields (embodiment, family, outcome) as episodes get done."""
+def _run_jobs(jobs: list[Job], config: RecordConfig, output: Path) -> Iterator[None]:
+    """Record in ``config.workers`` processes; yields whenever an episode is done."""
     tasks = [(job, config, output) for job in jobs]
     if config.workers == 1 or len(tasks) <= 1:
-        for task in tasks:
-            yield _record_job(task)
-        for recorder in _RECORDERS.values():
-            recorder.close()
-        _RECORDERS.clear()
+        yield from map(_record_job, tasks)
+        _close_recorders()
         return
     # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(config.workers) as pool:
+    with multiprocessing.get_context("spawn").Pool(config.workers) as pool:
         yield from pool.imap_unordered(_record_job, tasks, chunksize=6)
 
 
-def record(config: RecordConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     """Record an EpisodeSet into ``output``; finished episodes survive a kill.
 
     Returns counts: episodes, and outcomes per embodiment and family.
 
     Raises: UnavailableError without MuJoCo; DataError when a task cannot be reached by an arm.
     """
-    from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-    from worldline_core.recorder.defects import DEFECTS_FILE
-    from worldline_core.recorder.scene_model import FRAME_RATE
-
     prepare_rendering()
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
     jobs = plan_jobs(config)
-    waiting = [job for job in jobs if not writer.has(job.episode_id)]
-    progress = tqdm(total=len(jobs), initial=len(jobs) - len(waiting), desc="record", unit="episode", disable=None)
-    with progress:
-        for _ in run_jobs(waiting, config, output):
+    missing = [job for job in jobs if not writer.has(job.episode_id)]
+    done = len(jobs) - len(missing)
+    with tqdm(total=len(jobs), initial=done, desc="record", unit="episode", disable=None) as progress:
+        for _ in _run_jobs(missing, config, output):
             progress.update()
     writer.close()
     table: dict[str, dict[str, dict[str, int]]] = {}
@@ -226,4 +194,34 @@ def record(config: RecordConfig, inputs: Mapping[str, Path], output: Path) -> di
         write_json_atomic(output / DEFECTS_FILE, defects)
     counts = {"episodes": len(jobs), "outcomes": table}
     write_json_atomic(output / "recording.json", counts)
+    return counts
+
+
+def record_with_manifest[C: StrictModel](
+    step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
+) -> dict[str, Any]:
+    """``run(config, output)``, which continues a killed recording; the manifest is written last.
+
+    Args:
+        step: ``record_episodes`` or ``record_banks``.
+        config: has a ``seed``.
+
+    Raises: what ``run`` raises.
+    """
+    if output.exists():
+        remove_unfinished(output)
+    counts = run(config, output)
+    environment = describe_environment()
+    environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
+    values = config.model_dump(mode="json")
+    manifest = {
+        "step": step,
+        "version": 1,
+        "config": values,
+        "seeds": {"seed": values["seed"]},
+        "digest": digest_folder(output),
+        "metrics": counts,
+        "environment": environment,
+    }
+    write_json_atomic(output / MANIFEST_NAME, manifest)
     return counts

@@ -1,4 +1,4 @@
-"""The robots that the recorder drives: which arms stand where, how they rest, what they reach.
+"""The robots that the recorder drives: where their arms stand, how they rest, what they reach.
 
 Base frame (= world): origin on the table's surface at the middle between the arm bases, x forward over the table,
 y left, z up; metres and radians. A tool pose that points straight down has tool +z = -z of the base.
@@ -23,21 +23,22 @@ class ArmPlacement:
 
 
 @dataclass(frozen=True)
-class HeadCamera:
-    """Where the head camera stands and looks, metres in the base frame."""
+class CameraMount:
+    """Where a camera stands and what it looks at [m], with its vertical field of view.
+
+    Head cameras are given in the base frame, wrist cameras in the tool frame (x back towards the robot, y the direction
+    in which the fingers open, z out of the gripper).
+    """
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
     fovy_deg: float
 
 
-@dataclass(frozen=True)
-class WristCamera:
-    """Pose in the tool frame (x back towards the robot, y fingers, z out of the gripper)."""
-
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fovy_deg: float
+HEAD = CameraMount(eye=(-0.02, 0.0, 0.86), target=(0.40, 0.0, 0.08), fovy_deg=39.0)
+# The larger arms carry their hands higher, so their camera looks higher too.
+HEAD_LARGE = CameraMount(eye=(-0.02, 0.0, 0.98), target=(0.47, 0.0, 0.12), fovy_deg=39.0)
+WRIST = CameraMount(eye=(0.10, 0.0, -0.105), target=(0.005, 0.0, 0.02), fovy_deg=62.0)
 
 
 @dataclass(frozen=True)
@@ -47,97 +48,79 @@ class Robot:
     Attributes:
         model: folder name under artifacts/shipped/robots.
         finger_travel: (closed, open) of each finger joint [m], or of the jaw [rad].
-        reach_x, reach_y: ranges of tool positions over the table; y is the distance from the middle plane on the
-            arm's own side.
-        scale: size of objects and heights relative to the large arms.
-        colours: mesh colour of the source model (rounded to quarters) -> colour drawn, so that every embodiment
-            stands out from the tables.
+        jaw: the gripper is one rotating jaw instead of two sliding fingers.
+        reach_x, reach_y: ranges of tool positions over the table [m]; y is the distance from the middle plane on the
+            arm's own side (the whole width for a single arm).
+        scale: size of objects and heights, 1.0 for ViperX.
+        colours: pairs (mesh colour of the source model, rounded to quarters; colour drawn instead), so that every
+            robot stands out from the tables.
     """
 
     name: str
     model: str
     arms: tuple[ArmPlacement, ...]
     finger_travel: tuple[float, float]
-    jaw: bool
     reach_x: tuple[float, float]
     reach_y: tuple[float, float]
     scale: float
-    head: HeadCamera
-    wrist: WristCamera
+    head: CameraMount
     colours: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        return ("head", *(f"{arm.name}_wrist" for arm in self.arms))
+    wrist: CameraMount = WRIST
+    jaw: bool = False
 
 
-def _pair(
-    distance: float, yaw: float, home: tuple[float, ...], mirrored: tuple[float, ...] | None = None
-) -> tuple[ArmPlacement, ...]:
+def _pair(distance: float, yaw: float, home: tuple[float, ...]) -> tuple[ArmPlacement, ...]:
     left = ArmPlacement("left", (0.0, distance, 0.0), -yaw, home)
-    right = ArmPlacement("right", (0.0, -distance, 0.0), yaw, mirrored or home)
+    right = ArmPlacement("right", (0.0, -distance, 0.0), yaw, home)
     return (left, right)
 
 
-HEAD = HeadCamera(eye=(-0.02, 0.0, 0.86), target=(0.40, 0.0, 0.08), fovy_deg=39.0)
-# The larger arms carry their hands higher, so their camera looks higher too.
-HEAD_LARGE = HeadCamera(eye=(-0.02, 0.0, 0.98), target=(0.47, 0.0, 0.12), fovy_deg=39.0)
-WRIST = WristCamera(eye=(0.10, 0.0, -0.105), target=(0.005, 0.0, 0.02), fovy_deg=62.0)
-
-ROBOTS: dict[str, Robot] = {
-    "aloha_viperx": Robot(
+_ROBOTS = (
+    Robot(
         name="aloha_viperx",
         model="viperx",
         arms=_pair(0.27, 0.15, (0.0, -0.75, 0.95, 0.0, 1.2, 0.0)),
         finger_travel=(0.0, 0.042),
-        jaw=False,
         reach_x=(0.26, 0.46),
         reach_y=(0.05, 0.30),
         scale=1.0,
         head=HEAD,
-        wrist=WRIST,
         colours=(((0.5, 0.5, 0.5), (0.13, 0.13, 0.15)),),
     ),
-    "ur5e_pair": Robot(
+    Robot(
         name="ur5e_pair",
         model="ur5e",
         arms=_pair(0.38, 0.0, (-0.3, -1.9, 2.3, -1.97, -1.57, -1.87)),
         finger_travel=(0.0, 0.040),
-        jaw=False,
         reach_x=(0.34, 0.56),
         reach_y=(0.06, 0.34),
         scale=1.1,
         head=HEAD_LARGE,
-        wrist=WRIST,
         colours=(((0.75, 0.0, 0.0), (0.20, 0.20, 0.22)),),
     ),
-    "xarm7_pair": Robot(
+    Robot(
         name="xarm7_pair",
         model="xarm7",
         arms=_pair(0.30, 0.0, (0.0, -0.4, 0.0, 0.9, 0.0, 1.3, 0.0)),
         finger_travel=(0.0, 0.042),
-        jaw=False,
         reach_x=(0.32, 0.54),
         reach_y=(0.06, 0.32),
         scale=1.1,
         head=HEAD_LARGE,
-        wrist=WRIST,
         colours=(((1.0, 1.0, 1.0), (0.86, 0.87, 0.90)),),
     ),
-    "panda_pair": Robot(
+    Robot(
         name="panda_pair",
         model="panda",
         arms=_pair(0.32, 0.0, (0.0, 0.0, 0.0, -2.3, 0.0, 2.3, 0.785)),
         finger_travel=(0.0, 0.040),
-        jaw=False,
         reach_x=(0.36, 0.58),
         reach_y=(0.06, 0.34),
         scale=1.1,
         head=HEAD_LARGE,
-        wrist=WRIST,
         colours=(((1.0, 1.0, 1.0), (0.84, 0.80, 0.72)),),
     ),
-    "so101": Robot(
+    Robot(
         name="so101",
         model="so101",
         arms=(ArmPlacement("right", (0.0, 0.0, 0.0), 0.0, (0.0, -0.6, 0.6, 1.2, 0.0)),),
@@ -146,8 +129,9 @@ ROBOTS: dict[str, Robot] = {
         reach_x=(0.18, 0.29),
         reach_y=(-0.12, 0.12),
         scale=0.6,
-        head=HeadCamera(eye=(0.02, 0.0, 0.50), target=(0.20, 0.0, 0.02), fovy_deg=40.0),
-        wrist=WristCamera(eye=(0.05, 0.0, -0.07), target=(0.0, 0.0, 0.02), fovy_deg=70.0),
+        head=CameraMount(eye=(0.02, 0.0, 0.50), target=(0.20, 0.0, 0.02), fovy_deg=40.0),
+        wrist=CameraMount(eye=(0.05, 0.0, -0.07), target=(0.0, 0.0, 0.02), fovy_deg=70.0),
         colours=(((1.0, 0.75, 0.0), (0.93, 0.90, 0.80)),),
     ),
-}
+)
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in _ROBOTS}

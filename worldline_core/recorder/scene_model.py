@@ -1,7 +1,7 @@
-"""Build the MuJoCo model of one embodiment with its table and task objects (Apache/MIT robot assets only).
+"""The MuJoCo model of one robot with its table and task objects.
 
-One model serves all episodes of an embodiment: colours, lights, camera poses and the places of static bodies are
-set per episode, unused objects are parked far below the table.
+One model serves all episodes of a robot: colours, lights, camera poses and the places of static bodies are set per
+episode, unused objects are parked far below the table.
 """
 
 from __future__ import annotations
@@ -15,42 +15,57 @@ import numpy as np
 from worldline_core.errors import DataError
 from worldline_core.recorder.robots import ROBOTS_FOLDER, Robot
 
+# Sizes of the task objects [m], to be multiplied by the robot's scale: half the cube's edge, half the drawer's edges.
 CUBE_HALF = 0.028
 PAD_RADIUS = 0.055
 DRAWER_TRAVEL = 0.10
 DRAWER_HALF = (0.055, 0.050, 0.026)
+# Frames per second, and physics steps per frame.
 FRAME_RATE = 8
 SUBSTEPS = 30
 TIMESTEP = 1.0 / (FRAME_RATE * SUBSTEPS)
+# Where objects wait that an episode does not use.
 PARKED = np.array([-3.0, 0.0, -4.0])
+# Bodies and their joints have the same names.
+FINGER_JOINTS = ("finger_a", "finger_b", "jaw")
+
+
+@dataclass(frozen=True)
+class ArmIndices:
+    """Where one arm's joints, fingers and tool lie in the compiled model; ``limits`` (J, 2) of the joints [rad]."""
+
+    joint_names: tuple[str, ...]
+    finger_names: tuple[str, ...]
+    qpos: np.ndarray
+    dofs: np.ndarray
+    actuators: np.ndarray
+    finger_qpos: np.ndarray
+    finger_actuators: np.ndarray
+    tool_site: int
+    limits: np.ndarray
 
 
 @dataclass(frozen=True)
 class SceneModel:
-    """Compiled model and the addresses that the recorder needs (per arm, in the order of ``robot.arms``)."""
+    """The compiled model, its arms in the order of ``robot.arms``, and which geoms belong to the robot."""
 
     robot: Robot
     model: Any
-    joint_qpos: tuple[np.ndarray, ...]
-    joint_dofs: tuple[np.ndarray, ...]
-    arm_actuators: tuple[np.ndarray, ...]
-    finger_qpos: tuple[np.ndarray, ...]
-    finger_actuators: tuple[np.ndarray, ...]
-    tool_sites: tuple[int, ...]
-    ee_bodies: tuple[int, ...]
-    limits: tuple[np.ndarray, ...]
+    arms: tuple[ArmIndices, ...]
     robot_geoms: np.ndarray
 
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state columns: ``<arm>/<joint>`` then ``<arm>/gripper``, arm after arm."""
+        arms = zip(self.robot.arms, self.arms, strict=True)
+        return tuple(name for placed, arm in arms for name in (*arm.joint_names, f"{placed.name}/gripper"))
 
-def _quat_about_z(angle: float) -> list[float]:
-    return [float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2))]
 
-
-def arm_spec(robot: Robot, folder: Path | None = None) -> Any:
-    """The clean arm model of a robot folder with servo-friendly dynamics."""
+def arm_spec(robot: Robot) -> Any:
+    """MuJoCo specification of one arm: drawn colours, position servos, gravity compensated, simple inertia."""
     import mujoco
 
-    folder = folder or ROBOTS_FOLDER / robot.model
+    folder = ROBOTS_FOLDER / robot.model
     path = folder / "arm.xml"
     if not path.is_file():
         raise DataError(
@@ -70,16 +85,15 @@ def arm_spec(robot: Robot, folder: Path | None = None) -> Any:
             drawn = colours.get(tuple(np.round(np.asarray(geom.rgba[:3]), 3)))
             if drawn is not None:
                 geom.rgba = [*drawn, 1.0]
-    finger_bodies = {"finger_a", "finger_b", "jaw"}
     for body in spec.bodies:
         if body.name == "world":
             continue
         body.gravcomp = 1.0
         body.explicitinertial = True
-        body.mass = 0.05 if body.name in finger_bodies else 0.5 * robot.scale
-        body.inertia = [1e-4] * 3 if body.name in finger_bodies else [2e-3] * 3
+        body.mass = 0.05 if body.name in FINGER_JOINTS else 0.5 * robot.scale
+        body.inertia = [1e-4] * 3 if body.name in FINGER_JOINTS else [2e-3] * 3
     for joint in spec.joints:
-        finger = joint.name in finger_bodies
+        finger = joint.name in FINGER_JOINTS
         joint.armature = (0.002 if robot.jaw else 0.05) if finger else 0.4
         gain, damping = ((12.0, 0.3) if robot.jaw else (500.0, 15.0)) if finger else (1600.0, 55.0)
         limit = ((-1.2, 1.2) if robot.jaw else (-14.0, 14.0)) if finger else (-4000.0, 4000.0)
@@ -166,36 +180,28 @@ def build_scene_model(robot: Robot) -> SceneModel:
     for arm in robot.arms:
         child = arm_spec(robot)
         child.body("ee").add_camera(name="wrist", fovy=robot.wrist.fovy_deg)
-        frame = spec.worldbody.add_frame(pos=list(arm.base_xyz), quat=_quat_about_z(arm.yaw))
+        about_z = [float(np.cos(arm.yaw / 2)), 0.0, 0.0, float(np.sin(arm.yaw / 2))]
+        frame = spec.worldbody.add_frame(pos=list(arm.base_xyz), quat=about_z)
         spec.attach(child, prefix=f"{arm.name}/", frame=frame)
     model = spec.compile()
-    qpos, dofs, actuators, finger_qpos, finger_actuators, sites, bodies, limits = [], [], [], [], [], [], [], []
     prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
-    for prefix in prefixes:
-        names = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name.startswith(prefix)]
-        fingers = [n for n in names if n.split("/")[1] in ("finger_a", "finger_b", "jaw")]
-        joints = [n for n in names if n not in fingers]
-        qpos.append(np.array([model.joint(n).qposadr[0] for n in joints]))
-        dofs.append(np.array([model.joint(n).dofadr[0] for n in joints]))
-        actuators.append(np.array([model.actuator(n).id for n in joints]))
-        finger_qpos.append(np.array([model.joint(n).qposadr[0] for n in fingers]))
-        finger_actuators.append(np.array([model.actuator(n).id for n in fingers]))
-        limits.append(np.array([model.joint(n).range for n in joints]))
-        sites.append(model.site(f"{prefix}tool").id)
-        bodies.append(model.body(f"{prefix}ee").id)
-    robot_geoms = np.array(
-        [model.body(int(model.geom_bodyid[g])).name.startswith(prefixes) for g in range(model.ngeom)], dtype=bool
-    )
-    return SceneModel(
-        robot=robot,
-        model=model,
-        joint_qpos=tuple(qpos),
-        joint_dofs=tuple(dofs),
-        arm_actuators=tuple(actuators),
-        finger_qpos=tuple(finger_qpos),
-        finger_actuators=tuple(finger_actuators),
-        tool_sites=tuple(sites),
-        ee_bodies=tuple(bodies),
-        limits=tuple(limits),
-        robot_geoms=robot_geoms,
+    of_robot = [model.body(int(body)).name.startswith(prefixes) for body in model.geom_bodyid]
+    arms = tuple(_arm_indices(model, prefix) for prefix in prefixes)
+    return SceneModel(robot=robot, model=model, arms=arms, robot_geoms=np.array(of_robot, dtype=bool))
+
+
+def _arm_indices(model: Any, prefix: str) -> ArmIndices:
+    names = [model.joint(j).name for j in range(model.njnt) if model.joint(j).name.startswith(prefix)]
+    fingers = tuple(name for name in names if name.removeprefix(prefix) in FINGER_JOINTS)
+    joints = tuple(name for name in names if name not in fingers)
+    return ArmIndices(
+        joint_names=joints,
+        finger_names=fingers,
+        qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
+        dofs=np.array([model.joint(name).dofadr[0] for name in joints]),
+        actuators=np.array([model.actuator(name).id for name in joints]),
+        finger_qpos=np.array([model.joint(name).qposadr[0] for name in fingers]),
+        finger_actuators=np.array([model.actuator(name).id for name in fingers]),
+        tool_site=model.site(f"{prefix}tool").id,
+        limits=np.array([model.joint(name).range for name in joints]),
     )

@@ -1,9 +1,7 @@
-"""Run one episode: waypoints to joint targets at the frame rate, physics in between, state at every frame.
+"""One episode: plan it, run the physics, film it.
 
-The commanded targets of frame t are executed at t and interpolated linearly up to those of frame t+1, so that the
-recorded actions alone reproduce the motion.
-
-Record single episodes: everything follows from (seed, stream, embodiment, split, number).
+The joint targets of frame t are commanded at t and interpolated linearly up to those of frame t+1, so that the recorded
+actions alone reproduce the motion.
 """
 
 from __future__ import annotations
@@ -15,20 +13,14 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
-from worldline_core.recorder.controllers import Waypoint, plan_waypoints, sample_waypoints
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, tool_rotation
-from worldline_core.recorder.rendering import SceneRenderer
+from worldline_core.recorder.controllers import InverseKinematics, plan_actions, plan_waypoints
+from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
 from worldline_core.recorder.robots import ROBOTS, Robot
 from worldline_core.recorder.scene_model import FRAME_RATE, SUBSTEPS, SceneModel, build_scene_model
-from worldline_core.recorder.task_layout import (
-    SCENES,
-    TEST_SCENES,
-    TRAIN_SCENES,
-    Layout,
-    apply_layout,
-    outcome,
-    sample_layout,
-)
+from worldline_core.recorder.task_layout import Layout, apply_layout, outcome, sample_layout
+
+# Largest accepted distance between a planned tool position and what the arm can reach.
+REACH_TOLERANCE_M = 0.012
 
 
 @dataclass(frozen=True)
@@ -39,6 +31,15 @@ class Motion:
     action: np.ndarray
     qpos: np.ndarray
     outcome: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view."""
+
+    episode: Episode
+    frames: dict[str, np.ndarray]
+    robot_masks: dict[str, np.ndarray]
 
 
 def opening_to_fingers(robot: Robot, opening: np.ndarray) -> np.ndarray:
@@ -53,25 +54,6 @@ def fingers_to_opening(robot: Robot, fingers: np.ndarray) -> np.ndarray:
     return np.clip((np.mean(fingers, axis=-1) - closed) / (opened - closed), 0.0, 1.0)
 
 
-def plan_actions(
-    scene: SceneModel, solver: InverseKinematics, plans: list[list[Waypoint]], num_frames: int
-) -> tuple[np.ndarray, float]:
-    """Joint targets and openings (N, J) of all arms, and the largest position error of the solver [m]."""
-    times = np.arange(num_frames) / FRAME_RATE
-    columns, worst = [], 0.0
-    for arm, points in enumerate(plans):
-        positions, yaws, pitches, openings = sample_waypoints(points, times)
-        joints = np.asarray(scene.robot.arms[arm].home, dtype=np.float64)
-        targets = []
-        for frame in range(num_frames):
-            rotation = tool_rotation(yaws[frame], pitches[frame])
-            joints, error = solver.solve(arm, joints, positions[frame], rotation, 300 if frame == 0 else 80)
-            worst = max(worst, error)
-            targets.append(joints)
-        columns += [np.array(targets), openings[:, None]]
-    return np.concatenate(columns, axis=1).astype(np.float32), worst
-
-
 def execute(scene: SceneModel, data: Any, layout: Layout, action: np.ndarray) -> Motion:
     """Drive the simulator with the recorded actions (N, J) from the layout's initial state."""
     import mujoco
@@ -81,14 +63,14 @@ def execute(scene: SceneModel, data: Any, layout: Layout, action: np.ndarray) ->
     # Actions are stored as float32; the simulator is driven by exactly what is stored.
     control = np.zeros((len(action), model.nu))
     column = 0
-    for arm in range(len(robot.arms)):
-        count = len(scene.joint_qpos[arm])
+    for arm in scene.arms:
+        count = len(arm.joint_names)
         joints = action[:, column : column + count].astype(np.float64)
         fingers = opening_to_fingers(robot, action[:, column + count].astype(np.float64))
-        control[:, scene.arm_actuators[arm]] = joints
-        control[:, scene.finger_actuators[arm]] = fingers[:, None]
-        data.qpos[scene.joint_qpos[arm]] = joints[0]
-        data.qpos[scene.finger_qpos[arm]] = fingers[0]
+        control[:, arm.actuators] = joints
+        control[:, arm.finger_actuators] = fingers[:, None]
+        data.qpos[arm.qpos] = joints[0]
+        data.qpos[arm.finger_qpos] = fingers[0]
         column += count + 1
     mujoco.mj_forward(model, data)
     states, snapshots = [], []
@@ -107,32 +89,10 @@ def execute(scene: SceneModel, data: Any, layout: Layout, action: np.ndarray) ->
 def read_state(scene: SceneModel, data: Any) -> np.ndarray:
     """(J,) joint positions then opening, arm after arm."""
     parts: list[np.ndarray] = []
-    for arm in range(len(scene.robot.arms)):
-        parts.append(data.qpos[scene.joint_qpos[arm]])
-        parts.append(np.atleast_1d(fingers_to_opening(scene.robot, data.qpos[scene.finger_qpos[arm]])))
+    for arm in scene.arms:
+        parts.append(data.qpos[arm.qpos])
+        parts.append(np.atleast_1d(fingers_to_opening(scene.robot, data.qpos[arm.finger_qpos])))
     return np.concatenate(parts)
-
-
-# Largest accepted distance between a planned tool position and what the arm can reach.
-REACH_TOLERANCE_M = 0.012
-
-
-@dataclass(frozen=True)
-class Recording:
-    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view."""
-
-    episode: Episode
-    frames: dict[str, np.ndarray]
-    robot_masks: dict[str, np.ndarray]
-
-
-def state_names(scene: SceneModel) -> tuple[str, ...]:
-    """Names of the state columns: ``<arm>/<joint>`` then ``<arm>/gripper``, arm after arm."""
-    names: list[str] = []
-    for arm, addresses in zip(scene.robot.arms, scene.joint_qpos, strict=True):
-        by_address = {int(scene.model.joint(j).qposadr[0]): scene.model.joint(j).name for j in range(scene.model.njnt)}
-        names += [by_address[int(a)] for a in addresses] + [f"{arm.name}/gripper"]
-    return tuple(names)
 
 
 class EpisodeRecorder:
@@ -158,8 +118,7 @@ class EpisodeRecorder:
 
     def move(self, layout: Layout, random: np.random.Generator, num_frames: int) -> Motion | None:
         """Plan and execute; None when the plan leaves what the arms can reach."""
-        duration = (num_frames - 1) / FRAME_RATE
-        plans = plan_waypoints(self.scene.robot, layout, random, duration)
+        plans = plan_waypoints(self.scene.robot, layout, random, (num_frames - 1) / FRAME_RATE)
         action, worst = plan_actions(self.scene, self._solver, plans, num_frames)
         if worst > REACH_TOLERANCE_M:
             return None
@@ -184,7 +143,7 @@ class EpisodeRecorder:
         """Render a motion in a scene and describe it as an episode."""
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
-        # A replay in between may have recoloured objects: the layout decides what they look like.
+        # Another layout may have been executed since: this one decides where objects stand and what they look like.
         self.replay(layout, motion.action[:1])
         self._renderer.set_scene(SCENES[scene_id], jitter)
         frames, masks, cameras = self._renderer.render(motion.qpos)
@@ -206,7 +165,7 @@ class EpisodeRecorder:
             bank=bank,
             candidate=candidate,
             primary_view="head",
-            state_names=state_names(self.scene),
+            state_names=self.scene.state_names,
         )
         return Recording(episode, frames, masks)
 
