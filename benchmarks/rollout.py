@@ -22,8 +22,7 @@ from worldline_core.model.tokenizer.patch import PatchTokenizer
 from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.rollout.causal_simulator import BLOCK_SIZE, BlockCausalSimulator
-from worldline_core.rollout.full_clip import Noise, rollout_full_clip
+from worldline_core.rollout.samplers import BLOCK_SIZE, BlockCausalSimulator, Noise, rollout_full_clip
 
 GRID = (8, 12)
 

@@ -16,8 +16,8 @@ from worldline_core.distillation.distribution_matching import (
     self_forced_rollout,
 )
 from worldline_core.errors import ConfigError
-from worldline_core.rollout.causal_simulator import BlockCausalSimulator
-from worldline_core.rollout.full_clip import Noise
+from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
 from worldline_core.training.flow_matching import LossWeighting
 
 
@@ -116,13 +116,13 @@ def test_a_fake_score_update_reaches_the_fake_score_alone(make_model, clip) -> N
 def test_only_the_exit_pass_carries_a_gradient(make_model, clip) -> None:
     student = make_model(0)
     calls: list[bool] = []
-    original = student.forward
+    original = student._run
 
     def watched(*args, **kwargs):
         calls.append(torch.is_grad_enabled())
         return original(*args, **kwargs)
 
-    student.forward = watched
+    student._run = watched
     rollout(student, clip, 2, with_gradient=True)
     # observed frame; block 1: nodes 0, 1, then the exit; its cache write; block 2: nodes 0, 1, exit (not cached)
     assert calls == [False, False, False, True, False, False, False, True]
@@ -148,14 +148,12 @@ def test_the_rollout_is_causal(make_model, clip) -> None:
 
 
 def test_memory_of_the_history_does_not_grow_with_the_rollout(make_model, clip) -> None:
-    from worldline_core.distillation.causal_teacher_forcing import CausalHistory
-
-    history = CausalHistory(make_model(0), clip.views, CacheWindow(sink_blocks=1, recent_blocks=2))
-    history.remember(clip.latents[..., :1, :, :], clip.maps[..., :1, :, :])
+    model, cache = make_model(0), KVCache(1, 2)
+    model.write_block(clip.latents[..., :1, :, :], cache, action_maps=clip.maps[..., :1, :, :])
     sizes = []
     for _ in range(6):
-        history.remember(clip.latents[..., 1:3, :, :], clip.maps[..., 1:3, :, :])
-        sizes.append(history.cache.nbytes)
+        model.write_block(clip.latents[..., 1:3, :, :], cache, action_maps=clip.maps[..., 1:3, :, :])
+        sizes.append(cache.nbytes)
     assert sizes[0] < sizes[1] == sizes[2] == sizes[-1]
 
 

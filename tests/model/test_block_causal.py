@@ -9,6 +9,7 @@ import torch
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
+    CachedAttention,
     KVCache,
     TeacherForcingAttention,
     block_bounds,
@@ -109,27 +110,34 @@ def test_cached_passes_equal_the_full_block_causal_pass(model: WorldModel) -> No
     for block, (start, stop) in enumerate(block_bounds(FRAMES, BLOCK)):
         own = frames_of(maps, start, stop)
         if block:
-            cached = model(frames_of(noisy, start, stop), sigma[:, block - 1], action_maps=own, cache=cache).velocity
+            cached = model.forward_block(frames_of(noisy, start, stop), sigma[:, block - 1], cache, action_maps=own)
             torch.testing.assert_close(cached, frames_of(full, start, stop), rtol=1e-5, atol=1e-5)
-        model(frames_of(clean, start, stop), torch.zeros(2), action_maps=own, cache=cache, write_cache=True)
+        model.write_block(frames_of(clean, start, stop), cache, action_maps=own)
     assert cache.frames == FRAMES
-    assert cache.blocks_seen == 4
 
 
 def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(model: WorldModel) -> None:
+    """What a block leaves in the cache has no time embedding, which a noisy pass at sigma 0 has."""
     _, clean, _, _ = clip()
-    stored = []
-    for sigma in (0.0, 0.7):
-        cache = KVCache()
-        model(frames_of(clean, 0, 1), torch.full((2,), sigma), cache=cache, write_cache=True)
-        stored.append(cache._blocks[0].keys[1])
-    assert torch.equal(stored[0], stored[1])
-    block = frames_of(clean, 0, 2)
-    as_zero = model(block, torch.zeros(2), clean_frames=torch.tensor([[True, False]] * 2), features_at=1).features
-    as_clean = model(block, torch.zeros(2), clean_frames=torch.ones(2, 2, dtype=torch.bool), features_at=1).features
-    assert as_zero is not None
-    assert as_clean is not None
-    assert not torch.allclose(as_zero, as_clean)
+    observed, block = frames_of(clean, 0, 1), frames_of(clean, 1, 3)
+    cache = KVCache(1, 3)
+    model.write_block(observed, cache)
+    model.write_block(block, cache)
+    written = cache._blocks[1].layers[1][0]
+    other = KVCache(1, 3)
+    model.write_block(observed, other)
+    seen = []
+    attend = CachedAttention.__call__
+
+    def watch(self: CachedAttention, layer: int, queries: torch.Tensor, keys: torch.Tensor, *rest: object) -> object:
+        seen.append(keys)
+        return attend(self, layer, queries, keys, *rest)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CachedAttention, "__call__", watch)
+        model.forward_block(block, 0.0, other)
+    assert seen[1].shape == written.shape
+    assert not torch.allclose(seen[1], written)
 
 
 def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_trained_positions(
@@ -140,13 +148,13 @@ def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_tr
     for block in range(12):
         frames = 1 if block == 0 else BLOCK
         latents = torch.full((1, 3, 4, frames, 4, 4), float(block))
-        model(latents, torch.zeros(1), cache=cache, write_cache=True)
+        model.write_block(latents, cache)
         sizes.append((cache.frames, cache.nbytes))
     assert max(frames for frames, _ in sizes) == 1 + 2 * BLOCK
     assert len(set(sizes[3:])) == 1
     first = KVCache(1, 2)
-    model(torch.zeros(1, 3, 4, 1, 4, 4), torch.zeros(1), cache=first, write_cache=True)
-    assert torch.equal(cache._blocks[0].keys[0], first._blocks[0].keys[0])
+    model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), first)
+    assert torch.equal(cache._blocks[0].layers[0][0], first._blocks[0].layers[0][0])
 
 
 def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_blocks(model: WorldModel) -> None:
@@ -154,29 +162,25 @@ def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_block
     rolled, fresh = KVCache(1, 1), KVCache(1, 1)
     _, clean, _, sigma = clip()
     for start, stop in ((0, 1), (1, 3), (3, 5)):
-        model(frames_of(clean, start, stop), torch.zeros(2), cache=rolled, write_cache=True)
+        model.write_block(frames_of(clean, start, stop), rolled)
     fresh._blocks, fresh.reference = list(rolled._blocks), rolled.reference
     block = frames_of(clean, 5, 7)
-    assert torch.equal(
-        model(block, sigma[:, 0], cache=rolled).velocity, model(block, sigma[:, 0], cache=fresh).velocity
-    )
+    assert torch.equal(model.forward_block(block, sigma[:, 0], rolled), model.forward_block(block, sigma[:, 0], fresh))
 
 
 def test_copies_of_a_cache_go_on_separately(model: WorldModel) -> None:
-    cache = KVCache()
-    model(torch.zeros(1, 3, 4, 1, 4, 4), torch.zeros(1), cache=cache, write_cache=True)
+    cache = KVCache(1, 3)
+    model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), cache)
     other = cache.copy()
-    model(torch.ones(1, 3, 4, BLOCK, 4, 4), torch.zeros(1), cache=other, write_cache=True)
+    model.write_block(torch.ones(1, 3, 4, BLOCK, 4, 4), other)
     assert (cache.frames, other.frames) == (1, 1 + BLOCK)
 
 
 def test_misuse_is_refused(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
-    with pytest.raises(DataError, match="Only clean frames are written"):
-        model(clean, sigma[:, 0], write_cache=True)
-    with pytest.raises(DataError, match="one sigma a block"):
+    with pytest.raises(DataError, match="one sigma per block"):
         model.forward_teacher_forcing(noisy, clean, sigma[:, :1], action_maps=maps, block_size=BLOCK)
     with pytest.raises(ConfigError, match="at least the observed frame"):
-        KVCache(sink_blocks=0)
-    with pytest.raises(ConfigError, match="outside begin_block"):
-        KVCache().write(0, noisy, noisy)
+        KVCache(sink_blocks=0, recent_blocks=3)
+    with pytest.raises(DataError, match="Latents have the wrong shape"):
+        model.write_block(clean[0], KVCache(1, 3))

@@ -80,9 +80,9 @@ def test_diffusers_weights_give_the_same_velocity(diffusers_model: torch.nn.Modu
     text = [3, 1, 4, 1, 5, 9, 2]
     for sigma in (0.9, 0.3):
         expected = reference_velocity(diffusers_model, latents, sigma, text, fps=16.0)
-        ours = model(latents[:, None], torch.tensor([sigma]), text_ids=torch.tensor([text]), views=("head",)).velocity[
-            :, 0
-        ]
+        ours = model(
+            latents[:, None], torch.tensor([sigma]), text=model.encode_text(torch.tensor([text])), views=("head",)
+        ).velocity[:, 0]
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-5)
         assert expected[:, :, 1:].abs().mean() > 0.1
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.rope import video_positions, view_starts
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import cosmos3_nano_config
@@ -53,10 +54,9 @@ def test_sigma_is_not_read_on_clean_frames(build: Build) -> None:
     assert not torch.allclose(model(latents, per_frame).velocity, model(latents, other).velocity)
 
 
-def test_the_whole_clip_may_be_generated_without_a_clean_frame(build: Build) -> None:
+def test_a_block_after_a_cache_has_no_clean_frame(build: Build) -> None:
     latents, _, sigma = sample()
-    none_clean = torch.zeros(2, 3, dtype=torch.bool)
-    assert bool((build()(latents, sigma, clean_frames=none_clean).velocity[:, :, :, 0] != 0).any())
+    assert bool((build().forward_block(latents, sigma, KVCache(1, 3))[:, :, :, 0] != 0).any())
 
 
 def test_sample_prediction_returns_the_velocity_of_the_emitted_latents(build: Build) -> None:
@@ -73,8 +73,8 @@ def test_first_frame_residual_adds_the_clean_first_frame(build: Build) -> None:
     expected = (latents - emitted) / sigma.clamp_min(0.05).view(-1, 1, 1, 1, 1, 1)
     model = build(prediction="first_frame_residual")
     torch.testing.assert_close(model(latents, sigma).velocity[:, :, :, 1:], expected[:, :, :, 1:])
-    with pytest.raises(ConfigError, match="needs it clean"):
-        model(latents, sigma, clean_frames=torch.zeros(2, 3, dtype=torch.bool))
+    with pytest.raises(ConfigError, match="holds no first frame"):
+        model.forward_block(latents, sigma, KVCache(1, 3))
 
 
 def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bit_and_is_trainable(
@@ -137,24 +137,22 @@ def test_features_come_from_the_layer_asked_for(build: Build) -> None:
         model(latents, sigma, features_at=3)
 
 
-def test_text_encoded_once_equals_text_given_each_time_and_padding_changes_nothing(build: Build) -> None:
+def test_text_conditions_and_padding_changes_nothing(build: Build) -> None:
     latents, _, sigma = sample()
     model = build()
     ids = torch.tensor([[3, 4, 5], [6, 7, 0]])
     mask = torch.tensor([[1, 1, 1], [1, 1, 0]])
-    both = model(latents, sigma, text_ids=ids, text_mask=mask).velocity
-    torch.testing.assert_close(model(latents, sigma, text=model.encode_text(ids, mask)).velocity, both)
-    alone = model(latents[1:], sigma[1:], text_ids=ids[1:, :2]).velocity
+    both = model(latents, sigma, text=model.encode_text(ids, mask)).velocity
+    alone = model(latents[1:], sigma[1:], text=model.encode_text(ids[1:, :2])).velocity
     torch.testing.assert_close(both[1:], alone, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(both, model(latents, sigma).velocity, atol=1e-3)
 
 
 def test_a_model_without_the_understanding_tower_refuses_text(build: Build) -> None:
-    latents, _, sigma = sample()
     model = build(towers="generation")
     assert not any("to_q" in name or name.startswith("embed_tokens") for name, _ in model.named_parameters())
     with pytest.raises(ConfigError, match="no understanding tower"):
-        model(latents, sigma, text_ids=torch.ones(2, 3, dtype=torch.long))
+        model.encode_text(torch.ones(2, 3, dtype=torch.long))
 
 
 def test_parameter_groups_cover_the_generation_tower(build: Build) -> None:

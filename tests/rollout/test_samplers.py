@@ -10,9 +10,9 @@ import torch
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
-from worldline_core.rollout.causal_simulator import BlockCausalSimulator
-from worldline_core.rollout.full_clip import (
+from worldline_core.rollout.samplers import (
     CAUSAL_SIGMAS,
+    BlockCausalSimulator,
     Noise,
     check_nodes,
     euler_step,
@@ -109,7 +109,7 @@ def test_blocks_equal_the_full_block_causal_pass_at_every_step(model: WorldModel
     noise = Noise([42, 43])
     noisy = torch.cat([first[:, :, :, None], *(noise.draw((3, 4, 4, 4, 4)) for _ in range(2))], dim=3)
     clean = torch.cat([first[:, :, :, None], *blocks], dim=3)
-    velocity = model.forward_teacher_forcing(noisy, clean, torch.ones(2, 2), action_maps=maps)
+    velocity = model.forward_teacher_forcing(noisy, clean, torch.ones(2, 2), action_maps=maps, block_size=4)
     torch.testing.assert_close(noisy - velocity, clean, rtol=1e-4, atol=1e-4)
 
 

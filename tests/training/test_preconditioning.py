@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
+from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.world_model import WorldModel, WorldModelConfig, preconditioned_velocity
 
@@ -35,16 +36,11 @@ def test_the_cached_pass_sees_the_same_first_frame(model_config: Callable[..., W
     model.initialise(torch.Generator().manual_seed(0))
     latents = torch.randn(1, 3, 4, 3, 4, 4, generator=torch.Generator().manual_seed(1))
     sigma = torch.full((1,), 0.6)
-    clean = torch.zeros(1, 2, dtype=torch.bool)
     cache = KVCache(1, 3)
-    model(
-        latents[:, :, :, :1],
-        torch.zeros(1),
-        clean_frames=torch.ones(1, 1, dtype=torch.bool),
-        cache=cache,
-        write_cache=True,
-    )
-    cached = model(latents[:, :, :, 1:], sigma, clean_frames=clean, cache=cache).velocity
+    with pytest.raises(ConfigError, match="holds no first frame"):
+        model.forward_block(latents[:, :, :, 1:], sigma, cache)
+    model.write_block(latents[:, :, :, :1], cache)
+    cached = model.forward_block(latents[:, :, :, 1:], sigma, cache)
     # The head of a fresh model is silent, so what remains is the preconditioning alone.
     whole = model(latents, sigma).velocity[:, :, :, 1:]
     torch.testing.assert_close(cached, whole)

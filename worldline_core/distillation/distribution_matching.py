@@ -15,18 +15,19 @@ of gradients), so memory does not grow with the number of blocks or steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow, CausalHistory, frame_sigmas
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow, frame_sigmas
 from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.distillation.teacher_trajectories import NODES
 from worldline_core.errors import ConfigError
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.full_clip import euler_step
+from worldline_core.rollout.samplers import integrate
 from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
 
 Score = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -66,23 +67,21 @@ def self_forced_rollout(
     """
     if not 0 <= exit_step < len(NODES) - 1:
         raise ConfigError("No such exit step", expected=f"0..{len(NODES) - 2}", got=exit_step)
-    history = CausalHistory(student, views, window)
-    history.remember(first, action_maps[..., :1, :, :])
+    cache = KVCache(window.sink_blocks, window.recent_blocks)
+    student.write_block(first, cache, action_maps=action_maps[..., :1, :, :], views=views)
     bounds = block_bounds(noise.shape[3], block_size)
     blocks = [first]
     for start, stop in bounds[1:]:
         maps = action_maps[..., start:stop, :, :]
+        velocity = partial(student.forward_block, cache=cache, action_maps=maps, views=views)
         state = noise[..., start:stop, :, :]
         with torch.no_grad():
-            for step in range(exit_step):
-                velocity = history.velocity(state, NODES[step], maps)
-                state = euler_step(state, velocity, NODES[step], NODES[step + 1])
+            state = integrate(velocity, state, NODES[: exit_step + 1])
         with torch.set_grad_enabled(with_gradient):
-            velocity = history.velocity(state, NODES[exit_step], maps)
-            clean = euler_step(state, velocity, NODES[exit_step], 0.0)
+            clean = integrate(velocity, state, (NODES[exit_step], 0.0))
         blocks.append(clean)
         if stop < bounds[-1][1]:
-            history.remember(clean, maps)
+            student.write_block(clean, cache, action_maps=maps, views=views)
     return torch.cat(blocks, dim=3)
 
 

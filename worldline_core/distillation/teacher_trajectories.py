@@ -22,6 +22,7 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +33,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow, CausalHistory
+from worldline_core.distillation.causal_teacher_forcing import CacheWindow
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.block_causal_attention import KVCache, block_bounds
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.full_clip import CAUSAL_SHIFT, CAUSAL_SIGMAS, euler_step
+from worldline_core.rollout.samplers import CAUSAL_SHIFT, CAUSAL_SIGMAS, VelocityField, integrate
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.digest import digest_file
 from worldline_core.training.clip_sampler import Clip
 
 NODES = CAUSAL_SIGMAS
 """Noise levels of the four-step sampler, at which the trajectories are kept."""
-
-VelocityField = Callable[[Tensor, float], Tensor]
 
 
 def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
@@ -86,9 +85,7 @@ def euler_nodes(
         )
     state, states = noise, [noise]
     for (start, stop), count in zip(itertools.pairwise(nodes), substeps, strict=True):
-        levels = substep_sigmas(start, stop, count)
-        for level, following in itertools.pairwise(levels):
-            state = euler_step(state, velocity(state, level), level, following)
+        state = integrate(velocity, state, substep_sigmas(start, stop, count))
         states.append(state)
     return states
 
@@ -117,19 +114,17 @@ def teacher_trajectories(
         DataError: the clip does not divide into blocks.
     """
     bounds = block_bounds(latents.shape[3], block_size)
-    history = CausalHistory(teacher, views, window)
-    history.remember(latents[..., :1, :, :], action_maps[..., :1, :, :])
+    cache = KVCache(window.sink_blocks, window.recent_blocks)
+    teacher.write_block(latents[..., :1, :, :], cache, action_maps=action_maps[..., :1, :, :], views=views)
     blocks: list[Tensor] = []
     for start, stop in bounds[1:]:
         maps = action_maps[..., start:stop, :, :]
-
-        def field(state: Tensor, sigma: float, maps: Tensor = maps) -> Tensor:
-            return history.velocity(state, sigma, maps)
-
-        states = euler_nodes(field, noise[..., start:stop, :, :], substeps)
+        velocity = partial(teacher.forward_block, cache=cache, action_maps=maps, views=views)
+        states = euler_nodes(velocity, noise[..., start:stop, :, :], substeps)
         blocks.append(torch.stack(states, dim=1))
         if stop < bounds[-1][1]:
-            history.remember(states[-1] if generated_history else latents[..., start:stop, :, :], maps)
+            clean = states[-1] if generated_history else latents[..., start:stop, :, :]
+            teacher.write_block(clean, cache, action_maps=maps, views=views)
     return torch.cat(blocks, dim=4)
 
 

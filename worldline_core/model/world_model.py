@@ -1,11 +1,11 @@
 """The action-driven world model: a mixture of transformers over text and multi-view video latents.
 
+One network, four passes: :meth:`WorldModel.forward` (a whole clip), :meth:`~WorldModel.forward_teacher_forcing` (all
+blocks of a recorded clip at once), :meth:`~WorldModel.forward_block` (the next block after a cache) and
+:meth:`~WorldModel.write_block` (a finished block into the cache).
+
 Axis legend: b batch, v view, c latent channel, t latent frame, h w latent grid, n tokens in order ``(t v h w)``,
-d model width. Convention: ``z_sigma = (1 - sigma) z + sigma eps``, velocity ``eps - z`` (method.md section 4).
-
-From what the head emits to the velocity of the flow.
-
-Parameters by tower, and their starting values.
+d model width. Convention: ``z_sigma = (1 - sigma) z + sigma eps``, velocity ``eps - z`` (paper, Rectified Flow).
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from torch.utils.checkpoint import checkpoint
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
+    CachedBlock,
     FullAttention,
     KVCache,
     TeacherForcingAttention,
     block_bounds,
 )
 from worldline_core.model.layers import ActionEncoder, GenerationAttention, MixtureLayer, RMSNorm, TimeEmbedder
-from worldline_core.model.rope import rotation, text_positions, video_positions
+from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
 from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
 
 
@@ -197,73 +198,85 @@ class WorldModel(nn.Module):
         latents: Float[Tensor, "b v c t h w"],
         sigma: Tensor,
         *,
-        clean_frames: Bool[Tensor, "b t"] | None = None,
         action_maps: Float[Tensor, "b v a t h w"] | None = None,
-        text_ids: Tensor | None = None,
-        text_mask: Tensor | None = None,
         text: TextContext | None = None,
         views: Sequence[str] = VIEWS,
-        frame_offset: int = 0,
-        cache: KVCache | None = None,
-        write_cache: bool = False,
         features_at: int | None = None,
     ) -> WorldModelOutput:
-        """One denoising pass.
+        """Velocity of a whole clip whose first latent frame is the clean observation (Stage I and II).
 
         Args:
-            latents: noisy latents; clean frames hold the conditioning itself.
-            sigma: noise level in [0, 1], ``(b)`` or ``(b t)``; not read on clean frames.
-            clean_frames: frames that are conditioning: no time embedding, velocity 0. By default the first frame, or
-                none when the pass continues a cache; in a write pass all of them.
+            latents: noisy latents behind a clean first frame.
+            sigma: noise level in [0, 1], ``(b)`` or ``(b t)``; not read on the first frame.
             action_maps: maps at latent resolution; None runs without the action branch.
-            text_ids: token ids ``(b m)``, with ``text_mask`` (1 = real); or ``text``, encoded before.
+            text: from :meth:`encode_text`.
             views: names of the views in ``latents``.
-            frame_offset: temporal position of the first frame (ignored with a cache, which counts by itself).
-            cache: attend to the window of finished blocks too; the current frames follow it in time.
-            write_cache: store this block's keys and values (it must be clean: the conditioned-frame form).
-            features_at: return the video tokens after this many layers (1-based), as ``(b v t h w d)``.
+            features_at: also return the video tokens after this many layers (1-based), as ``(b v t h w d)``.
 
         Raises:
             DataError: a shape does not fit.
-            ConfigError: a view is unknown, or text is given to a model without the understanding tower.
+            ConfigError: a view is unknown, or there is no such layer.
         """
         self._check(latents, views, action_maps)
-        batch, _, _, frames, _, _ = latents.shape
-        if clean_frames is None:
-            clean_frames = torch.zeros(batch, frames, dtype=torch.bool, device=latents.device)
-            if write_cache:
-                clean_frames = ~clean_frames
-            elif cache is None:
-                clean_frames[:, 0] = True
-        if write_cache and (cache is None or not bool(clean_frames.all())):
-            raise DataError("Only clean frames are written to a cache", expected="a cache, and all frames clean")
-        if text is None and text_ids is not None:
-            text = self.encode_text(text_ids, text_mask)
-        index = torch.arange(frames, device=latents.device)
-        grid = (latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size)
-        if cache is not None:
-            if text is not None:
-                raise ConfigError("Block-causal passes take no text", next_step="text belongs to Stage I only")
-            attend: GenerationAttention = self._cached_attention(cache, index, grid, views, write_cache)
-        else:
-            offset = 0.0 if text is None else text.size + self.config.temporal_margin
-            by = rotation(self.config, video_positions(self.config, index + frame_offset, grid, views, offset))
-            attend = FullAttention(by, None if text is None else text.mask)
-        tokens = self._embed(latents, sigma, clean_frames, action_maps, views)
-        tokens, features = self._run(tokens, attend, text, features_at)
-        if write_cache and cache is not None:
-            cache.end_block()
-            if cache.reference is None:
-                cache.reference = latents[:, :, :, :1].detach()
-        reference = latents[:, :, :, :1] if cache is None else cache.reference
-        if self.config.prediction == "first_frame_residual" and cache is None and not bool(clean_frames[:, 0].all()):
-            raise ConfigError(
-                "A model that predicts residuals to the first frame needs it clean", next_step="condition on it"
-            )
-        velocity = self._velocity(tokens, latents, sigma, clean_frames, reference)
+        frames, (rows, columns) = latents.shape[3], self._patch_grid(latents)
+        offset = 0.0 if text is None else text.size + self.config.temporal_margin
+        by = self._rotation(torch.arange(frames, device=latents.device), latents, views, offset)
+        clean = torch.zeros(len(latents), frames, dtype=torch.bool, device=latents.device)
+        clean[:, 0] = True
+        tokens = self._embed(latents, sigma, clean, action_maps, views)
+        tokens, features = self._run(tokens, FullAttention(by, None if text is None else text.mask), text, features_at)
+        velocity = self._velocity(tokens, latents, sigma, clean, latents[:, :, :, :1])
         if features is not None:
-            features = rearrange(features, "b (t v h w) d -> b v t h w d", t=frames, v=len(views), h=grid[0], w=grid[1])
+            features = rearrange(features, "b (t v h w) d -> b v t h w d", t=frames, v=len(views), h=rows, w=columns)
         return WorldModelOutput(velocity, features)
+
+    def forward_block(
+        self,
+        noisy: Float[Tensor, "b v c t h w"],
+        sigma: Tensor | float,
+        cache: KVCache,
+        *,
+        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        views: Sequence[str] = VIEWS,
+    ) -> Float[Tensor, "b v c t h w"]:
+        """Velocity of the block that follows the finished blocks in ``cache``, which stays as it is.
+
+        Args:
+            sigma: noise level in [0, 1], ``(b)`` or one for all.
+
+        Raises:
+            DataError: a shape does not fit.
+            ConfigError: a view is unknown, or the cache holds no first frame for a model that predicts residuals to it.
+        """
+        sigma = torch.as_tensor(sigma, device=noisy.device).expand(len(noisy))
+        clean = torch.zeros(len(noisy), noisy.shape[3], dtype=torch.bool, device=noisy.device)
+        tokens = self._run_block(noisy, sigma, clean, cache, action_maps, views)
+        return self._velocity(tokens, noisy, sigma, clean, cache.reference)
+
+    def write_block(
+        self,
+        clean: Float[Tensor, "b v c t h w"],
+        cache: KVCache,
+        *,
+        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        views: Sequence[str] = VIEWS,
+    ) -> None:
+        """Put the keys and values of a finished block into ``cache``: one pass over its clean latents, as conditioning.
+
+        The first block written is the observed frame, which the cache remembers. No gradient flows into a cache.
+
+        Raises:
+            DataError: a shape does not fit.
+            ConfigError: a view is unknown.
+        """
+        sigma = torch.zeros(len(clean), device=clean.device)
+        every_frame = torch.ones(len(clean), clean.shape[3], dtype=torch.bool, device=clean.device)
+        written: dict[int, tuple[Tensor, Tensor]] = {}
+        with torch.no_grad():
+            self._run_block(clean, sigma, every_frame, cache, action_maps, views, written)
+        cache.append(CachedBlock(clean.shape[3], written))
+        if cache.reference is None:
+            cache.reference = clean[:, :, :, :1].detach()
 
     def forward_teacher_forcing(
         self,
@@ -272,10 +285,10 @@ class WorldModel(nn.Module):
         sigma: Float[Tensor, "b blocks"],
         *,
         action_maps: Float[Tensor, "b v a t h w"] | None = None,
-        block_size: int = 4,
+        block_size: int,
         views: Sequence[str] = VIEWS,
     ) -> Float[Tensor, "b v c t h w"]:
-        """Block-causal velocity of every block in one pass (method.md section 4, Stage III step 1).
+        """Block-causal velocity of every block in one pass (paper, Stage III step 1).
 
         Noisy block ``i`` sees the clean blocks before it and itself, with its own action maps. Frame 0 of ``noisy`` is
         not read; its velocity is 0.
@@ -288,12 +301,11 @@ class WorldModel(nn.Module):
         bounds = block_bounds(frames, block_size)
         if clean.shape != noisy.shape or sigma.shape != (batch, len(bounds) - 1):
             raise DataError(
-                "Teacher forcing needs clean latents like the noisy ones and one sigma a block",
+                "Teacher forcing needs clean latents like the noisy ones and one sigma per block",
                 expected=f"{tuple(noisy.shape)} and {(batch, len(bounds) - 1)}",
                 got=f"{tuple(clean.shape)} and {tuple(sigma.shape)}",
             )
         history = frames - block_size
-        grid = (noisy.shape[-2] // self.config.patch_size, noisy.shape[-1] // self.config.patch_size)
         frame_sigma = repeat(sigma, "b blocks -> b (blocks size)", size=block_size)
         latents = torch.cat((clean[..., :history, :, :], noisy[..., 1:, :, :].to(clean.dtype)), dim=3)
         frame_sigma = torch.cat((frame_sigma.new_zeros(batch, history), frame_sigma), dim=1)
@@ -303,11 +315,12 @@ class WorldModel(nn.Module):
         if action_maps is not None:
             maps = torch.cat((action_maps[..., :history, :, :], action_maps[..., 1:, :, :]), dim=3)
         index = torch.cat((torch.arange(history), torch.arange(1, frames))).to(noisy.device)
-        by = rotation(self.config, video_positions(self.config, index, grid, views))
-        per_frame = len(views) * grid[0] * grid[1]
+        by = self._rotation(index, noisy, views)
+        rows, columns = self._patch_grid(noisy)
+        per_frame = len(views) * rows * columns
         sizes = tuple((stop - start) * per_frame for start, stop in bounds)
         tokens = self._embed(latents, frame_sigma, is_clean, maps, views)
-        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes), None, None)
+        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes))
         velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
 
@@ -327,16 +340,30 @@ class WorldModel(nn.Module):
             if action_maps.shape != wanted:
                 raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
 
-    def _cached_attention(
-        self, cache: KVCache, index: Tensor, grid: tuple[int, int], views: Sequence[str], store: bool
-    ) -> CachedAttention:
-        if cache.needs_rotation:
-            window = torch.arange(cache.frames, device=index.device)
-            cache.set_rotation(rotation(self.config, video_positions(self.config, window, grid, views)))
-        by = rotation(self.config, video_positions(self.config, index + cache.frames, grid, views))
-        if store:
-            cache.begin_block(len(index))
-        return CachedAttention(by, cache, store)
+    def _patch_grid(self, latents: Tensor) -> tuple[int, int]:
+        """Patch rows and columns of one view."""
+        return latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size
+
+    def _rotation(self, frames: Tensor, latents: Tensor, views: Sequence[str], offset: float = 0.0) -> Rotation:
+        """Rotary angles of the tokens of these latent frames (temporal positions)."""
+        return rotation(self.config, video_positions(self.config, frames, self._patch_grid(latents), views, offset))
+
+    def _run_block(
+        self,
+        latents: Tensor,
+        sigma: Tensor,
+        clean: Tensor,
+        cache: KVCache,
+        action_maps: Tensor | None,
+        views: Sequence[str],
+        written: dict[int, tuple[Tensor, Tensor]] | None = None,
+    ) -> Tensor:
+        """Tokens of one block that attends to itself and to the cache's window, which it follows in time."""
+        self._check(latents, views, action_maps)
+        own, window = (torch.arange(count, device=latents.device) for count in (latents.shape[3], cache.frames))
+        by = self._rotation(own + cache.frames, latents, views)
+        attend = CachedAttention(by, cache, self._rotation(window, latents, views), written)
+        return self._run(self._embed(latents, sigma, clean, action_maps, views), attend)[0]
 
     def _embed(
         self, latents: Tensor, sigma: Tensor, clean: Tensor, action_maps: Tensor | None, views: Sequence[str]
@@ -360,7 +387,11 @@ class WorldModel(nn.Module):
         return tokens
 
     def _run(
-        self, tokens: Tensor, attend: GenerationAttention, text: TextContext | None, features_at: int | None
+        self,
+        tokens: Tensor,
+        attend: GenerationAttention,
+        text: TextContext | None = None,
+        features_at: int | None = None,
     ) -> tuple[Tensor, Tensor | None]:
         if features_at is not None and not 1 <= features_at <= len(self.layers):
             raise ConfigError("features_at counts layers from 1", expected=f"1..{len(self.layers)}", got=features_at)

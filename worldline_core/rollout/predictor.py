@@ -20,9 +20,15 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, check_action_contract, load_checkpoint
 from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.causal_simulator import BLOCK_SIZE, BlockCausalSimulator
-from worldline_core.rollout.full_clip import Noise, rollout_full_clip, sigmas_causal, sigmas_full
 from worldline_core.rollout.rollout_config import Job, RolloutConfig
+from worldline_core.rollout.samplers import (
+    BLOCK_SIZE,
+    BlockCausalSimulator,
+    Noise,
+    rollout_full_clip,
+    sigmas_causal,
+    sigmas_full,
+)
 from worldline_core.rollout.speed import Elapsed, timed
 
 WARM_UP_BLOCKS = 2

@@ -12,10 +12,10 @@ from tqdm import tqdm
 from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.rollout.causal_simulator import BLOCK_SIZE
 from worldline_core.rollout.predictor import Predictor
 from worldline_core.rollout.rollout_config import Job, RolloutConfig, shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSetWriter
+from worldline_core.rollout.samplers import BLOCK_SIZE
 from worldline_core.rollout.speed import BatchTime, SpeedLog, device_name, long_rollout, timed
 
 __all__ = ["RolloutConfig", "rollout"]

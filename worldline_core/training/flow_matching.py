@@ -19,7 +19,7 @@ from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
-from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.relational import (
     PoolingShape,
@@ -203,8 +203,7 @@ class FlowMatchingObjective:
             add_noise(latents, noise, sigma),
             sigma,
             action_maps=maps,
-            text_ids=batch.text_ids if with_text else None,
-            text_mask=batch.text_mask if with_text else None,
+            text=self._text(batch) if with_text else None,
             views=batch.views,
             features_at=None if self.relational is None else self.relational.layer,
         )
@@ -215,6 +214,9 @@ class FlowMatchingObjective:
             raise ConfigError("The model returned no features for the relational terms.", where="features_at")
         total, values = self.relational.add(flow, output.features, batch, step)
         return total, {"flow_matching": flow.item(), **values}
+
+    def _text(self, batch: Batch) -> TextContext | None:
+        return None if batch.text_ids is None else self.model.encode_text(batch.text_ids, batch.text_mask)
 
     def state(self) -> dict[str, Any]:
         """Running loss scales."""
@@ -245,8 +247,7 @@ class FlowMatchingObjective:
                 noisy,
                 sigma,
                 action_maps=maps,
-                text_ids=batch.text_ids,
-                text_mask=batch.text_mask,
+                text=self._text(batch),
                 views=batch.views,
             ).velocity
             for name, kind in (("loss", "velocity"), ("sample_error", "sample")):

@@ -1,0 +1,231 @@
+"""Samplers: Euler integration of the rectified flow (paper, Rollout), for a whole clip or block by block."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Float
+from torch import Tensor
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.model.world_model import TextContext, WorldModel
+from worldline_core.model.world_model_config import VIEWS
+
+VelocityField = Callable[[Tensor, float], Tensor]
+"""Velocity at (state, noise level)."""
+FULL_STEPS = 35
+CAUSAL_SHIFT = 5.0
+CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
+"""Nodes of the four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4."""
+BLOCK_SIZE = 4
+
+
+def shifted_sigmas(steps: int, shift: float = 1.0) -> tuple[float, ...]:
+    """``steps + 1`` nodes from 1 to 0; ``s' = shift s / (1 + (shift - 1) s)`` of an even grid.
+
+    Raises:
+        ConfigError: fewer than one step, or a shift that is not positive.
+    """
+    if steps < 1 or shift <= 0:
+        raise ConfigError("A sampler needs at least one step and a positive shift", got=f"steps {steps}, shift {shift}")
+    grid = [1.0 - step / steps for step in range(steps)]
+    return (*(shift * s / (1.0 + (shift - 1.0) * s) for s in grid), 0.0)
+
+
+def sigmas_full(steps: int = FULL_STEPS) -> tuple[float, ...]:
+    """Even nodes of the whole-clip sampler."""
+    return shifted_sigmas(steps)
+
+
+def sigmas_causal(steps: int = 4) -> tuple[float, ...]:
+    """Nodes of the block-causal sampler; four steps are :data:`CAUSAL_SIGMAS`."""
+    return CAUSAL_SIGMAS if steps == 4 else shifted_sigmas(steps, CAUSAL_SHIFT)
+
+
+def euler_step(
+    latents: Float[Tensor, "*shape"], velocity: Float[Tensor, "*shape"], sigma: float, next_sigma: float
+) -> Float[Tensor, "*shape"]:
+    """``z' = z + (sigma' - sigma) v``, in float32."""
+    return latents + (next_sigma - sigma) * velocity.float()
+
+
+def integrate(velocity: VelocityField, state: Tensor, sigmas: Sequence[float]) -> Tensor:
+    """Explicit Euler steps of ``dz / dsigma = velocity`` along ``sigmas``; a single level leaves the state as it is."""
+    for sigma, next_sigma in itertools.pairwise(sigmas):
+        state = euler_step(state, velocity(state, sigma), sigma, next_sigma)
+    return state
+
+
+def check_nodes(sigmas: Sequence[float]) -> None:
+    """Refuse nodes that do not fall from at most 1 to 0.
+
+    Raises:
+        ConfigError: they do not.
+    """
+    falling = all(later < earlier for earlier, later in itertools.pairwise(sigmas))
+    if len(sigmas) < 2 or sigmas[0] > 1 or sigmas[-1] != 0 or not falling:
+        raise ConfigError("Noise levels must fall from at most 1 to 0", got=list(sigmas))
+
+
+class Noise:
+    """Gaussian noise that depends on each clip's seed alone, not on who shares its batch.
+
+    Drawn on the CPU in float32, so that CPU and GPU start from the same noise.
+    """
+
+    def __init__(self, seeds: Sequence[int]) -> None:
+        self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+
+    def draw(self, shape: Sequence[int], device: torch.device | str = "cpu") -> Tensor:
+        """``(batch, *shape)``, one slice a seed."""
+        return torch.stack([torch.randn(tuple(shape), generator=g) for g in self._generators]).to(device)
+
+    def copy(self) -> Noise:
+        """A source that will draw the same noise as this one from here on."""
+        other = Noise([])
+        for generator in self._generators:
+            twin = torch.Generator()
+            twin.set_state(generator.get_state())
+            other._generators.append(twin)
+        return other
+
+
+@torch.no_grad()
+def rollout_full_clip(
+    model: WorldModel,
+    first_latents: Float[Tensor, "b v c h w"],
+    action_maps: Float[Tensor, "b v a t h w"] | None,
+    *,
+    noise: Noise,
+    steps: int = 35,
+    sigmas: Sequence[float] | None = None,
+    frames: int | None = None,
+    views: Sequence[str] = VIEWS,
+    text: TextContext | None = None,
+    bfloat16: bool = False,
+) -> Float[Tensor, "b v c t h w"]:
+    """Integrate from noise to a clip whose first latent frame is ``first_latents``; no classifier-free guidance.
+
+    Args:
+        action_maps: controls of every latent frame; None for a model without actions (then give ``frames``).
+        noise: one source a clip.
+        sigmas: nodes, instead of ``steps`` even ones.
+
+    Raises:
+        ConfigError: the noise levels do not fall to 0.
+        DataError: a shape does not fit the model.
+    """
+    nodes = tuple(sigmas) if sigmas is not None else sigmas_full(steps)
+    check_nodes(nodes)
+    if frames is None:
+        frames = 1 if action_maps is None else action_maps.shape[3]
+    batch, views_count, channels, height, width = first_latents.shape
+    first = repeat(first_latents.float(), "b v c h w -> b v c 1 h w")
+    latents = noise.draw((views_count, channels, frames, height, width), first.device)
+    latents = torch.cat((first, latents[:, :, :, 1:]), dim=3)
+
+    def velocity(state: Tensor, sigma: float) -> Tensor:
+        # The first frame's velocity is zero, so it stays what was observed.
+        levels = torch.full((batch,), sigma, device=state.device)
+        return model(state, levels, action_maps=action_maps, text=text, views=views).velocity
+
+    with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
+        return integrate(velocity, latents, nodes)
+
+
+class BlockCausalSimulator:
+    """Start from observed frames, then step with new controls; the cost of a step does not grow.
+
+    Each block starts from fresh noise and is denoised in a few Euler steps against the cache; when done, its clean form
+    is written to the cache in one more pass (as conditioning: without time embedding). The write waits until the next
+    block is asked for, so the last block of a rollout costs no write pass.
+
+    Args:
+        noise: one source a clip.
+        sink_blocks: blocks kept from the start (the observed frame is block 0).
+        recent_blocks: most recent blocks kept besides; at most what the model was trained on.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        *,
+        noise: Noise,
+        sigmas: Sequence[float] = CAUSAL_SIGMAS,
+        block_size: int = BLOCK_SIZE,
+        sink_blocks: int = 1,
+        recent_blocks: int = 3,
+        views: Sequence[str] = VIEWS,
+        bfloat16: bool = False,
+    ) -> None:
+        check_nodes(sigmas)
+        self.model = model
+        self.sigmas = tuple(sigmas)
+        self.block_size = block_size
+        self.views = tuple(views)
+        self.bfloat16 = bfloat16
+        self.noise = noise
+        self.cache = KVCache(sink_blocks, recent_blocks)
+        self._unwritten: tuple[Tensor, Tensor | None] | None = None
+
+    def start(
+        self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 h w"] | None = None
+    ) -> None:
+        """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
+        self.cache = KVCache(self.cache.sink_blocks, self.cache.recent_blocks)
+        self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
+
+    @torch.no_grad()
+    def step(self, action_maps: Float[Tensor, "b v a t h w"] | None) -> Float[Tensor, "b v c t h w"]:
+        """Predict the next block under these controls.
+
+        Raises:
+            DataError: the rollout was not started, or the controls are not those of one block.
+        """
+        if self._unwritten is None:
+            raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
+        if action_maps is not None and action_maps.shape[3] != self.block_size:
+            raise DataError(
+                "Controls of one block are needed",
+                expected=f"{self.block_size} latent frames",
+                got=action_maps.shape[3],
+            )
+        self._write()
+        reference = self.cache.reference
+        if reference is None:
+            raise DataError("The cache lost its first frame", next_step="call start() again")
+        views, channels, _, height, width = reference.shape[1:]
+        latents = self.noise.draw((views, channels, self.block_size, height, width), reference.device)
+        velocity = partial(self.model.forward_block, cache=self.cache, action_maps=action_maps, views=self.views)
+        with torch.autocast(reference.device.type, torch.bfloat16, enabled=self.bfloat16):
+            latents = integrate(velocity, latents, self.sigmas)
+        self._unwritten = (latents, action_maps)
+        return latents
+
+    def fork(self) -> BlockCausalSimulator:
+        """A simulator in the same state that goes on separately: to try several controls from one moment."""
+        other = BlockCausalSimulator(
+            self.model,
+            noise=self.noise.copy(),
+            sigmas=self.sigmas,
+            block_size=self.block_size,
+            sink_blocks=self.cache.sink_blocks,
+            recent_blocks=self.cache.recent_blocks,
+            views=self.views,
+            bfloat16=self.bfloat16,
+        )
+        other.cache = self.cache.copy()
+        other._unwritten = self._unwritten
+        return other
+
+    def _write(self) -> None:
+        if self._unwritten is None:
+            return
+        latents, action_maps = self._unwritten
+        with torch.autocast(latents.device.type, torch.bfloat16, enabled=self.bfloat16):
+            self.model.write_block(latents, self.cache, action_maps=action_maps, views=self.views)
