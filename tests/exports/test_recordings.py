@@ -12,10 +12,10 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.exports.mcap_recording import write_mcap_recordings
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
-from worldline_core.exports.rollout import export_rollout, safe_stem
+from worldline_core.exports.rollout import export_rollout, write_mcap_recordings
 
 COUNT, HEIGHT = 5, 32
 """As `conftest` makes the episode."""

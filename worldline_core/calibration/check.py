@@ -27,8 +27,8 @@ from worldline_core.data.curation.checks import check_camera, check_times, check
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.exports.rollout import safe_stem
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
@@ -14,14 +13,14 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import with_rigid_poses
 from worldline_core.data.episodes.view_recording import RecordedView
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
 from worldline_core.data.mcap.io import write_episode_mcap
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
-from worldline_core.exports.rollout import Format as RolloutFormat
-from worldline_core.exports.rollout import export_rollout, safe_stem
+from worldline_core.exports.rollout import export_rollout
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import write_json_atomic
 
@@ -42,7 +41,7 @@ def export(
 
     Args:
         formats: of an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
-            artifact refers to another one's), `mcap` and `rrd` (one file an episode); of a RolloutSet `mp4`, `rrd`, `mcap`.
+            artifact refers to another one's), `mcap` and `rrd` (one file per episode); of a RolloutSet `mp4`, `rrd`, `mcap`.
         episode_ids: which episodes; none: all.
         episodes: the EpisodeSet that predictions belong to; default: the one that their manifest names.
 
@@ -152,11 +151,10 @@ def _export_rollouts(
     rollouts, recorded = RolloutSet.open(artifact), EpisodeSet.open(folder)
     tracks_folder = linked_folder(artifact, "tracks")
     tracks = None if tracks_folder is None else ActionTracks.open(tracks_folder)
-    wanted = [name for name in get_args(RolloutFormat) if name in formats]
     missing = sorted(set(episode_ids) - set(rollouts.episode_ids))
     if missing:
         raise DataError("No prediction of this episode", where=artifact, got=", ".join(missing))
     written: list[Path] = []
     for name in episode_ids or rollouts.episode_ids:
-        written += export_rollout(rollouts, recorded, tracks, name, output, wanted)
+        written += export_rollout(rollouts, recorded, tracks, name, output, formats)
     return written

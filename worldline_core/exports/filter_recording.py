@@ -3,7 +3,7 @@
 Entities:
 
     views/<view>                        recorded frames
-    segments/<kept or reason>           a coloured dot a frame, one row a reason: the episode's timeline
+    segments/<kept or reason>           a coloured dot per frame, one row per reason: the episode's timeline
     curves/<detector>/<view>/<name>     what a detector measured, over its threshold: above or below 1 decides
     verdict                             what was found, as text
 """
@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from worldline_core.exports.rerun_recording import log_frames, timeline
@@ -22,9 +24,6 @@ from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     from worldline_core.filters.examine import Finding
 
 _LARGEST_RATIO = 5.0
@@ -39,7 +38,7 @@ def write_filter_recording(
     fps: float,
     summary: str,
 ) -> None:
-    """Writes one `.rrd` with a blueprint; opens with `rerun <file>`.
+    """Write one `.rrd` with a blueprint; opens with `rerun <file>`.
 
     Args:
         frames: by view, (n, H, W, 3).
@@ -47,8 +46,6 @@ def write_filter_recording(
         findings: of the detectors, with their curves.
         summary: Markdown.
     """
-    import rerun as rr
-
     stream = rr.RecordingStream("worldline_filters", send_properties=False)
     with atomic_path(path) as temporary:
         stream.save(temporary, default_blueprint=_blueprint(list(frames), _shown_curves(findings), fps))
@@ -62,8 +59,6 @@ def write_filter_recording(
 
 
 def _log_segments(stream: rr.RecordingStream, dropped: Mapping[str, NDArray[np.bool_]], count: int, fps: float) -> None:
-    import rerun as rr
-
     lost = np.logical_or.reduce([*dropped.values(), np.zeros(count, dtype=bool)])
     rows = [("kept", ~lost, KEPT_COLOUR), *[(r, flags, reason_colour(r)) for r, flags in dropped.items()]]
     for height, (name, flags, colour) in enumerate(rows):
@@ -79,8 +74,6 @@ def _log_segments(stream: rr.RecordingStream, dropped: Mapping[str, NDArray[np.b
 
 
 def _log_curves(stream: rr.RecordingStream, finding: Finding, fps: float) -> None:
-    import rerun as rr
-
     for name, curve in finding.verdict.curves.items():
         if curve.threshold <= 0:
             continue
@@ -99,8 +92,6 @@ def _shown_curves(findings: Sequence[Finding]) -> list[str]:
 
 
 def _blueprint(views: Sequence[str], curves: Sequence[str], fps: float) -> rrb.Blueprint:
-    import rerun.blueprint as rrb
-
     pictures = [rrb.Spatial2DView(origin=f"views/{view}", name=view.replace("_", " ")) for view in views]
     series = rrb.Vertical(
         rrb.TimeSeriesView(origin="segments", name="kept and dropped frames"),

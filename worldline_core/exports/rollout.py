@@ -1,27 +1,27 @@
-"""Export of one episode with its predictions: a Rerun recording, MCAP files, or side-by-side videos."""
+"""Export of one episode with its predictions: side-by-side videos, a Rerun recording, MCAP files."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
-from worldline_core.pictures.side_by_side import write_side_by_side
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.actions.track_store import ActionTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
+    from worldline_core.exports.rerun_recording import RecordingContent
     from worldline_core.rollout.rollout_set import RolloutSet
 
-Format = Literal["mp4", "rrd", "mcap"]
-FORMATS: tuple[str, ...] = ("mp4", "rrd", "mcap")
+FORMATS = ("mp4", "rrd", "mcap")
 
 
 def export_rollout(
@@ -34,12 +34,12 @@ def export_rollout(
     *,
     name: str | None = None,
 ) -> list[Path]:
-    """Writes an episode's predictions below `output` and returns the files.
+    """Write an episode's predictions below `output` and return the files.
 
     Args:
         rollout_sets: one set, or several by method name.
         tracks: action tracks for tool poses and heat maps; left out when None.
-        formats: `mp4` (one side-by-side video a view), `rrd` (one recording with everything), `mcap` (one a method).
+        formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap` (one per method).
         name: beginning of the file names (default: the episode's id).
 
     Raises:
@@ -62,14 +62,13 @@ def export_rollout(
     output.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     if "mp4" in formats:
-        written += write_videos(content, output, stem)
+        written += _write_videos(content, output, stem)
     if "rrd" in formats:
-        path = output / f"{stem}.rrd"
-        write_rerun_recording(path, content)
-        written.append(path)
-    if "mcap" in formats:
-        from worldline_core.exports.mcap_recording import write_mcap_recordings
+        from worldline_core.exports.rerun_recording import write_rerun_recording
 
+        written.append(output / f"{stem}.rrd")
+        write_rerun_recording(written[-1], content)
+    if "mcap" in formats:
         written += write_mcap_recordings(content, output, stem)
     return written
 
@@ -82,7 +81,9 @@ def recording_content(
     *,
     sigma_px_ref: float = SIGMA_PX_REFERENCE,
 ) -> RecordingContent:
-    """Gathers the frames, predictions and tracks of one episode."""
+    """Gather the frames, predictions and tracks of one episode."""
+    from worldline_core.exports.rerun_recording import RecordingContent
+
     index = episode_set.position(episode_id)
     episode = episode_set.episode(index)
     views = [view for view in VIEWS if view in episode_set.rows[index].views]
@@ -91,22 +92,50 @@ def recording_content(
         seed = rollout.seeds(episode_id)[0]
         predicted[method] = {view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views}
     true_frames = {view: np.asarray(episode_set.frames(index, view)) for view in views}
-    names = episode.state_names or ()
-    return RecordingContent(episode, true_frames, predicted, tracks, names, sigma_px_ref)
+    return RecordingContent(episode, true_frames, predicted, tracks, episode.state_names or (), sigma_px_ref)
 
 
-def write_videos(content: RecordingContent, output: Path, stem: str) -> list[Path]:
-    """One side-by-side video a view: truth, then every method."""
+def _write_videos(content: RecordingContent, output: Path, stem: str) -> list[Path]:
+    """One side-by-side video per view: truth, then every method."""
+    from worldline_core.pictures.side_by_side import write_side_by_side
+
     written: list[Path] = []
     for view, frames in content.true_frames.items():
-        columns = {"true": frames} | {
-            method: views[view] for method, views in content.predicted_frames.items() if view in views
-        }
-        made = write_side_by_side(output / f"{stem}_{view}.mp4", columns, content.episode.fps)
+        predicted = {method: views[view] for method, views in content.predicted_frames.items() if view in views}
+        made = write_side_by_side(output / f"{stem}_{view}.mp4", {"true": frames, **predicted}, content.episode.fps)
         written += [made.video, made.poster]
     return written
 
 
-def safe_stem(episode_id: str) -> str:
-    """An episode's id as the beginning of a file name."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in episode_id)
+def write_mcap_recordings(content: RecordingContent, output: Path, stem: str) -> list[Path]:
+    """Write `<stem>_<method>.mcap` for every method, with cameras and commanded tool poses, and return the files.
+
+    Calibration follows the frames' size; poses are cut to the prediction's length.
+    """
+    from worldline_core.data.mcap.io import write_rollout_mcap
+
+    episode = content.episode
+    written: list[Path] = []
+    for method, views in content.predicted_frames.items():
+        count = min(len(frames) for frames in views.values())
+        cameras = {
+            view: episode.cameras[view].resized(frames.shape[2], frames.shape[1]).cut(0, count)
+            for view, frames in views.items()
+            if view in episode.cameras
+        }
+        facts = {
+            "method": method,
+            "episode_id": episode.episode_id,
+            "embodiment": episode.embodiment,
+            "instruction": episode.instruction,
+        }
+        written.append(output / f"{stem}_{method}.mcap")
+        write_rollout_mcap(
+            written[-1],
+            {view: frames[:count] for view, frames in views.items()},
+            episode.fps,
+            metadata={key: json.dumps(value) for key, value in facts.items()},
+            cameras=cameras,
+            T_base_ee=None if content.tracks is None else content.tracks.T_base_tool[:count],
+        )
+    return written

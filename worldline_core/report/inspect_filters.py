@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import DataError
-from worldline_core.exports.rollout import safe_stem
 from worldline_core.pictures.clip_strip import ClipStrip, clip_strip, stacked
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture, png_bytes
@@ -208,7 +209,7 @@ class Subject:
 
     def write_video(self, output: Path, episode_id: str) -> list[Path]:
         """All views side by side with the controls drawn over them, `<episode>.mp4`; truth beside a prediction."""
-        from worldline_core.exports.rollout import export_rollout, safe_stem
+        from worldline_core.exports.rollout import export_rollout
 
         if self.kind == "RolloutSet":
             return export_rollout(self.rollouts, self.episodes, None, episode_id, output, ("mp4",))
@@ -221,7 +222,6 @@ class Subject:
 
         An episode that cannot be shown stays on the page, with the reason.
         """
-        from worldline_core.exports.rollout import safe_stem
         from worldline_core.report.dataset_page import EpisodeCard, dataset_page
         from worldline_core.report.sections.data import one_of_each
 
@@ -255,7 +255,7 @@ class Subject:
     def write_recording(self, output: Path, episode_id: str, notes: list[str]) -> Path:
         """A Rerun recording: frames, controls, cameras, signals, and predictions where the artifact has them."""
         from worldline_core.exports.rerun_recording import write_rerun_recording
-        from worldline_core.exports.rollout import recording_content, safe_stem
+        from worldline_core.exports.rollout import recording_content
 
         tracks = None
         try:

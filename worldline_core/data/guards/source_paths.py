@@ -278,6 +278,11 @@ def fill_template(template: str, **values: int | str) -> str:
     return filled
 
 
+def safe_stem(name: str) -> str:
+    """Any name as the beginning of a file name: what is no letter, digit, - or _ becomes _."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+
+
 def safe_name(name: str, what: str) -> str:
     """`name` when it can serve as one path component.
 
