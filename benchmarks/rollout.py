@@ -18,8 +18,9 @@ import torch
 from einops import rearrange
 
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.tokenizer.patch import PatchTokenizer
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, load_tokenizer
+from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.samplers import BLOCK_SIZE, BlockCausalSimulator, Noise, rollout_full_clip

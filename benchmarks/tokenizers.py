@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from worldline_core.model.tokenizer.patch import PatchTokenizer
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer
-from worldline_core.model.tokenizer.wan import WanTokenizer
+from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.wan_tokenizer import WanTokenizer
 from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     clip_of,

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.tokenizer.patch import PatchTokenizer
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
-from worldline_core.model.tokenizer.wan import WAN22_MEAN, WAN22_STD, WanTokenizer
+from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
+from worldline_core.model.wan_tokenizer import WAN22_MEAN, WAN22_STD, WanTokenizer
 from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     decoder_batch,

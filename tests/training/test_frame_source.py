@@ -12,7 +12,7 @@ import torch
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
-from worldline_core.model.tokenizer.tokenizer import frames_to_video
+from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_reader import ClipReader, SkipLog
 from worldline_core.training.clip_sampler import ClipBatch, ClipSampler, ClipSampling

@@ -41,7 +41,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import valid_intrinsics
 from worldline_core.geometry.se3 import is_rigid
 from worldline_core.model.lpips import LPIPS, load_lpips
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer
 
 
 class PerceptualLoss:

@@ -21,7 +21,7 @@ from worldline_core.model.checkpoint import (
     read_checkpoint_info,
     save_checkpoint,
 )
-from worldline_core.model.tokenizer.tokenizer import load_tokenizer
+from worldline_core.model.tokenizer import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader

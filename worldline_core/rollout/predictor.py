@@ -18,7 +18,8 @@ from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, check_action_contract, load_checkpoint
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
+from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.rollout_config import Job, RolloutConfig
 from worldline_core.rollout.samplers import (

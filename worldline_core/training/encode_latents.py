@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -140,7 +139,8 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     from tqdm import tqdm
 
     from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.model.tokenizer.tokenizer import frames_to_video, load_tokenizer
+    from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
+    from worldline_core.model.video_tokenizer import frames_to_video
 
     episodes = EpisodeSet.open(inputs["episodes"])
     tokenizer = load_tokenizer(inputs["tokenizer"])
@@ -188,23 +188,6 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     )
     frames_total = sum(row.num_frames for row in rows)
     return {"episodes": len(rows), "frames": frames_total, "shards": len(shards), "layout": layout}
-
-
-def tokenizer_fingerprint(tokenizer: Encoder, folder: Path) -> str:
-    """Name of the encoder, so that latents and models of one tokenizer stay together.
-
-    A tokenizer that tells its encoder from its decoder says so itself (``encoder_digest``): a better decoder keeps the
-    latents valid. Otherwise it is a digest of the folder's weights and configuration.
-    """
-    own = getattr(tokenizer, "encoder_digest", None)
-    if isinstance(own, str):
-        return own[:16]
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        if path.suffix in {".safetensors", ".json"} and path.name != "manifest.json":
-            digest.update(path.relative_to(folder).as_posix().encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:

@@ -17,9 +17,9 @@ from torch import Tensor
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.model.tokenizer.tokenizer import VideoTokenizer, load_tokenizer, resize_frame
+from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.video_tokenizer import VideoTokenizer, resize_frame
 from worldline_core.training.clip_source import Clip, ClipRow, FrameInput, longest_clip
-from worldline_core.training.encode_latents import tokenizer_fingerprint
 
 logger = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ from torch.nn import functional
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.model.tokenizer.tokenizer import frames_to_video
+from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.trainer import (

@@ -24,8 +24,8 @@ from tqdm import tqdm
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import DataError, TrainingError
-from worldline_core.model.tokenizer.patch import PatchTokenizer, PatchTokenizerConfig, Refinement
-from worldline_core.model.tokenizer.tokenizer import DESCRIPTION, VideoTokenizer, frames_to_video
+from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerConfig, Refinement
+from worldline_core.model.video_tokenizer import DESCRIPTION, VideoTokenizer, frames_to_video
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 if TYPE_CHECKING:

@@ -1,6 +1,8 @@
-"""What every video tokenizer offers, and how one is found on disk.
+"""What every video tokenizer offers: RGB in [-1, 1] to normalised latents and back, causal in time.
 
-Frames as stored (uint8) to tensors as models see them, and back; one place decides how frames are resized.
+Also frames as stored (uint8) to tensors as models see them, and back; one place decides how frames are resized.
+
+Axis legend: b batch, c channel, t frame, h w pixels; ``_l`` marks the latent grid.
 """
 
 from __future__ import annotations
@@ -87,23 +89,6 @@ def read_description(folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError("Not a tokenizer", where=path, expected=FORMAT, got=content)
     return content
-
-
-def load_tokenizer(folder: Path) -> VideoTokenizer:
-    """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.
-
-    Raises:
-        CheckpointError: the folder holds none, or a damaged one.
-    """
-    from worldline_core.model.tokenizer.patch import PatchTokenizer
-    from worldline_core.model.tokenizer.wan import WanTokenizer
-
-    if (folder / "config.json").is_file() or (folder / "vae" / "config.json").is_file():
-        return WanTokenizer.load(folder)
-    kind = read_description(folder).get("kind")
-    if kind != PatchTokenizer.KIND:
-        raise CheckpointError("Unknown kind of tokenizer", where=folder, expected=PatchTokenizer.KIND, got=kind)
-    return PatchTokenizer.load(folder)
 
 
 def resize_frame(frame: np.ndarray, size: tuple[int, int], *, out: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.tokenizer.tokenizer import check_latents, check_video
+from worldline_core.model.video_tokenizer import check_latents, check_video
 
 if TYPE_CHECKING:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.checkpoint import fill
-from worldline_core.model.tokenizer.tokenizer import (
+from worldline_core.model.video_tokenizer import (
     DESCRIPTION,
     FORMAT,
     WEIGHTS,
