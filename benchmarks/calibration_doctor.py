@@ -34,7 +34,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
+from worldline_core.geometry.rotations import quaternion_xyzw_from_rotation
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 from worldline_core.store.atomic import write_json_atomic
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "recordings"

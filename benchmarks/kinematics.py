@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 import torch
 
-from worldline_core.geometry.description import TreeBody
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
 from worldline_core.geometry.embodiment_check import random_states
+from worldline_core.geometry.kinematic_tree import TreeBody
 from worldline_core.geometry.kinematics import ArmKinematics
 
 FRAMES, FRAMES_ONE_BY_ONE = 4096, 256

@@ -23,7 +23,8 @@ from worldline_core.calibration.reading import read
 from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.geometry.transforms import project_points, rigid_inverse
+from worldline_core.geometry.cameras import project_points
+from worldline_core.geometry.transforms import rigid_inverse
 
 CONFIG = CalibrationDoctorConfig()
 COUNT, HEIGHT, WIDTH = 30, 64, 96

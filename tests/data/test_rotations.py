@@ -17,18 +17,20 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.transforms import (
-    pose_from_euler_fixed_xyz,
-    pose_from_euler_moving_xyz,
-    pose_from_quaternion_wxyz,
-    pose_from_quaternion_xyzw,
+from worldline_core.geometry.rotations import (
     quaternion_wxyz_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
     rotation_deviation,
+    rotation_from_euler_moving_xyz,
     rotation_from_quaternion_wxyz,
     written_as_moving,
     written_as_wxyz,
+)
+from worldline_core.geometry.transforms import (
+    pose_from_euler_fixed_xyz,
+    pose_from_quaternion_wxyz,
+    pose_from_quaternion_xyzw,
 )
 
 Make = Callable[..., tuple]
@@ -37,10 +39,11 @@ Make = Callable[..., tuple]
 def test_conventions_agree_with_scipy() -> None:
     rng = np.random.default_rng(0)
     angles, position = rng.uniform(-3, 3, (50, 3)), rng.normal(size=(50, 3))
-    for build, name in ((pose_from_euler_fixed_xyz, "xyz"), (pose_from_euler_moving_xyz, "XYZ")):
-        poses = build(position, angles)
-        assert np.abs(poses[:, :3, :3] - Rotation.from_euler(name, angles).as_matrix()).max() < 1e-12
-        assert np.array_equal(poses[:, :3, 3], position)
+    poses = pose_from_euler_fixed_xyz(position, angles)
+    assert np.abs(poses[:, :3, :3] - Rotation.from_euler("xyz", angles).as_matrix()).max() < 1e-12
+    assert np.array_equal(poses[:, :3, 3], position)
+    moving = rotation_from_euler_moving_xyz(angles)
+    assert np.abs(moving - Rotation.from_euler("XYZ", angles).as_matrix()).max() < 1e-12
     quaternions = rng.normal(size=(50, 4))
     expected = Rotation.from_quat(quaternions).as_matrix()
     assert np.abs(pose_from_quaternion_xyzw(position, quaternions)[:, :3, :3] - expected).max() < 1e-12

@@ -35,7 +35,8 @@ from worldline_core.filters.motion import (
 )
 from worldline_core.filters.signals import picture_statistics
 from worldline_core.filters.verdict import long_runs, runs
-from worldline_core.geometry.transforms import hand_eye_residual, inside_image, mean_pose, project_points, rigid_inverse
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
+from worldline_core.geometry.transforms import hand_eye_residual, mean_pose, rigid_inverse
 
 FPS = 8.0
 
@@ -379,7 +380,7 @@ def test_points_project_as_by_hand() -> None:
     uv, depth = project_points(np.array([[0.4, 0.0, 0.2], [0.5, 0.1, 0.2], [0.4, 0.0, 1.5]]), K, T[:3])
     assert np.allclose(depth, [1.0, 1.0, -0.3])
     assert np.allclose(uv[:2], [[47.5, 31.5], [55.5, 23.5]])
-    assert inside_image(uv, depth, 96, 64).tolist() == [True, True, False]
+    assert ((depth > MIN_DEPTH_M) & inside_image(uv, (64, 96))).tolist() == [True, True, False]
 
 
 def test_motion_must_be_where_the_tool_is_projected() -> None:
@@ -388,12 +389,12 @@ def test_motion_must_be_where_the_tool_is_projected() -> None:
     tool = np.stack([0.1 + 0.018 * np.arange(33), 0.15 * np.sin(np.arange(33) / 3), np.full(33, 0.3)], axis=1)
     uv, depth = project_points(tool, K, T)
     gray = scene(centres=uv)
-    inside = inside_image(uv, depth, 96, 64)
+    inside = (depth > MIN_DEPTH_M) & inside_image(uv, (64, 96))
     right = detect_projection(gray, uv[:, None], inside[:, None], config)
     assert right.passed
     assert right.numbers["motion_contrast"] > 3  # type: ignore[operator]
     shifted = uv + np.array([0.0, 25.0])
-    wrong = detect_projection(gray, shifted[:, None], inside_image(shifted, depth, 96, 64)[:, None], config)
+    wrong = detect_projection(gray, shifted[:, None], inside_image(shifted, (64, 96))[:, None], config)
     assert not wrong.passed
     outside = detect_projection(gray, uv[:, None] + 500, np.zeros((33, 1), bool), config)
     assert not outside.passed

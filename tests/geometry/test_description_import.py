@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="descriptions are compiled by MuJoCo")
 from tools import description_import
 from tools.description_import import Recipe, import_description
 from worldline_core.errors import DataError
-from worldline_core.geometry.mjcf import read_mjcf
+from worldline_core.geometry.kinematic_tree import read_mjcf
 
 ARM = """
 <mujoco><compiler angle="degree"/><asset><mesh name="link" file="missing.stl"/></asset>

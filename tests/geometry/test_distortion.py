@@ -16,7 +16,6 @@ from worldline_core.geometry.distortion import Distortion, distortion_from_ros
 from worldline_core.geometry.undistortion import (
     MAX_HALF_ANGLE_DEG,
     distort_points,
-    undistort_points,
     undistort_rays,
     undistorted_intrinsics,
     undistortion,
@@ -41,6 +40,12 @@ def opencv_distorted(points: np.ndarray, lens: Distortion) -> np.ndarray:
         return cv2.fisheye.distortPoints(points[None], np.eye(3), coefficients)[0]
     in_front = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     return cv2.projectPoints(in_front, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
+
+
+def undistort_points(points: torch.Tensor, lens: Distortion) -> torch.Tensor:
+    """(x', y') -> (x, y) on the plane in front of the camera."""
+    rays = undistort_rays(points, lens)
+    return rays[..., :2] / rays[..., 2:]
 
 
 def small(limit: float) -> st.SearchStrategy[float]:
@@ -146,8 +151,6 @@ def test_a_fisheye_beyond_a_half_space_gets_a_pinhole_of_bounded_width():
     wide = np.array([[focal, 0, 319.5], [0, focal, 239.5], [0, 0, 1.0]])
     rays = undistort_rays(torch.tensor([[-319.5 / focal, 0.0]], dtype=torch.float64), lens)
     assert math.degrees(math.acos(float(rays[0, 2]))) == pytest.approx(100)
-    with pytest.raises(CalibrationError, match="beside or behind"):
-        undistort_points(torch.tensor([[-319.5 / focal, 0.0]], dtype=torch.float64), lens)
     new_K = undistorted_intrinsics(lens, wide, SIZE)
     half_angle = math.degrees(math.atan(319.5 / new_K[0, 0]))
     assert half_angle == pytest.approx(MAX_HALF_ANGLE_DEG)

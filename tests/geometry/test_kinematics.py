@@ -13,9 +13,10 @@ import yaml
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.embodiment_check import random_states
+from worldline_core.geometry.kinematic_tree import read_mjcf
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.mjcf import read_mjcf
-from worldline_core.geometry.se3 import is_rigid, rotation_angle
+from worldline_core.geometry.rotations import rotation_angle
+from worldline_core.geometry.transforms import is_rigid
 
 # Everything that decides a pose: each way to write an orientation, joints off the body's origin, two joints on a
 # body, a slide, defaults by class and childclass, a site, an unnormalised axis and quaternion.

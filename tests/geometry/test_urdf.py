@@ -10,8 +10,8 @@ import yaml
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematic_tree import read_urdf
 from worldline_core.geometry.kinematics import ArmKinematics, chain_from_tree
-from worldline_core.geometry.urdf import read_urdf
 
 # Origins with all three angles, unnormalised axes, a missing origin and axis, every kind of joint, an undeclared prefix.
 TOY = """<?xml version="1.0"?>

@@ -27,7 +27,7 @@ from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.se3 import invert, is_rigid
+from worldline_core.geometry.transforms import invert, is_rigid
 
 __all__ = [
     "ActionTracks",

@@ -10,7 +10,7 @@ What is drawn of an end-effector that is valid in a view (nothing is drawn of th
 - a ring around the tool's centre, the wider the further the gripper is open.
 
 Frames and tracks may differ in resolution: both are brought to the size of the picture. Pixel centres lie at whole
-numbers (`geometry.image_transforms`).
+numbers (`geometry.cameras`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from worldline_core.actions.action_maps import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, grid_sigma
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
+from worldline_core.geometry.rotations import rotation_from_rot6d
 from worldline_core.pictures.labels import Picture, scale_frames, scaled_size
 
 if TYPE_CHECKING:
@@ -136,11 +137,10 @@ def axis_tips(
 ) -> list[NDArray[np.float64] | None]:
     """Pixels (of the tracks' image size) of the ends of the tool's axes; None for one that is behind the camera."""
     K = tracks.K[v].astype(np.float64)
-    x, y = tracks.rot6d[n, v, arm, :3].astype(np.float64), tracks.rot6d[n, v, arm, 3:].astype(np.float64)
     ray = np.linalg.solve(K, np.append(tracks.uv[n, v, arm].astype(np.float64), 1.0))
     origin = ray * float(tracks.depth[n, v, arm])
     tips: list[NDArray[np.float64] | None] = []
-    for axis in (x, y, np.cross(x, y)):
+    for axis in rotation_from_rot6d(tracks.rot6d[n, v, arm]).T:
         tip = origin + length_m * axis
         tips.append((K @ (tip / tip[2]))[:2] if tip[2] > 1e-3 else None)
     return tips

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, valid_intrinsics
-from worldline_core.geometry.se3 import is_rigid
+from worldline_core.geometry.transforms import is_rigid, rot6d_from_rotation
 
 CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
 """What the numbers of `Projection.cause` mean; 0 is valid."""
@@ -116,7 +116,7 @@ def _project(
     return Projection(
         uv=torch.where((located & in_front)[..., None], uv, 0.0),
         depth=torch.where(located, depth, 0.0),
-        rot6d=torch.where(located[..., None], turned[..., :2, :].flatten(-2), 0.0),
+        rot6d=torch.where(located[..., None], rot6d_from_rotation(turned[..., :2, :].mT), 0.0),
         gripper=torch.nan_to_num(opening).clamp(0.0, 1.0)[..., None, :].expand(depth.shape),
         valid=cause == _VALID,
         cause=cause,

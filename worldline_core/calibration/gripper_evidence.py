@@ -11,7 +11,8 @@ from worldline_core.calibration.image_evidence import cosine
 from worldline_core.calibration.observation import CELL_PX, Observation, cell_centres
 from worldline_core.calibration.reading import Reading, predict_motion
 from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Spread
-from worldline_core.geometry.transforms import project_points, rigid_inverse
+from worldline_core.geometry.cameras import project_points
+from worldline_core.geometry.transforms import rigid_inverse
 
 _MIN_TRAVEL = 0.12  # range of the opening over the episode: less moves no finger visibly, and noise stays below
 _MOVES = 0.02  # of the opening a frame

@@ -13,7 +13,8 @@ import numpy as np
 from worldline_core.calibration.observation import Observation, cell_centres
 from worldline_core.calibration.reading import Reading
 from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
-from worldline_core.geometry.transforms import rigid_inverse, rotation_angle_deg
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import rigid_inverse
 
 _MIN_STEP_PX = 0.7
 _FOLLOWS = 0.5  # correlation above which an angle between flows means something

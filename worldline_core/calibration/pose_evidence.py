@@ -8,13 +8,9 @@ from worldline_core.calibration.observation import Arm, Observation
 from worldline_core.calibration.reading import Reading
 from worldline_core.calibration.thresholds import CalibrationDoctorConfig
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.geometry.transforms import (
-    hand_eye_residual,
-    inside_image,
-    project_points,
-    rigid_inverse,
-    rotation_angle_deg,
-)
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
 
 _WORST = -40.0
 _WORST_UNREST = -60.0
@@ -125,7 +121,7 @@ def in_view_share(reading: Reading, camera: CameraTrack) -> float:
     inside = np.zeros(len(reading.tools), dtype=bool)
     for i in range(reading.tools.shape[1]):
         uv, depth = project_points(reading.tools[:, i, :3, 3], camera.K, poses)
-        inside |= inside_image(uv, depth, camera.width, camera.height)
+        inside |= (depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width))
     return float(inside.mean())
 
 

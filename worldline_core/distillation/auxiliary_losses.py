@@ -39,7 +39,7 @@ from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import valid_intrinsics
-from worldline_core.geometry.se3 import is_rigid
+from worldline_core.geometry.transforms import is_rigid
 from worldline_core.model.lpips import LPIPS, load_lpips
 from worldline_core.model.video_tokenizer import VideoTokenizer
 

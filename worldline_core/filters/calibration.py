@@ -24,7 +24,8 @@ from worldline_core.errors import UnavailableError
 from worldline_core.filters.verdict import Verdict, runs
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import hand_eye_residual, rotation_angle_deg
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import hand_eye_residual
 
 
 class CalibrationConfig(StrictModel):

@@ -23,7 +23,9 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.motion import detect_joint_jump, detect_joint_speed, detect_reset, detect_static
 from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Verdict, runs
-from worldline_core.geometry.transforms import inside_image, project_points, rigid_inverse, rotation_angle_deg
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import rigid_inverse
 
 if TYPE_CHECKING:
     from worldline_core.filters.filter_config import FilterConfig
@@ -224,7 +226,7 @@ def _projection(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray)
     for arm in range(T_base_tool.shape[1]):
         uv, depth = project_points(T_base_tool[:, arm, :3, 3], camera.K, poses)
         uvs.append(uv)
-        insides.append(inside_image(uv, depth, camera.width, camera.height))
+        insides.append((depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width)))
     verdict = detect_projection(gray, np.stack(uvs, axis=1), np.stack(insides, axis=1), config.projection)
     return [Finding("projection", view, 2, verdict)]
 

@@ -1,19 +1,10 @@
-"""Pinhole cameras.
+"""Pinhole cameras: what they see, where they are, and what becomes of K when an image is resized, cropped or padded.
 
 Camera frame: OpenCV (x right, y down, z forward), metres. `T_base_camera` maps camera points to base.
-Pixels: the *centre* of the top left pixel is (0, 0), so the image covers -0.5 <= u < width - 0.5, likewise v. Under
-this convention a resize by s maps u to (u + 0.5) s - 0.5, and K follows it exactly (`image_transforms`): to resize
-and then project is to project and then resize. Distorted lenses are undistorted on ingest (`undistortion`).
-
-Camera poses that say their convention: the only way to make one is to name what the recorded matrices map and mean.
-
-Axes: `opencv` is x right, y down, z forward; `opengl` (also Blender, MuJoCo, USD) is x right, y up, z backward.
-
-Changes of an image's pixel grid, and what they do to pixels and to K: resize, crop, pad, and what is made of them.
-
-A pixel's *centre* lies at whole numbers (the convention of `cameras`), so every change is an affine map of pixels,
-u' = s u + t, and the camera matrix follows it exactly: K' = A K. To transform an image and then project is to project
-and then transform. NumPy and OpenCV only.
+Pixels: the *centre* of the top left pixel is (0, 0), so the image covers -0.5 <= u < width - 0.5, likewise v. Every
+change of the pixel grid is then an affine map of pixels, u' = s u + t (a resize by s maps u to (u + 0.5) s - 0.5), and
+the camera matrix follows it exactly, K' = A K: to transform an image and then project is to project and then transform.
+Distorted lenses are undistorted when recordings are read (`undistortion`).
 """
 
 from __future__ import annotations
@@ -29,16 +20,48 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from worldline_core.errors import CalibrationError, ConfigError, DataError
-from worldline_core.geometry.se3 import invert, transform_points
 from worldline_core.geometry.transforms import RotationRepair, repair_rotations, rigid_inverse
 
+MIN_DEPTH_M = 0.01
+"""A point nearer to the camera plane than this counts as behind the camera."""
+
+
+def project_points(points: np.ndarray, K: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) and depth (n,) [m] of base points (n, 3) in cameras (n or 1, 4, 4) with one K (3, 3).
+
+    A point on or behind the camera plane has a meaningless pixel (finite, never NaN); look at its depth. End-effectors
+    of action maps are projected with gradients, by `actions.tool_projection`.
+    """
+    T_camera_base = rigid_inverse(T_base_camera)
+    in_camera = (T_camera_base[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_camera_base[:, :3, 3]
+    depth = in_camera[:, 2]
+    divisor = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    return ((in_camera / divisor[:, None]) @ K.T)[:, :2], depth
+
+
+def inside_image[Array: (np.ndarray, Tensor)](uv: Array, image_size: tuple[int, int]) -> Array:
+    """Bool (...): whether uv (..., 2) falls on a pixel of an image of (height, width)."""
+    height, width = image_size
+    u, v = uv[..., 0], uv[..., 1]
+    return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+
+
+def valid_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
+    """Finite, invertible, last row 0 0 1, positive focal lengths."""
+    last_row = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
+    finite = torch.isfinite(K).all(-1).all(-1)
+    upper = (K[..., 0, 0] > 1e-6) & (K[..., 1, 1] > 1e-6) & (K[..., 1, 0].abs() < 1e-6)
+    return finite & upper & ((K[..., 2, :] - last_row).abs() <= 1e-6).all(-1)
+
+
 CameraAxes = Literal["opencv", "opengl"]
+"""`opencv` is x right, y down, z forward; `opengl` (also Blender, MuJoCo, USD) is x right, y up, z backward."""
 _OPENCV_FROM: dict[str, np.ndarray] = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 
 
 @dataclass(frozen=True, init=False, eq=False)
 class CameraPose:
-    """Where a camera is: what a bare (N, 4, 4) array does not say. Made by `from_camera_to_base`, `from_base_to_camera`.
+    """Where a camera is. Made only by `from_camera_to_base` or `from_base_to_camera`, which say what the matrices map.
 
     Attributes:
         T_base_camera: (N, 4, 4) float64, N = 1 for a fixed camera; maps camera points (OpenCV axes, metres) to base.
@@ -269,67 +292,3 @@ def _whole(image_size: tuple[int, int]) -> tuple[int, int]:
     if height < 1 or width < 1 or int(height) != height or int(width) != width:
         raise ConfigError("Image size has no pixels", expected="whole height and width of at least 1", got=image_size)
     return int(height), int(width)
-
-
-MIN_DEPTH_M = 0.01
-"""A point nearer to the camera plane than this counts as behind the camera."""
-
-
-def project(
-    points_base: Float[Tensor, "*#b 3"], K: Float[Tensor, "*#b 3 3"], T_base_camera: Float[Tensor, "*#b 4 4"]
-) -> tuple[Float[Tensor, "*#b 2"], Float[Tensor, "*#b"]]:
-    """Pixels uv and depth [m] of base points; leading axes broadcast.
-
-    A point on or behind the camera plane has a meaningless uv (finite, never NaN); look at its depth.
-    """
-    in_camera = transform_points(invert(T_base_camera), points_base)
-    depth = in_camera[..., 2]
-    divisor = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
-    uv = (K[..., :2, :] @ (in_camera / divisor[..., None])[..., None])[..., 0]
-    return uv, depth
-
-
-def unproject(
-    uv: Float[Tensor, "*#b 2"],
-    depth: Float[Tensor, "*#b"],
-    K: Float[Tensor, "*#b 3 3"],
-    T_base_camera: Float[Tensor, "*#b 4 4"],
-) -> Float[Tensor, "*#b 3"]:
-    """Base points at these pixels and depths: the inverse of `project`."""
-    homogeneous = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1)
-    ray = torch.linalg.solve(K, homogeneous[..., None].to(K.dtype))[..., 0]
-    return transform_points(T_base_camera, ray * depth[..., None])
-
-
-def inside_image(uv: Float[Tensor, "*b 2"], image_size: tuple[int, int]) -> Bool[Tensor, "*b"]:
-    """Whether uv falls on a pixel of an image of (height, width)."""
-    height, width = image_size
-    u, v = uv.unbind(-1)
-    return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
-
-
-def transform_intrinsics(K: Float[Tensor, "*b 3 3"], transform: ImageTransform) -> Float[Tensor, "*b 3 3"]:
-    """K after the image is resized, cropped, padded or letterboxed."""
-    return torch.as_tensor(transform.affine, dtype=K.dtype, device=K.device) @ K
-
-
-def valid_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
-    """Finite, invertible, last row 0 0 1, positive focal lengths."""
-    last_row = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
-    finite = torch.isfinite(K).all(-1).all(-1)
-    upper = (K[..., 0, 0] > 1e-6) & (K[..., 1, 1] > 1e-6) & (K[..., 1, 0].abs() < 1e-6)
-    return finite & upper & ((K[..., 2, :] - last_row).abs() <= 1e-6).all(-1)
-
-
-def check_intrinsics(K: Float[Tensor, "*b 3 3"], where: object) -> None:
-    """Raises: CalibrationError when a camera matrix is singular or no pinhole camera."""
-    good = valid_intrinsics(K)
-    if not bool(good.all()):
-        bad = K.reshape(-1, 3, 3)[~good.reshape(-1)]
-        raise CalibrationError(
-            "Camera matrix is singular or not that of a pinhole camera",
-            where=where,
-            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, all finite",
-            got=bad[0].tolist(),
-            next_step="check the order of the values (row major) and their units (pixels)",
-        )

@@ -8,7 +8,7 @@ Models, both of OpenCV, on the plane at depth 1 (x = X / Z, y = Y / Z, r^2 = x^2
         x' = x / r * theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), y' likewise. All zeros is the
         equidistant lens, not a pinhole.
 
-The maths on points is in `distortion_points`, the undistortion of images in `undistortion`.
+Points and images are undistorted in `undistortion`.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
 """What a robot is made of, as far as this project needs: arms, joint order, tools, grippers, wrist cameras.
 
-One YAML file an embodiment in `configs/embodiments/`, beside it (or in a Python package, or at the user) the kinematic
-description. `observation.state` and `action` hold, for each arm in order, its joint positions, then its gripper.
-
-Which joints of a recording leave their limits, and by how much.
+One YAML file per embodiment in `configs/embodiments/`; the kinematic description lies beside it, in a Python package,
+or with the user (`description`). `observation.state` and `action` hold, for each arm in order, its joint positions,
+then its gripper.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,13 +17,16 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.config import CONFIG_ROOT, StrictModel, read_yaml, validate
-from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.description import (
-    Description,
-    locate_description,
-    read_description_file,
-)
-from worldline_core.geometry.transforms import RigidOffset
+from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.geometry.description import Description, RigidOffset, description_variable, locate_description
+from worldline_core.geometry.rotations import rotation_deviation
+
+EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
+LIMIT_TOLERANCE_RAD = 0.02
+"""Joint positions may pass their limits by this much."""
+
+Bound = Annotated[float, Field(allow_inf_nan=True)]
+Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
 
 
 @dataclass(frozen=True)
@@ -44,36 +45,6 @@ class LimitViolation:
     def excess(self) -> float:
         """How far the worst value is beyond its limit."""
         return max(self.lower - self.worst, self.worst - self.upper)
-
-
-def limit_violations(
-    state: np.ndarray,
-    outside: np.ndarray,
-    limits: Mapping[int, tuple[float, float]],
-    names: Sequence[str],
-    unit: str,
-) -> list[LimitViolation]:
-    """The joints with a frame outside, the furthest first.
-
-    Args:
-        state: (N, J).
-        outside: (N, J) bool, as `Embodiment.outside_limits` gives.
-        limits: lower and upper by column.
-    """
-    found: list[LimitViolation] = []
-    for column in map(int, np.flatnonzero(outside.any(axis=0))):
-        lower, upper = limits[column]
-        values = state[:, column].astype(np.float64)
-        frame = int(np.argmax(np.maximum(lower - values, values - upper)))
-        count = int(outside[:, column].sum())
-        found.append(LimitViolation(names[column], count, float(values[frame]), frame, lower, upper, unit))
-    return sorted(found, key=lambda violation: -violation.excess)
-
-
-EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
-
-Bound = Annotated[float, Field(allow_inf_nan=True)]
-Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
 
 
 class FingerJoint(StrictModel):
@@ -99,6 +70,9 @@ class Gripper(StrictModel):
         return self
 
 
+_MOUNT_TOLERANCE = 1.1e-4  # largest entry of |R R^T - I| of a wrist camera's mount
+
+
 class WristCamera(StrictModel):
     """Where the arm's camera is mounted; `T_link_camera` maps camera points (OpenCV axes) to the link."""
 
@@ -108,19 +82,10 @@ class WristCamera(StrictModel):
 
     @model_validator(mode="after")
     def _rigid(self) -> WristCamera:
-        T = (
-            np.asarray(self.T_link_camera, dtype=np.float64)
-            if {len(r) for r in self.T_link_camera} == {4}
-            else np.zeros(0)
-        )
-        if T.shape != (4, 4):
+        if [len(row) for row in self.T_link_camera] != [4] * 4:
             raise ValueError("T_link_camera is not a 4x4 matrix")
-        R = T[:3, :3]
-        if (
-            not np.allclose(R @ R.T, np.eye(3), atol=1e-4)
-            or np.linalg.det(R) < 0
-            or not np.allclose(T[3], [0, 0, 0, 1])
-        ):
+        T = np.asarray(self.T_link_camera, dtype=np.float64)
+        if rotation_deviation(T[:3, :3]) > _MOUNT_TOLERANCE or not np.allclose(T[3], [0, 0, 0, 1]):
             raise ValueError("T_link_camera is not a rigid transform (R R^T = I, det R = 1, last row 0 0 0 1)")
         return self
 
@@ -178,7 +143,7 @@ class Embodiment(StrictModel):
     description_path: Path
 
     @model_validator(mode="after")
-    def _unique(self) -> Embodiment:
+    def _consistent(self) -> Embodiment:
         joints = [joint for arm in self.arms for joint in arm.joints] + list(self.posture)
         doubled = sorted({joint for joint in joints if joints.count(joint) > 1})
         if doubled:
@@ -186,10 +151,6 @@ class Embodiment(StrictModel):
         names = [arm.name for arm in self.arms]
         if len(set(names)) != len(names):
             raise ValueError(f"arms named twice: {', '.join(names)}")
-        return self
-
-    @model_validator(mode="after")
-    def _honest(self) -> Embodiment:
         if self.verified == bool(self.unverified_reason):
             raise ValueError("unverified_reason goes with verified: false, and only with it")
         return self
@@ -236,7 +197,7 @@ class Embodiment(StrictModel):
                 got=float(state[row, column]),
             )
 
-    def outside_limits(self, state: np.ndarray, tolerance_rad: float = 0.02) -> np.ndarray:
+    def outside_limits(self, state: np.ndarray, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> np.ndarray:
         """Bool (N, J): joint positions beyond their limits by more than the tolerance; gripper columns are False."""
         tolerance = tolerance_rad if self.joint_units == "rad" else math.degrees(tolerance_rad)
         outside = np.zeros(state.shape, dtype=bool)
@@ -246,19 +207,22 @@ class Embodiment(StrictModel):
             outside[:, columns] = (joints < limits[:, 0] - tolerance) | (joints > limits[:, 1] + tolerance)
         return outside
 
-    def limit_violations(self, state: np.ndarray, tolerance_rad: float = 0.02) -> list[LimitViolation]:
-        """For each joint that leaves its limits: frames, the worst value and where; worst first."""
-        limits = {
-            column: pair for arm in self.arms for column, pair in zip(self._columns(arm), arm.limits, strict=True)
-        }
-        return limit_violations(
-            state, self.outside_limits(state, tolerance_rad), limits, self.state_names, self.joint_units
-        )
+    def limit_violations(self, state: np.ndarray, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> list[LimitViolation]:
+        """For each joint that leaves its limits: frames, the worst value and where; the worst joint first."""
+        outside = self.outside_limits(state, tolerance_rad)
+        found: list[LimitViolation] = []
+        for arm in self.arms:
+            for column, (lower, upper) in enumerate(arm.limits, self.joint_columns(arm).start):
+                if frames := int(outside[:, column].sum()):
+                    values = state[:, column].astype(np.float64)
+                    worst = int(np.argmax(np.maximum(lower - values, values - upper)))
+                    name = self.state_names[column]
+                    found.append(
+                        LimitViolation(name, frames, float(values[worst]), worst, lower, upper, self.joint_units)
+                    )
+        return sorted(found, key=lambda violation: -violation.excess)
 
-    def _columns(self, arm: Arm) -> range:
-        return range(*self.joint_columns(arm).indices(self.state_size))
-
-    def check_limits(self, state: np.ndarray, where: object, tolerance_rad: float = 0.02) -> None:
+    def check_limits(self, state: np.ndarray, where: object, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> None:
         """Raises: DataError naming the joint that is furthest out, its value, its limits and the frames outside."""
         self.check_state(state, where)
         violations = self.limit_violations(state, tolerance_rad)
@@ -312,10 +276,27 @@ def load_embodiment(name_or_path: str | Path, description_path: Path | str | Non
     return embodiment.model_copy(update={"description_path": located})
 
 
+def how_to_get(embodiment: Embodiment) -> str:
+    """What a user without the kinematic description can do."""
+    description = embodiment.description
+    steps = [description.how_to_get or "restore the file beside the embodiment's YAML"]
+    if description.package is None:
+        steps.append(f"then set {description_variable(embodiment.name)}=/path/to/it or pass description_path")
+    return "; ".join(steps)
+
+
 def read_description(embodiment: Embodiment) -> str:
     """Text of the kinematic description.
 
     Raises:
         UnavailableError: the file is not there; the message says how to get it.
     """
-    return read_description_file(embodiment.name, embodiment.description, embodiment.description_path)
+    description, path = embodiment.description, embodiment.description_path
+    if not path.is_file():
+        raise UnavailableError(
+            f"The kinematic description of {embodiment.name} is not here",
+            where=path,
+            expected=description.file,
+            next_step=how_to_get(embodiment),
+        )
+    return path.read_text(encoding="utf-8")

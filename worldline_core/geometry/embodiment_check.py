@@ -1,9 +1,8 @@
-"""Proof of an embodiment's forward kinematics against an independent engine: MuJoCo reads the same description itself.
+"""Embodiments checked and described: forward kinematics against MuJoCo, the list of all robots, one robot in full.
 
-Nothing of this project's readers is used on MuJoCo's side: the description's text goes to MuJoCo's own MJCF or URDF
-compiler, after meshes and all else that decides no pose were taken out (they are often not there).
-
-Embodiments in words: the list of all, one in full, and what a check found.
+MuJoCo is an independent engine here: nothing of this project's readers is used on its side. The description's text goes
+to MuJoCo's own MJCF or URDF compiler, after meshes and all else that decides no pose were taken out (they are often not
+there).
 """
 
 from __future__ import annotations
@@ -18,8 +17,17 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import ConfigError, UnavailableError, WorldLineError
-from worldline_core.geometry.description import description_variable, parse_xml
-from worldline_core.geometry.embodiment import Arm, Embodiment, embodiment_names, load_embodiment, read_description
+from worldline_core.geometry.description import RigidOffset
+from worldline_core.geometry.embodiment import (
+    Arm,
+    Embodiment,
+    embodiment_names,
+    how_to_get,
+    load_embodiment,
+    read_description,
+)
+from worldline_core.geometry.kinematic_tree import TreeBody, parse_xml
+from worldline_core.geometry.rotations import rotation_angle
 
 POSITION_TOLERANCE_M = 1e-5
 ROTATION_TOLERANCE_RAD = 1e-5
@@ -81,50 +89,51 @@ def check_embodiment(embodiment: Embodiment, samples: int = 1000, seed: int = 0)
     """
     if samples < 1:
         raise ConfigError("A check needs random joint positions", expected="--samples of at least 1", got=samples)
-    mujoco = _mujoco()
-    import torch
-
-    from worldline_core.geometry.kinematics import ArmKinematics
-    from worldline_core.geometry.se3 import rotation_angle
+    if importlib.util.find_spec("mujoco") is None:
+        raise UnavailableError(
+            "The check compares with MuJoCo, which is not installed",
+            expected="the extra `sim`",
+            next_step="uv sync --extra sim (or pip install 'worldline[sim]')",
+        )
+    mujoco = importlib.import_module("mujoco")
+    from worldline_core.geometry.kinematics import ArmKinematics  # torch, which the other commands do without
 
     kinematics = ArmKinematics(embodiment)
     state = random_states(embodiment, samples, seed)
-    ours = kinematics.link_poses(state)
+    ours = {name: poses.numpy() for name, poses in kinematics.link_poses(state).items()}
     theirs = _mujoco_poses(mujoco, embodiment, state, kinematics.links)
-    frames = [("link", name, ours[name], theirs[name]) for name in kinematics.links if name in theirs]
-    wanted = []
-    tools, cameras = kinematics.tool_poses(state), kinematics.wrist_camera_poses(state)
+    tools, cameras = kinematics.tool_poses(state).numpy(), kinematics.wrist_camera_poses(state)
+    errors: list[PoseError] = []
     for index, arm in enumerate(embodiment.arms):
         flange = theirs[arm.end_effector_link]
-        wanted.append(("end-effector", arm.end_effector_link, ours[arm.end_effector_link], flange))
-        offset = _offset_matrix(mujoco, arm.T_link_tool.translation, arm.T_link_tool.rotation_wxyz)
-        wanted.append(("tool", arm.name, tools[:, index], flange @ offset))
+        errors.append(_pose_error("end-effector", arm.end_effector_link, ours[arm.end_effector_link], flange))
+        expected = flange @ _offset_matrix(mujoco, arm.T_link_tool)
+        errors.append(_pose_error("tool", arm.name, tools[:, index], expected))
         if arm.wrist_camera is not None:
-            mount = np.asarray(arm.wrist_camera.T_link_camera, dtype=np.float64)
-            wanted.append(("camera", arm.camera_view, cameras[arm.camera_view], theirs[arm.wrist_camera.link] @ mount))
-
-    def error(kind: str, frame: str, poses: Any, expected: np.ndarray) -> PoseError:
-        reference = torch.from_numpy(expected)
-        position = (poses[..., :3, 3] - reference[..., :3, 3]).norm(dim=-1)
-        rotation = rotation_angle(reference[..., :3, :3].mT @ poses[..., :3, :3])
-        return PoseError(frame, kind, *(float(value) for m in (position, rotation) for value in (m.max(), m.mean())))
-
-    errors = [error(*frame) for frame in wanted]
-    everything = [error(*frame) for frame in frames]
-    worst = max(everything, key=lambda e: max(e.max_position_m, e.max_rotation_rad))
-    errors.append(
-        PoseError(
-            f"{len(everything)} links, worst {worst.frame}",
-            "all links",
-            max(e.max_position_m for e in everything),
-            float(np.mean([e.mean_position_m for e in everything])),
-            max(e.max_rotation_rad for e in everything),
-            float(np.mean([e.mean_rotation_rad for e in everything])),
-        )
+            expected = theirs[arm.wrist_camera.link] @ np.asarray(arm.wrist_camera.T_link_camera, dtype=np.float64)
+            errors.append(_pose_error("camera", arm.camera_view, cameras[arm.camera_view].numpy(), expected))
+    links = [_pose_error("link", name, ours[name], theirs[name]) for name in kinematics.links if name in theirs]
+    worst = max(links, key=lambda e: max(e.max_position_m, e.max_rotation_rad))
+    together = PoseError(
+        f"{len(links)} links, worst {worst.frame}",
+        "all links",
+        max(e.max_position_m for e in links),
+        float(np.mean([e.mean_position_m for e in links])),
+        max(e.max_rotation_rad for e in links),
+        float(np.mean([e.mean_rotation_rad for e in links])),
     )
+    notes = _limit_notes(embodiment, kinematics.tree)
+    if missing := [name for name in kinematics.links if name not in theirs and "#" not in name]:
+        notes.append(f"not compared, MuJoCo has no name for them: {', '.join(missing)}")
     engine = f"MuJoCo {mujoco.__version__}"
-    notes = (*_limit_notes(embodiment, kinematics.tree), *_missing_notes(kinematics.links, theirs))
-    return EmbodimentCheck(embodiment.name, engine, samples, seed, tuple(errors), notes)
+    return EmbodimentCheck(embodiment.name, engine, samples, seed, (*errors, together), tuple(notes))
+
+
+def _pose_error(kind: str, frame: str, poses: np.ndarray, expected: np.ndarray) -> PoseError:
+    """Of poses (N, 4, 4)."""
+    position = np.linalg.norm(poses[:, :3, 3] - expected[:, :3, 3], axis=-1)
+    rotation = rotation_angle(np.swapaxes(expected[:, :3, :3], -1, -2) @ poses[:, :3, :3])
+    return PoseError(frame, kind, *(float(value) for m in (position, rotation) for value in (m.max(), m.mean())))
 
 
 def random_states(embodiment: Embodiment, samples: int, seed: int = 0) -> np.ndarray:
@@ -132,21 +141,10 @@ def random_states(embodiment: Embodiment, samples: int, seed: int = 0) -> np.nda
     turn = math.pi if embodiment.joint_units == "rad" else 180.0
     ranges: list[tuple[float, float]] = []
     for arm in embodiment.arms:
-        ranges += [(max(low, -turn) if low == -math.inf else low, min(high, turn) if high == math.inf else high)
-                   for low, high in arm.limits]  # fmt: skip
+        ranges += [(-turn if low == -math.inf else low, turn if high == math.inf else high) for low, high in arm.limits]
         ranges.append((min(arm.gripper.closed, arm.gripper.open), max(arm.gripper.closed, arm.gripper.open)))
     low, high = np.asarray(ranges).T
     return np.random.default_rng(seed).uniform(low, high, (samples, embodiment.state_size))
-
-
-def _mujoco() -> Any:
-    if importlib.util.find_spec("mujoco") is None:
-        raise UnavailableError(
-            "The check compares with MuJoCo, which is not installed",
-            expected="the extra `sim`",
-            next_step="uv sync --extra sim (or pip install 'worldline[sim]')",
-        )
-    return importlib.import_module("mujoco")
 
 
 def _mujoco_poses(
@@ -252,15 +250,16 @@ def bare_mjcf(root: ET.Element) -> ET.Element:
     return root
 
 
-def _offset_matrix(mujoco: Any, translation: tuple[float, ...], wxyz: tuple[float, ...]) -> np.ndarray:
+def _offset_matrix(mujoco: Any, offset: RigidOffset) -> np.ndarray:
+    """(4, 4) of a fixed offset, its quaternion converted by MuJoCo."""
     flat, T = np.zeros(9), np.eye(4)
-    quaternion = np.asarray(wxyz, dtype=np.float64)
-    mujoco.mju_quat2Mat(flat, quaternion / np.linalg.norm(quaternion))
-    T[:3, :3], T[:3, 3] = flat.reshape(3, 3), translation
+    mujoco.mju_quat2Mat(flat, np.asarray(offset.rotation_wxyz) / np.linalg.norm(offset.rotation_wxyz))
+    T[:3, :3], T[:3, 3] = flat.reshape(3, 3), offset.translation
     return T
 
 
-def _limit_notes(embodiment: Embodiment, tree: Any) -> list[str]:
+def _limit_notes(embodiment: Embodiment, tree: TreeBody) -> list[str]:
+    """Limits of the YAML that are not those of the description."""
     described = {joint.name: joint for body in tree.walk() for joint in body.joints}
     notes = []
     for arm in embodiment.arms:
@@ -278,13 +277,8 @@ def _limit_notes(embodiment: Embodiment, tree: Any) -> list[str]:
     return notes
 
 
-def _missing_notes(links: tuple[str, ...], theirs: dict[str, np.ndarray]) -> list[str]:
-    missing = [name for name in links if name not in theirs and "#" not in name]
-    return [f"not compared, MuJoCo has no name for them: {', '.join(missing)}"] if missing else []
-
-
 def list_embodiments() -> list[dict[str, Any]]:
-    """One row an embodiment: arms, joints, state size, whether its description is here, whether it is verified."""
+    """One row per embodiment: arms, joints, state size, whether its description is here, whether it is verified."""
     return [_row(name) for name in embodiment_names()]
 
 
@@ -296,28 +290,19 @@ def _row(name: str) -> dict[str, Any]:
         return {"name": name, "found": False, "problem": str(error)}
     description = embodiment.description
     found = embodiment.description_path.is_file()
-    kind = f"package {description.package}" if description.package else "shipped" if found else "your file"
     return {
         "name": name,
         "arms": [arm.name for arm in embodiment.arms],
         "joints": [len(arm.joints) for arm in embodiment.arms],
         "state_size": embodiment.state_size,
         "wrist_cameras": [arm.camera_view for arm in embodiment.arms if arm.wrist_camera is not None],
-        "description": kind,
+        "description": f"package {description.package}" if description.package else "shipped" if found else "your file",
         "found": found,
         "path": str(embodiment.description_path),
-        "how_to_get": None if found else _how_to_get(embodiment),
+        "how_to_get": None if found else how_to_get(embodiment),
         "verified": embodiment.verified,
         "unverified_reason": embodiment.unverified_reason,
     }
-
-
-def _how_to_get(embodiment: Embodiment) -> str:
-    description = embodiment.description
-    ways = [description.how_to_get] if description.how_to_get else []
-    if description.package is None:
-        ways.append(f"then set {description_variable(embodiment.name)}=/path/to/it")
-    return "; ".join(ways)
 
 
 def format_list(rows: list[dict[str, Any]]) -> str:
@@ -325,21 +310,18 @@ def format_list(rows: list[dict[str, Any]]) -> str:
     cells = [("name", "arms (joints)", "state", "wrist cameras", "description", "verified")]
     notes: list[str] = []
     for row in rows:
+        name = row["name"]
         if "problem" in row:
-            cells.append((row["name"], "-", "-", "-", "not usable", "-"))
-            notes.append(f"{row['name']}: {row['problem']}")
+            cells.append((name, "-", "-", "-", "not usable", "-"))
+            notes.append(f"{name}: {row['problem']}")
             continue
         arms = ", ".join(f"{arm} ({joints})" for arm, joints in zip(row["arms"], row["joints"], strict=True))
+        wrists, verified = ", ".join(row["wrist_cameras"]) or "-", "yes" if row["verified"] else "no"
         found = row["description"] if row["found"] else f"{row['description']}: not here"
-        cells.append(
-            (row["name"], arms, str(row["state_size"]), ", ".join(row["wrist_cameras"]) or "-", found,
-             "yes" if row["verified"] else "no")
-        )  # fmt: skip
-        if not row["found"]:
-            notes.append(f"{row['name']}: {row['how_to_get']}")
-        if not row["verified"]:
-            notes.append(f"{row['name']}: not verified: {row['unverified_reason']}")
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+        cells.append((name, arms, str(row["state_size"]), wrists, found, verified))
+        notes += [] if row["found"] else [f"{name}: {row['how_to_get']}"]
+        notes += [] if row["verified"] else [f"{name}: not verified: {row['unverified_reason']}"]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
     return "\n".join([*lines, *([""] if notes else []), *notes])
 
@@ -347,7 +329,7 @@ def format_list(rows: list[dict[str, Any]]) -> str:
 def describe_embodiment(embodiment: Embodiment) -> str:
     """Everything that the file says, for people."""
     description = embodiment.description
-    here = "" if embodiment.description_path.is_file() else f" (not here: {_how_to_get(embodiment)})"
+    here = "" if embodiment.description_path.is_file() else f" (not here: {how_to_get(embodiment)})"
     lines = [
         f"{embodiment.name}: state of {embodiment.state_size} columns, angles in {embodiment.joint_units}, "
         f"poses in {embodiment.base_link}",
@@ -355,26 +337,21 @@ def describe_embodiment(embodiment: Embodiment) -> str:
         *([f"  source       {description.source}"] if description.source else []),
         f"  verified     {'yes' if embodiment.verified else f'no: {embodiment.unverified_reason}'}",
     ]
-    lines += [
-        f"  mount        {name}: {offset.translation} m, wxyz {offset.rotation_wxyz}"
-        for name, offset in description.mounts.items()
-    ]
+    for name, offset in description.mounts.items():
+        lines.append(f"  mount        {name}: {offset.translation} m, wxyz {offset.rotation_wxyz}")
     if embodiment.posture:
         lines.append("  posture      " + ", ".join(f"{name} {value:g}" for name, value in embodiment.posture.items()))
-    for arm in embodiment.arms:
-        lines += _describe_arm(embodiment, arm)
-    return "\n".join(lines)
+    return "\n".join(lines + [line for arm in embodiment.arms for line in _describe_arm(embodiment, arm)])
 
 
 def _describe_arm(embodiment: Embodiment, arm: Arm) -> list[str]:
-    start = embodiment.joint_columns(arm).start
     width = max(len(joint) for joint in arm.joints)
-    tool = arm.T_link_tool
+    rows = zip(arm.joints, arm.limits, strict=True)
     lines = [f"  arm {arm.name}"]
-    for number, (joint, (low, high)) in enumerate(zip(arm.joints, arm.limits, strict=True)):
+    for number, (joint, (low, high)) in enumerate(rows, embodiment.joint_columns(arm).start):
         limits = "no limits" if (low, high) == (-math.inf, math.inf) else f"{low:g} to {high:g}"
-        lines.append(f"    column {start + number:<3} {joint:<{width}}  {limits}")
-    gripper = arm.gripper
+        lines.append(f"    column {number:<3} {joint:<{width}}  {limits}")
+    gripper, tool = arm.gripper, arm.T_link_tool
     fingers = ", ".join(f"{f.name} {f.closed:g} to {f.open:g}" for f in gripper.finger_joints) or "no finger joints"
     lines += [
         f"    column {embodiment.gripper_column(arm):<3} {'gripper':<{width}}  {gripper.closed:g} closed, "
@@ -393,15 +370,12 @@ def format_check(check: EmbodimentCheck) -> str:
         f"{e.max_rotation_rad:>9.1e} {e.mean_rotation_rad:>9.1e}  {'ok' if e.passed else 'FAILED'}"
         for e in check.errors
     ]
-    head = [
-        f"{check.name}: forward kinematics against {check.engine}, {check.samples} random joint positions (seed "
-        f"{check.seed})",
-        f"  {'frame':<49} {'max m':>9} {'mean m':>9} {'max rad':>9} {'mean rad':>9}",
-    ]
     verdict = "passed" if check.passed else "FAILED"
     return "\n".join(
         [
-            *head,
+            f"{check.name}: forward kinematics against {check.engine}, {check.samples} random joint positions (seed "
+            f"{check.seed})",
+            f"  {'frame':<49} {'max m':>9} {'mean m':>9} {'max rad':>9} {'mean rad':>9}",
             *rows,
             *(f"  note: {note}" for note in check.notes),
             f"  {verdict}: the limit is {POSITION_TOLERANCE_M:g} m and {ROTATION_TOLERANCE_RAD:g} rad",
@@ -411,7 +385,6 @@ def format_check(check: EmbodimentCheck) -> str:
 
 def check_as_json(check: EmbodimentCheck) -> dict[str, Any]:
     """The same as plain values."""
-    values = asdict(check)
-    values["errors"] = [{**error, "passed": e.passed} for error, e in zip(values["errors"], check.errors, strict=True)]
+    errors = [{**asdict(error), "passed": error.passed} for error in check.errors]
     tolerances = {"position_m": POSITION_TOLERANCE_M, "rotation_rad": ROTATION_TOLERANCE_RAD}
-    return {**values, "tolerances": tolerances, "passed": check.passed}
+    return {**asdict(check), "errors": errors, "tolerances": tolerances, "passed": check.passed}

@@ -1,9 +1,8 @@
 """Forward kinematics: from `observation.state` (or `action`) to tool, link and wrist camera poses, in batches.
 
-The chains are `pytorch_kinematics` chains in float64, built from trees that `worldline_core.geometry.urdf` and
-`worldline_core.geometry.mjcf` read; all poses are float64. Tools and wrist cameras need the arms only: they come from
-a chain without the other links, which gives the same bits and is faster. Axis legend: n frames, a arms, j state
-columns, l links.
+The chains are `pytorch_kinematics` chains in float64, built from the trees that `kinematic_tree` reads; all poses are
+float64. Tools and wrist cameras need the arms only: they come from a chain without the other links, which gives the
+same bits and is faster. Axis legend: n frames, a arms, j state columns, l links.
 """
 
 from __future__ import annotations
@@ -21,11 +20,9 @@ from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.description import TreeBody, kept_for, mounted
 from worldline_core.geometry.embodiment import Embodiment, read_description
-from worldline_core.geometry.mjcf import read_mjcf
-from worldline_core.geometry.se3 import invert
-from worldline_core.geometry.urdf import read_urdf
+from worldline_core.geometry.kinematic_tree import TreeBody, mounted, read_mjcf, read_urdf
+from worldline_core.geometry.transforms import invert
 
 
 def read_tree(embodiment: Embodiment) -> TreeBody:
@@ -174,7 +171,7 @@ class ArmKinematics:
 
     @cached_property
     def _arm_chain(self) -> Chain:
-        tree = kept_for(self.tree, {self.embodiment.base_link, *self._arm_links})
+        tree = self.tree.pruned({self.embodiment.base_link, *self._arm_links})
         return self.chain if tree is None else chain_from_tree(tree)
 
     def tool_poses(

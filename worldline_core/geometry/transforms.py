@@ -1,31 +1,76 @@
-"""Rigid transforms and pinhole projection of whole recordings, in NumPy and float64.
+"""Rigid transforms as 4x4 matrices.
 
-What filters and the calibration doctor measure recordings with. The differentiable versions, on any device, are in
-`se3` and `cameras`; the conventions are theirs.
-
-A fixed rigid transform as a configuration writes it: translation [m] and quaternion (wxyz).
-
-Rotations and poses as recordings write them (quaternions, Euler angles) and as matrices. NumPy, float64.
-
-Every name says its order: quaternions `_wxyz` or `_xyzw`; Euler angles (about x, y, z, radians) about *fixed* axes,
-R = Rz Ry Rx (URDF's roll pitch yaw), or about *moving* axes, R = Rx Ry Rz. The differentiable quaternion is in `se3`.
+`T_a_b` maps points given in frame b to frame a, so `T_a_c = T_a_b @ T_b_c`. The NumPy functions (float64) are what
+recordings are read and measured with; the torch functions at the end are differentiable, batched over leading axes,
+and keep dtype and device. Rotations in other forms: `rotations`.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import model_validator
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import CalibrationError
+from worldline_core.geometry.rotations import (
+    nearest_rotation,
+    rotation_angle_deg,
+    rotation_deviation,
+    rotation_from_euler_fixed_xyz,
+    rotation_from_quaternion_wxyz,
+    rotation_from_quaternion_xyzw,
+)
 
 MAX_ROTATION_DEVIATION = 1e-3
 """A recorded rotation with R R^T further from the identity (largest entry) is refused, not repaired."""
 ROTATION_ROUNDING = 1e-6
 """Up to here a deviation is the rounding of float32 storage: left as it is, and not reported."""
+RIGID_TOLERANCE = 1e-4
+"""`is_rigid`: largest deviation of R R^T from the identity that still counts as a rotation."""
+
+
+def pose_from_rotation(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Position (..., 3) and rotation (..., 3, 3) -> (..., 4, 4) float64."""
+    place = np.asarray(position, dtype=np.float64)
+    pose = np.zeros((*place.shape[:-1], 4, 4))
+    pose[..., :3, :3] = rotation
+    pose[..., :3, 3] = place
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def pose_from_quaternion_xyzw(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Position (..., 3) [m] and quaternion xyzw -> (..., 4, 4).
+
+    Raises: CalibrationError for a quaternion of no length.
+    """
+    return pose_from_rotation(position, rotation_from_quaternion_xyzw(quaternion))
+
+
+def pose_from_quaternion_wxyz(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Position (..., 3) [m] and quaternion wxyz -> (..., 4, 4).
+
+    Raises: CalibrationError for a quaternion of no length.
+    """
+    return pose_from_rotation(position, rotation_from_quaternion_wxyz(quaternion))
+
+
+def pose_from_euler_fixed_xyz(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Position (..., 3) [m] and roll, pitch, yaw [rad] about fixed axes -> (..., 4, 4)."""
+    return pose_from_rotation(position, rotation_from_euler_fixed_xyz(angles))
+
+
+def rigid_inverse(pose: np.ndarray) -> np.ndarray:
+    """T_b_a from T_a_b (..., 4, 4), by the transpose of the rotation."""
+    result = np.zeros_like(pose)
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
 
 
 @dataclass(frozen=True)
@@ -34,21 +79,6 @@ class RotationRepair:
 
     count: int
     largest: float
-
-
-def rotation_deviation(rotation: np.ndarray) -> np.ndarray:
-    """(...,) largest entry of |R R^T - I| of matrices (..., 3, 3); infinite for a mirrored or not finite one."""
-    known = np.nan_to_num(rotation)
-    deviation = np.abs(known @ np.swapaxes(known, -1, -2) - np.eye(3)).max(axis=(-2, -1))
-    usable = np.isfinite(rotation).all(axis=(-2, -1)) & (np.linalg.det(known) > 0)
-    return np.where(usable, deviation, np.inf)
-
-
-def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotations nearest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes, by SVD)."""
-    u, _, vt = np.linalg.svd(matrix)
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return u @ vt
 
 
 def repair_rotations(poses: np.ndarray, where: object) -> tuple[np.ndarray, RotationRepair]:
@@ -78,39 +108,9 @@ def repair_rotations(poses: np.ndarray, where: object) -> tuple[np.ndarray, Rota
     return repaired, RotationRepair(int(off.sum()), float(deviation[off].max()))
 
 
-def rotation_angle_deg(rotation: np.ndarray) -> np.ndarray:
-    """(...,) angle of rotations (..., 3, 3)."""
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2
-    sine = 0.5 * np.linalg.norm(
-        np.stack(
-            [
-                rotation[..., 2, 1] - rotation[..., 1, 2],
-                rotation[..., 0, 2] - rotation[..., 2, 0],
-                rotation[..., 1, 0] - rotation[..., 0, 1],
-            ],
-            axis=-1,
-        ),
-        axis=-1,
-    )
-    return np.degrees(np.arctan2(sine, cosine))
-
-
-def rigid_inverse(pose: np.ndarray) -> np.ndarray:
-    """Inverse of rigid transforms (..., 4, 4)."""
-    result = np.zeros_like(pose)
-    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result[..., :3, :3] = rotation
-    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
-
-
 def mean_pose(poses: np.ndarray) -> np.ndarray:
     """(4, 4) with the median position and the chordal mean rotation of (n, 4, 4)."""
-    result = np.eye(4)
-    result[:3, :3] = nearest_rotation(poses[:, :3, :3].mean(axis=0))
-    result[:3, 3] = np.median(poses[:, :3, 3], axis=0)
-    return result
+    return pose_from_rotation(np.median(poses[:, :3, 3], axis=0), nearest_rotation(poses[:, :3, :3].mean(axis=0)))
 
 
 def hand_eye_residual(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -124,212 +124,31 @@ def hand_eye_residual(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tup
     return mount, np.linalg.norm(T_tool_camera[:, :3, 3] - mount[:3, 3], axis=1), rotation_angle_deg(apart[:, :3, :3])
 
 
-def project_points(points: np.ndarray, K: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) and depth (n,) [m] of base points (n, 3); depth <= 0 lies behind the camera."""
-    T_camera_base = rigid_inverse(T_base_camera)
-    in_camera = (T_camera_base[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_camera_base[:, :3, 3]
-    depth = in_camera[:, 2]
-    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-    homogeneous = (in_camera / safe[:, None]) @ K.T
-    return homogeneous[:, :2], depth
+def invert(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """`rigid_inverse` of tensors."""
+    rotation = T[..., :3, :3].mT
+    top = torch.cat([rotation, -(rotation @ T[..., :3, 3:])], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return torch.cat([top, bottom], dim=-2)
 
 
-def inside_image(uv: np.ndarray, depth: np.ndarray, width: int, height: int) -> np.ndarray:
-    """bool (n,): in front of the camera and on a pixel."""
-    u, v = uv[:, 0], uv[:, 1]
-    return (depth > 0.01) & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+def transform_points(T: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
+    """Points of frame b in frame a; leading axes broadcast."""
+    return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
 
 
-QUATERNION_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
+def is_rigid(T: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
+    """Whether transforms are finite, orthonormal and right-handed, with last row 0 0 0 1."""
+    rotation = T[..., :3, :3]
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)
+    finite = torch.isfinite(T).all(-1).all(-1)
+    orthonormal = ((rotation @ rotation.mT - eye).abs() <= RIGID_TOLERANCE).all(-1).all(-1)
+    right_handed = (torch.linalg.det(torch.nan_to_num(rotation)) - 1).abs() <= 3 * RIGID_TOLERANCE
+    return finite & orthonormal & right_handed & ((T[..., 3, :] - last_row).abs() <= RIGID_TOLERANCE).all(-1)
 
 
-class RigidOffset(StrictModel):
-    """A fixed transform by translation [m] and quaternion (wxyz); a length within 1e-3 of 1 is normalised."""
-
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-
-    @model_validator(mode="after")
-    def _proper(self) -> RigidOffset:
-        if not all(math.isfinite(value) for value in (*self.translation, *self.rotation_wxyz)):
-            raise ValueError("translation and rotation_wxyz must be finite numbers")
-        norm = float(np.linalg.norm(self.rotation_wxyz))
-        if norm == 0.0:
-            raise ValueError("rotation_wxyz is the zero quaternion, which is no rotation (no rotation: 1 0 0 0)")
-        if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-            raise ValueError(f"rotation_wxyz has length {norm:.6f}, expected 1")
-        return self
-
-    def matrix(self) -> np.ndarray:
-        """(4, 4) float64."""
-        w, x, y, z = np.asarray(self.rotation_wxyz, dtype=np.float64) / np.linalg.norm(self.rotation_wxyz)
-        T = np.eye(4)
-        T[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        T[:3, 3] = self.translation
-        return T
-
-
-MIN_QUATERNION_NORM = 1e-6
-"""A shorter quaternion has no direction; longer ones are normalised."""
-
-
-def pose_from_rotation(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Position (..., 3) and rotation (..., 3, 3) -> (..., 4, 4) float64."""
-    place = np.asarray(position, dtype=np.float64)
-    pose = np.zeros((*place.shape[:-1], 4, 4))
-    pose[..., :3, :3] = rotation
-    pose[..., :3, 3] = place
-    pose[..., 3, 3] = 1.0
-    return pose
-
-
-def rotation_from_quaternion_wxyz(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) wxyz, any positive length -> (..., 3, 3).
-
-    Raises: CalibrationError for a quaternion of no length, or one that is not finite.
-    """
-    value = np.asarray(quaternion, dtype=np.float64)
-    norm = np.linalg.norm(value, axis=-1, keepdims=True)
-    bad = ~(np.isfinite(norm[..., 0]) & (norm[..., 0] > MIN_QUATERNION_NORM))
-    if bad.any():
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise CalibrationError(
-            "Quaternion has no direction",
-            where=f"entry {', '.join(map(str, first))}" if first else None,
-            expected="a unit quaternion",
-            got=f"{value[first].tolist()}; {int(bad.sum())} of {bad.size} such",
-            next_step="check whether the pose was never written, or the columns are others",
-        )
-    w, x, y, z = np.moveaxis(value / norm, -1, 0)
-    return _stacked(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def rotation_from_quaternion_xyzw(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) xyzw, any positive length -> (..., 3, 3).
-
-    Raises: CalibrationError for a quaternion of no length, or one that is not finite.
-    """
-    return rotation_from_quaternion_wxyz(np.roll(quaternion, 1, axis=-1))
-
-
-def quaternion_wxyz_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) -> (..., 4) unit wxyz with w >= 0: eigenvector of the largest eigenvalue, stable everywhere."""
-    m = np.asarray(rotation, dtype=np.float64)
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    k = np.zeros((*m.shape[:-2], 4, 4))
-    k[..., 0, 0] = xx + yy + zz
-    k[..., 1, 1], k[..., 2, 2], k[..., 3, 3] = xx - yy - zz, yy - xx - zz, zz - xx - yy
-    k[..., 0, 1] = k[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
-    k[..., 0, 2] = k[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
-    k[..., 0, 3] = k[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
-    k[..., 1, 2] = k[..., 2, 1] = m[..., 1, 0] + m[..., 0, 1]
-    k[..., 1, 3] = k[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
-    k[..., 2, 3] = k[..., 3, 2] = m[..., 2, 1] + m[..., 1, 2]
-    _, vectors = np.linalg.eigh(k)
-    quaternion = vectors[..., -1]
-    sign = np.where(quaternion[..., :1] < 0, -1.0, 1.0)
-    return quaternion * sign
-
-
-def quaternion_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) -> (..., 4) unit xyzw with w >= 0."""
-    return np.roll(quaternion_wxyz_from_rotation(rotation), -1, axis=-1)
-
-
-def rotation_from_euler_fixed_xyz(angles: np.ndarray) -> np.ndarray:
-    """Angles (..., 3) [rad] about fixed x, then y, then z (roll, pitch, yaw): R = Rz Ry Rx."""
-    (cr, cp, cy), (sr, sp, sy) = (np.moveaxis(f(np.asarray(angles, np.float64)), -1, 0) for f in (np.cos, np.sin))
-    return _stacked(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-
-
-def rotation_from_euler_moving_xyz(angles: np.ndarray) -> np.ndarray:
-    """Angles (..., 3) [rad] about moving x, then y, then z: R = Rx Ry Rz."""
-    # Turning about moving axes is turning about fixed ones in the opposite order, hence the transpose of the negative.
-    return np.swapaxes(rotation_from_euler_fixed_xyz(-np.asarray(angles, np.float64)), -1, -2)
-
-
-def euler_fixed_xyz_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) -> angles (..., 3) [rad] about fixed axes; pitch in -pi/2..pi/2, and roll 0 where it is +-pi/2."""
-    m = np.asarray(rotation, dtype=np.float64)
-    across = np.hypot(m[..., 0, 0], m[..., 1, 0])
-    pitch = np.arctan2(-m[..., 2, 0], across)
-    # With the pitch at a right angle only yaw - roll (or their sum) exists: all of it is called yaw.
-    locked = across < 1e-9
-    roll = np.where(locked, 0.0, np.arctan2(m[..., 2, 1], m[..., 2, 2]))
-    yaw = np.where(locked, np.arctan2(-m[..., 0, 1], m[..., 1, 1]), np.arctan2(m[..., 1, 0], m[..., 0, 0]))
-    return np.stack([roll, pitch, yaw], axis=-1)
-
-
-def euler_moving_xyz_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) -> angles (..., 3) [rad] about moving axes; the second in -pi/2..pi/2."""
-    return -euler_fixed_xyz_from_rotation(np.swapaxes(np.asarray(rotation, np.float64), -1, -2))
-
-
-def pose_from_quaternion_xyzw(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and quaternion xyzw -> (..., 4, 4).
-
-    Raises: CalibrationError for a quaternion of no length.
-    """
-    return pose_from_rotation(position, rotation_from_quaternion_xyzw(quaternion))
-
-
-def pose_from_quaternion_wxyz(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and quaternion wxyz -> (..., 4, 4).
-
-    Raises: CalibrationError for a quaternion of no length.
-    """
-    return pose_from_rotation(position, rotation_from_quaternion_wxyz(quaternion))
-
-
-def pose_from_euler_fixed_xyz(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and roll, pitch, yaw [rad] about fixed axes -> (..., 4, 4)."""
-    return pose_from_rotation(position, rotation_from_euler_fixed_xyz(angles))
-
-
-def pose_from_euler_moving_xyz(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Position (..., 3) [m] and angles [rad] about moving x, y, z -> (..., 4, 4)."""
-    return pose_from_rotation(position, rotation_from_euler_moving_xyz(angles))
-
-
-def _stacked(rows: list[list[np.ndarray]]) -> np.ndarray:
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def reread_as_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) are whose quaternion was read as xyzw while it was written wxyz."""
-    return rotation_from_quaternion_wxyz(quaternion_xyzw_from_rotation(rotation))
-
-
-def written_as_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when they are written wxyz and read as xyzw."""
-    return rotation_from_quaternion_xyzw(quaternion_wxyz_from_rotation(rotation))
-
-
-def reread_as_moving(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) are whose Euler angles were read about fixed axes while they were about moving ones.
-
-    At pitch = +-90 degrees the angles are not unique and the result is one of several.
-    """
-    return rotation_from_euler_moving_xyz(euler_fixed_xyz_from_rotation(rotation))
-
-
-def written_as_moving(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when their angles are written about moving axes and read about fixed ones."""
-    return rotation_from_euler_fixed_xyz(euler_moving_xyz_from_rotation(rotation))
+def rot6d_from_rotation(rotation: Float[Tensor, "*b 3 columns"]) -> Float[Tensor, "*b 6"]:
+    """Rot6D (see `rotations`): the first two columns, one after the other."""
+    return rotation[..., :2].mT.flatten(-2)

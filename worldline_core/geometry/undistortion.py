@@ -1,8 +1,7 @@
-"""Undistortion of a camera's images: the pinhole that replaces the lens, and the pixel maps, made once a camera.
+"""Undistortion of a camera's images: the pinhole that replaces the lens, and the pixel maps, made once per camera.
 
-Distortion of points on the plane at depth 1, batched and differentiable: models and formulas in `distortion`.
-
-Points are (x, y) = (X / Z, Y / Z) in the camera frame, OpenCV axes; pixels are K (x', y', 1).
+Models and formulas are in `distortion`. Points are (x, y) = (X / Z, Y / Z) in the camera frame, OpenCV axes; pixels are
+K (x', y', 1). Points are worked on in torch, batched over leading axes and differentiable.
 """
 
 from __future__ import annotations
@@ -31,22 +30,6 @@ def distort_points(points: Float[Tensor, "*b 2"], distortion: Distortion) -> Flo
     r = _norm(points)
     theta = torch.atan(r)
     return points * (_radius(theta, distortion) / r)[..., None]
-
-
-def undistort_points(points: Float[Tensor, "*b 2"], distortion: Distortion) -> Float[Tensor, "*b 2"]:
-    """The inverse: (x', y') -> (x, y).
-
-    Raises: CalibrationError for a point that no ray of the model reaches, or only one from beside or behind the camera.
-    """
-    rays = undistort_rays(points, distortion)
-    if not bool((rays[..., 2] > 0).all()):
-        raise CalibrationError(
-            "Pixel is seen from beside or behind the camera: it has no place on a plane in front of it",
-            expected="rays less than 90 degrees off the axis",
-            got=f"{int((rays[..., 2] <= 0).sum())} of {rays[..., 2].numel()} beyond",
-            next_step="use undistort_rays",
-        )
-    return rays[..., :2] / rays[..., 2:]
 
 
 def undistort_rays(points: Float[Tensor, "*b 2"], distortion: Distortion) -> Float[Tensor, "*b 3"]:

@@ -19,15 +19,15 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.geometry.transforms import (
+from worldline_core.geometry.rotations import (
     quaternion_wxyz_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
-    rigid_inverse,
     rotation_from_quaternion_wxyz,
     written_as_moving,
     written_as_wxyz,
 )
+from worldline_core.geometry.transforms import rigid_inverse
 
 _NEEDS = {
     **dict.fromkeys(("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size"), "a calibrated camera"),

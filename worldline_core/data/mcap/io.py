@@ -22,7 +22,7 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.mcap.schemas import SCHEMAS
 from worldline_core.errors import DataError
 from worldline_core.geometry.distortion import Distortion
-from worldline_core.geometry.transforms import quaternion_wxyz_from_rotation
+from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
 from worldline_core.store.atomic import atomic_path
 
 ImageFormat = Literal["png", "jpeg"]

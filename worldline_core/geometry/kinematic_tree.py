@@ -1,0 +1,323 @@
+"""A robot as a tree of bodies and joints, read from MJCF or URDF.
+
+MJCF is read without MuJoCo: the lean install has no simulator, and `pytorch_kinematics.build_chain_from_mjcf` needs
+one. Covered is what decides the pose of a body: nested bodies with pos and quat / euler / axisangle / xyaxes / zaxis,
+hinge and slide joints with pos and axis, joint defaults by class, sites, and the compiler's angle and eulerseq. Geoms,
+cameras, actuators and the like are passed over; a ball joint, a free body, `<include>`, `<frame>` or a joint `ref` is
+refused rather than guessed.
+
+URDF is read in float64: `pytorch_kinematics` reads it in float32 (about 1e-7 of the robot's size lost at every joint)
+and stops at planar and floating joints with a KeyError. Links, joints, their origins, axes and limits are read; meshes,
+inertia and vendor tags decide no pose. A `mimic` joint is a joint of its own here: the embodiment lists it among its
+finger joints. Reference: https://wiki.ros.org/urdf/XML/joint.
+
+Tests compare both readers with MuJoCo itself.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from worldline_core.errors import DataError
+from worldline_core.geometry.rotations import rotation_about_axis, rotation_from_euler_fixed_xyz
+
+_UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
+_URDF_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": None}
+_MJCF_KINDS = {"hinge": "revolute", "slide": "prismatic"}
+
+
+@dataclass(frozen=True)
+class TreeJoint:
+    """One degree of freedom; `kind` is revolute or prismatic, axis (unit) and position [m] are in its body's frame.
+
+    `limits` [rad or m] are those of the description, None where it sets none.
+    """
+
+    name: str
+    kind: str
+    axis: np.ndarray
+    position: np.ndarray
+    limits: tuple[float, float] | None = None
+
+
+@dataclass
+class TreeBody:
+    """A body, link or site: its pose in its parent at joint positions zero, its joints in order, its children."""
+
+    name: str
+    T_parent_body: np.ndarray
+    joints: list[TreeJoint] = field(default_factory=list)
+    children: list[TreeBody] = field(default_factory=list)
+
+    def walk(self) -> Iterator[TreeBody]:
+        """This body and everything below it, parents first."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+    def pruned(self, wanted: set[str]) -> TreeBody | None:
+        """The part of the tree that decides the poses of some bodies: they and what lies between them and the root."""
+        children = [kept for child in self.children if (kept := child.pruned(wanted)) is not None]
+        return replace(self, children=children) if children or self.name in wanted else None
+
+    def prefixed(self, prefix: str) -> TreeBody:
+        """A copy in which every body and joint is named `prefix/name`."""
+        joints = [replace(joint, name=f"{prefix}/{joint.name}") for joint in self.joints]
+        children = [child.prefixed(prefix) for child in self.children]
+        return TreeBody(f"{prefix}/{self.name}", self.T_parent_body, joints, children)
+
+
+def mounted(tree: TreeBody, T_world_root: Mapping[str, np.ndarray]) -> TreeBody:
+    """One copy of a tree for each entry under a body `world`, its names prefixed by the entry's and a slash."""
+    copies = [(tree.prefixed(name), T) for name, T in T_world_root.items()]
+    children = [replace(copy, T_parent_body=T @ tree.T_parent_body) for copy, T in copies]
+    return TreeBody("world", np.eye(4), children=children)
+
+
+def parse_xml(text: str, where: object) -> ET.Element:
+    """Root of an XML text, comments dropped.
+
+    Descriptions made by xacro often keep a prefix whose namespace they no longer declare (`drake:acceleration`);
+    ROS and MuJoCo read those, so they are declared here.
+
+    Raises: DataError when the text is not XML.
+    """
+    # The user's own file; expat bounds the expansion of entities and fetches none.
+    try:
+        return ET.fromstring(text.encode())  # noqa: S314
+    except ET.ParseError as error:
+        problem = error
+    if "unbound prefix" in str(problem):
+        prefixes = sorted({name for match in _UNDECLARED_PREFIX.findall(text) for name in match} - {"", "xml", "xmlns"})
+        declarations = "".join(f' xmlns:{p}="urn:{p}"' for p in prefixes if f"xmlns:{p}=" not in text)
+        declared = re.sub(r"<(robot|mujoco)\b", rf"<\1{declarations}", text, count=1)
+        try:
+            return ET.fromstring(declared.encode())  # noqa: S314
+        except ET.ParseError as error:
+            problem = error
+    raise DataError("Kinematic description is not XML", where=where, got=str(problem))
+
+
+def _numbers(text: str, count: int, where: object) -> np.ndarray:
+    """(count,) float64 from an attribute.
+
+    Raises: DataError for another number of values, or one that is not a finite number.
+    """
+    try:
+        values = np.array([float(value) for value in text.split()], dtype=np.float64)
+    except ValueError as error:
+        raise DataError("Not numbers", where=where, expected=f"{count} numbers", got=text) from error
+    if len(values) != count or not np.isfinite(values).all():
+        raise DataError("Not the numbers that belong here", where=where, expected=f"{count} finite numbers", got=text)
+    return values
+
+
+def _unit(vector: np.ndarray, where: object) -> np.ndarray:
+    """The vector at length 1.
+
+    Raises: DataError when it is zero.
+    """
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise DataError("A direction of length zero", where=where, expected="a vector that is not zero")
+    return vector / length
+
+
+def read_mjcf(text: str, where: object) -> TreeBody:
+    """The tree under `world`.
+
+    Raises: DataError when the text is not MJCF, or uses something this reader does not know.
+    """
+    root = parse_xml(text, where)
+    worldbody = root.find("worldbody")
+    if root.tag != "mujoco" or worldbody is None:
+        raise DataError("Not an MJCF file", where=where, expected="<mujoco> with a <worldbody>", got=f"<{root.tag}>")
+    for tag in ("include", "frame", "replicate", "attach"):
+        if next(root.iter(tag), None) is not None:
+            raise DataError(
+                f"MJCF element <{tag}> is not supported here",
+                where=where,
+                next_step="write the file out flat (mujoco.mj_saveLastXML)",
+            )
+    return _MjcfReader(root, where).body(worldbody, "world", None)
+
+
+class _MjcfReader:
+    """Holds what bodies inherit: the compiler's settings and the joint defaults by class."""
+
+    def __init__(self, root: ET.Element, where: object) -> None:
+        compiler = root.find("compiler")
+        settings = {} if compiler is None else compiler.attrib
+        self.where = where
+        self.to_radians = 1.0 if settings.get("angle", "degree") == "radian" else math.pi / 180
+        self.eulerseq = settings.get("eulerseq", "xyz")
+        self.autolimits = settings.get("autolimits", "true") == "true"
+        self.joint_defaults: dict[str, dict[str, str]] = {}
+        for default in root.findall("default"):
+            self._read_defaults(default, {}, "main")
+        self.unnamed = 0
+        self.body_names = {element.get("name") for element in root.iter("body")}
+
+    def _read_defaults(self, element: ET.Element, inherited: dict[str, str], fallback: str) -> None:
+        joint = element.find("joint")
+        values = {**inherited, **({} if joint is None else joint.attrib)}
+        self.joint_defaults[element.get("class", fallback)] = values
+        for child in element.findall("default"):
+            self._read_defaults(child, values, fallback)
+
+    def body(self, element: ET.Element, name: str, childclass: str | None) -> TreeBody:
+        childclass = element.get("childclass", childclass)
+        body = TreeBody(name, self._pose(element))
+        if element.find("freejoint") is not None:
+            raise DataError("A free body is no part of a kinematic description", where=f"{self.where}: {name}")
+        body.joints = [self._joint(joint, name, childclass) for joint in element.findall("joint")]
+        for child in element:
+            if child.tag not in ("body", "site"):
+                continue
+            self.unnamed += 1
+            child_name = child.get("name", f"{child.tag}_{self.unnamed}")
+            if child.tag == "body":
+                body.children.append(self.body(child, child_name, childclass))
+            else:
+                # A site may bear the name of a body; link names are unique.
+                unique = f"site:{child_name}" if child_name in self.body_names else child_name
+                body.children.append(TreeBody(unique, self._pose(child)))
+        return body
+
+    def _joint(self, element: ET.Element, body: str, childclass: str | None) -> TreeJoint:
+        joint_class = element.get("class", childclass) or "main"
+        values = {**self.joint_defaults.get(joint_class, {}), **element.attrib}
+        kind = _MJCF_KINDS.get(values.get("type", "hinge"))
+        if kind is None or float(values.get("ref", "0")) != 0.0:
+            raise DataError(
+                "Joint is not supported here",
+                where=f"{self.where}: body {body}, joint {values.get('name')}",
+                expected="type hinge or slide, ref 0",
+                got=f"type {values.get('type')}, ref {values.get('ref', '0')}",
+            )
+        name = values.get("name", f"{body}_joint")
+        place = f"{self.where}: joint {name}"
+        axis = _unit(_numbers(values.get("axis", "0 0 1"), 3, place), place)
+        position = _numbers(values.get("pos", "0 0 0"), 3, place)
+        return TreeJoint(name, kind, axis, position, self._limits(values, kind, place))
+
+    def _limits(self, values: dict[str, str], kind: str, place: str) -> tuple[float, float] | None:
+        limited = values.get("limited", "auto")
+        if "range" not in values or limited == "false" or (limited == "auto" and not self.autolimits):
+            return None
+        lower, upper = _numbers(values["range"], 2, place) * (self.to_radians if kind == "revolute" else 1.0)
+        return float(lower), float(upper)
+
+    def _pose(self, element: ET.Element) -> np.ndarray:
+        """T_parent_body from pos and whichever of the five forms of orientation the element has."""
+        place = f"{self.where}: {element.tag} {element.get('name', '')}"
+        given = element.attrib
+        T = np.eye(4)
+        T[:3, 3] = _numbers(given.get("pos", "0 0 0"), 3, place)
+        if "quat" in given:
+            w, *xyz = _unit(_numbers(given["quat"], 4, place), place)
+            # Through axis and angle: digests of action tracks hold the last bit of this.
+            T[:3, :3] = rotation_about_axis(np.array(xyz), 2 * math.atan2(float(np.linalg.norm(xyz)), float(w)))
+        elif "euler" in given:
+            for letter, angle in zip(self.eulerseq, _numbers(given["euler"], 3, place) * self.to_radians, strict=True):
+                turn = rotation_about_axis(np.eye(3)["xyz".index(letter.lower())], float(angle))
+                # Lower case: about the moving axes; upper case: about the fixed ones.
+                T[:3, :3] = T[:3, :3] @ turn if letter.islower() else turn @ T[:3, :3]
+        elif "axisangle" in given:
+            *axis, angle = _numbers(given["axisangle"], 4, place)
+            T[:3, :3] = rotation_about_axis(np.asarray(axis), float(angle) * self.to_radians)
+        elif "xyaxes" in given:
+            axes = _numbers(given["xyaxes"], 6, place)
+            x = _unit(axes[:3], place)
+            y = _unit(axes[3:] - (axes[3:] @ x) * x, place)
+            T[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+        elif "zaxis" in given:
+            z = _unit(_numbers(given["zaxis"], 3, place), place)
+            axis = np.cross([0.0, 0.0, 1.0], z)
+            sine = float(np.linalg.norm(axis))
+            axis = axis if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+            T[:3, :3] = rotation_about_axis(axis, math.atan2(sine, float(z[2])))
+        return T
+
+
+def read_urdf(text: str, where: object) -> TreeBody:
+    """The tree under the root link.
+
+    Raises: DataError for what is no URDF, a joint without a link, a link with two parents, none or several roots, or a
+        kind of joint that is not known here.
+    """
+    robot = parse_xml(text, where)
+    if robot.tag != "robot":
+        raise DataError("Not a URDF file", where=where, expected="<robot> with links and joints", got=f"<{robot.tag}>")
+    bodies: dict[str, TreeBody] = {}
+    for link in robot.findall("link"):
+        name = link.get("name", "")
+        if not name or name in bodies:
+            raise DataError("A link without a name, or named twice", where=where, got=name)
+        bodies[name] = TreeBody(name, np.eye(4))
+    parents: dict[str, str] = {}
+    for joint in robot.findall("joint"):
+        parent, child = (_joint_end(joint, end, bodies, where) for end in ("parent", "child"))
+        if child in parents:
+            raise DataError("A link has two parents", where=f"{where}: {child}", got=f"{parents[child]} and {parent}")
+        parents[child] = parent
+        bodies[child].T_parent_body = _urdf_origin(joint, where)
+        bodies[child].joints = _urdf_joints(joint, where)
+        bodies[parent].children.append(bodies[child])
+    roots = [name for name in bodies if name not in parents]
+    if len(roots) != 1:
+        raise DataError("A URDF has one root link", where=where, expected="one link without a parent", got=f"{roots}")
+    root = bodies[roots[0]]
+    if (reached := sum(1 for _ in root.walk())) != len(bodies):
+        raise DataError("Links form a circle", where=where, got=f"{reached} of {len(bodies)} reached from {roots}")
+    return root
+
+
+def _joint_end(joint: ET.Element, end: str, bodies: dict[str, TreeBody], where: object) -> str:
+    """Name of the parent or child link of a joint."""
+    element = joint.find(end)
+    name = "" if element is None else element.get("link", "")
+    if name not in bodies:
+        raise DataError(
+            f"A joint's {end} is no link of the description",
+            where=f"{where}: joint {joint.get('name')}",
+            expected=f"one of {', '.join(bodies)}",
+            got=name,
+        )
+    return name
+
+
+def _urdf_origin(joint: ET.Element, where: object) -> np.ndarray:
+    """T_parent_child at position zero; rpy is about fixed axes."""
+    T = np.eye(4)
+    origin = joint.find("origin")
+    if origin is not None:
+        place = f"{where}: joint {joint.get('name')}, origin"
+        T[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3, place)
+        T[:3, :3] = rotation_from_euler_fixed_xyz(_numbers(origin.get("rpy", "0 0 0"), 3, place))
+    return T
+
+
+def _urdf_joints(joint: ET.Element, where: object) -> list[TreeJoint]:
+    """The joint's one degree of freedom, none of a fixed one; its axis is given in the child's frame."""
+    name, kind = joint.get("name", ""), joint.get("type", "")
+    place = f"{where}: joint {name}"
+    if not name or kind not in _URDF_KINDS:
+        expected = f"one of {', '.join(_URDF_KINDS)}"
+        raise DataError("Joint is not supported here", where=place, expected=expected, got=kind)
+    moves = _URDF_KINDS[kind]
+    if moves is None:
+        return []
+    axis, limit = joint.find("axis"), joint.find("limit")
+    direction = _unit(_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, place), place)
+    limits = None
+    if limit is not None and kind != "continuous":
+        lower, upper = (float(_numbers(limit.get(key, "0"), 1, place)[0]) for key in ("lower", "upper"))
+        limits = (lower, upper)
+    return [TreeJoint(name, moves, direction, np.zeros(3), limits)]
