@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
@@ -198,3 +198,29 @@ def test_intrinsics_follow_a_resize() -> None:
     expected = (pixels(camera.K) + 0.5) * [16 / 64, 24 / 48] - 0.5
     assert np.abs(pixels(small.K) - expected).max() < 1e-9
     assert (small.width, small.height) == (16, 24)
+
+
+def test_the_record_of_an_episode_is_stored_whole(sample: Make, tmp_path: Path) -> None:
+    """Every field that the record declares comes back; a field that is added to it is stored without another line."""
+    episode, frames, _ = sample(
+        0, bank="b", candidate=3, primary_view="left_wrist", conventions={"layout": "x", "n": 3},
+        T_base_ee=np.tile(np.eye(4), (9, 2, 1, 1)), gripper=np.linspace(0, 1, 18).reshape(9, 2),
+    )  # fmt: skip
+    with EpisodeSetWriter(tmp_path / "set") as writer:
+        writer.add(episode, frames)
+    read = EpisodeSet.open(tmp_path / "set").episode(0)
+    assert read.described() == episode.described()
+    assert set(ARRAYS) == {"state", "action", "T_base_ee", "gripper"} == set(read.arrays())
+    for name, values in episode.arrays().items():
+        assert getattr(read, name).dtype == ARRAYS[name].dtype
+        assert np.array_equal(getattr(read, name), values)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("scene", 3), ("fps", "fast"), ("state_names", "left"), ("candidate", "one")]
+)
+def test_a_description_of_another_type_is_refused(sample: Make, field: str, value: object) -> None:
+    described = sample(0)[0].described()
+    assert EpisodeDescription.arguments(described)["state_names"] == sample(0)[0].state_names
+    with pytest.raises(ValueError, match=field):
+        EpisodeDescription.arguments({**described, field: value})

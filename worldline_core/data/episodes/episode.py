@@ -6,11 +6,13 @@ forward). Units: metres, radians, seconds, pixels. Gripper opening: 0 closed .. 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
@@ -101,23 +103,27 @@ class CameraTrack:
 
 
 @dataclass(frozen=True)
-class Episode:
-    """Arrays and description of one episode; images live apart.
+class Stored:
+    """How an array of an episode is stored: its dtype, and its axes (N frames, J state columns, A arms, or a size)."""
 
-    Attributes:
-        state, action: (N, J) float32. With state_kind "joints": for each arm in order (left, right; a single arm is
-            right) joint positions [rad] then gripper opening. With "ee_pose": xyz [m], quaternion xyzw, gripper. With
-            "none" (plain videos, for Stage I alone): no columns, (N, 0).
-        action: commanded targets, same layout.
-        timestamps: (N,) float64 seconds from the first frame.
-        cameras: by view; empty when a source publishes no calibration.
-        T_base_ee: (N, A, 4, 4) tool poses (between the fingertips, +z out of the gripper) where a source records
-            them; None where they come from kinematics.
-        gripper: (N, A) opening, given together with T_base_ee.
-        state_names: (J,) names of the state columns.
-        video_frames: number of leading frames with images (None: all N). Some samples publish more states than images.
-        conventions: units and frames as the source declares them, and notes such as counted gripper overshoot.
-    """
+    dtype: type[np.floating]
+    axes: tuple[str | int, ...]
+
+    def array(self, values: np.ndarray | Sequence[float], sizes: Mapping[str, int]) -> np.ndarray:
+        """Numbers in row order as an array of these axes; raises a ValueError where they do not fit."""
+        return np.asarray(values, self.dtype).reshape(
+            [sizes[axis] if isinstance(axis, str) else axis for axis in self.axes]
+        )
+
+
+_Columns = Annotated[np.ndarray, Stored(np.float32, ("N", "J"))]
+_Poses = Annotated[np.ndarray, Stored(np.float64, ("N", "A", 4, 4))]
+_Openings = Annotated[np.ndarray, Stored(np.float64, ("N", "A"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeLabels:
+    """What an episode is. Under these names it stands in the index of a set and in every file that holds an episode."""
 
     episode_id: str
     source: str
@@ -128,19 +134,61 @@ class Episode:
     outcome: str
     split: str
     fps: float
-    state: np.ndarray
-    action: np.ndarray
-    timestamps: np.ndarray
-    cameras: dict[str, CameraTrack] = field(default_factory=dict)
     bank: str | None = None
     candidate: int | None = None
-    T_base_ee: np.ndarray | None = None
-    gripper: np.ndarray | None = None
     primary_view: str = "head"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeDescription(EpisodeLabels):
+    """All that is said about an episode in words.
+
+    Attributes:
+        state_names: (J,) names of the state columns.
+        conventions: units and frames as the source declares them, and notes such as counted gripper overshoot.
+    """
+
     state_names: tuple[str, ...] | None = None
     state_kind: str = "joints"
-    video_frames: int | None = None
     conventions: Mapping[str, str | float | int] = field(default_factory=dict)
+
+    def described(self) -> dict[str, Any]:
+        """The fields as JSON values: what MCAP files and episodes that wait for their set hold."""
+        names = None if self.state_names is None else list(self.state_names)
+        values = {name: getattr(self, name) for name in _DESCRIPTION}
+        return values | {"state_names": names, "conventions": dict(self.conventions)}
+
+    @staticmethod
+    def arguments(found: Mapping[str, Any]) -> dict[str, Any]:
+        """The reverse, for `Episode`; raises a ValueError naming a field that is missing or of another type."""
+        description = _ADAPTER.validate_json(json.dumps({name: found[name] for name in _DESCRIPTION}), strict=True)
+        return {name: getattr(description, name) for name in _DESCRIPTION}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode(EpisodeDescription):
+    """The record of one episode: what every file, table and reader of episodes is made from. Images live apart.
+
+    Attributes:
+        state, action: (N, J). With state_kind "joints": for each arm in order (left, right; a single arm is right) joint
+            positions [rad] then gripper opening. With "ee_pose": xyz [m], quaternion xyzw, gripper. With "none" (plain
+            videos, for Stage I alone): no columns, (N, 0).
+        action: commanded targets, same layout.
+        timestamps: (N,) float64 seconds from the first frame; a set stores the rate alone.
+        cameras: by view; empty when a source publishes no calibration.
+        T_base_ee: (N, A, 4, 4) tool poses (between the fingertips, +z out of the gripper) where a source records
+            them; None where they come from kinematics.
+        gripper: (N, A) opening, given together with T_base_ee.
+        video_frames: number of leading frames with images (None: all N). Some samples publish more states than images.
+    """
+
+    state: _Columns
+    action: _Columns
+    timestamps: np.ndarray
+    cameras: dict[str, CameraTrack] = field(default_factory=dict)
+    T_base_ee: _Poses | None = None
+    gripper: _Openings | None = None
+    video_frames: int | None = None
 
     def __post_init__(self) -> None:
         where = f"episode {self.episode_id}"
@@ -230,11 +278,31 @@ class Episode:
         return replace(
             self,
             fps=self.fps / step,
-            state=self.state[start:stop:step],
-            action=self.action[start:stop:step],
             timestamps=times - times[0],
             cameras={view: camera.cut(start, stop, step) for view, camera in self.cameras.items()},
-            T_base_ee=None if self.T_base_ee is None else self.T_base_ee[start:stop:step],
-            gripper=None if self.gripper is None else self.gripper[start:stop:step],
             video_frames=None if self.video_frames is None else -(-with_images // step),
+            **{name: values[start:stop:step] for name, values in self.arrays().items()},
         )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of `ARRAYS` that the episode has, by name."""
+        found = {name: getattr(self, name) for name in ARRAYS}
+        return {name: values for name, values in found.items() if values is not None}
+
+
+def _stored_arrays() -> dict[str, Stored]:
+    """By name, of the fields whose annotation says how they are stored, be they optional or not."""
+    found: dict[str, Stored] = {}
+    for name, hint in get_type_hints(Episode, include_extras=True).items():
+        for part in (hint, *get_args(hint)):
+            for note in getattr(part, "__metadata__", ()):
+                if isinstance(note, Stored):
+                    found[name] = note
+    return found
+
+
+LABELS = tuple(each.name for each in fields(EpisodeLabels))
+_DESCRIPTION = tuple(each.name for each in fields(EpisodeDescription))
+_ADAPTER = TypeAdapter(EpisodeDescription)
+ARRAYS = _stored_arrays()
+"""Arrays of an episode that are stored, and how."""

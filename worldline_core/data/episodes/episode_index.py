@@ -6,10 +6,12 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_type_hints
 
 import pyarrow as pa
 
+from worldline_core.data.episodes.episode import EpisodeLabels
 from worldline_core.data.guards.plain_files import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import is_file
@@ -19,9 +21,9 @@ INDEX_FILE = "index.parquet"
 QUARANTINE_FILE = "quarantine.parquet"
 
 
-@dataclass(frozen=True)
-class EpisodeRow:
-    """One episode, or a kept segment of one.
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRow(EpisodeLabels):
+    """One episode, or a kept segment of one: its labels, and where it lies.
 
     Attributes:
         dataset: folder of the LeRobot dataset, relative to the set; may lie in another artifact.
@@ -32,60 +34,42 @@ class EpisodeRow:
         conventions: JSON of what the source declared.
     """
 
-    episode_id: str
     dataset: str
     episode_index: int
     start: int
     stop: int
     num_frames: int
     video_frames: int
-    fps: float
-    source: str
-    embodiment: str
-    scene: str
-    task_family: str
-    instruction: str
-    outcome: str
-    split: str
     views: tuple[str, ...]
-    bank: str | None
-    candidate: int | None
-    primary_view: str
     stage1_ok: bool = True
     stage2_ok: bool = True
     stage2_reason: str | None = None
     conventions: str = "{}"
 
 
+# The file's order of columns; their types are those of `EpisodeRow`.
+_ORDER = (
+    "episode_id", "dataset", "episode_index", "start", "stop", "num_frames", "video_frames",
+    "fps", "source", "embodiment", "scene", "task_family", "instruction", "outcome", "split",
+    "views", "bank", "candidate", "primary_view", "stage1_ok", "stage2_ok", "stage2_reason", "conventions",
+)  # fmt: skip
+_HINTS = get_type_hints(EpisodeRow)
+_ARROW = {
+    str: pa.string(),
+    int: pa.int64(),
+    float: pa.float64(),
+    bool: pa.bool_(),
+    tuple[str, ...]: pa.list_(pa.string()),
+}
 _INDEX = pa.schema(
     [
-        ("episode_id", pa.string()),
-        ("dataset", pa.string()),
-        ("episode_index", pa.int64()),
-        ("start", pa.int64()),
-        ("stop", pa.int64()),
-        ("num_frames", pa.int64()),
-        ("video_frames", pa.int64()),
-        ("fps", pa.float64()),
-        ("source", pa.string()),
-        ("embodiment", pa.string()),
-        ("scene", pa.string()),
-        ("task_family", pa.string()),
-        ("instruction", pa.string()),
-        ("outcome", pa.string()),
-        ("split", pa.string()),
-        ("views", pa.list_(pa.string())),
-        ("bank", pa.string()),
-        ("candidate", pa.int64()),
-        ("primary_view", pa.string()),
-        ("stage1_ok", pa.bool_()),
-        ("stage2_ok", pa.bool_()),
-        ("stage2_reason", pa.string()),
-        ("conventions", pa.string()),
+        (name, next(_ARROW[hint] for hint in (_HINTS[name], *get_args(_HINTS[name])) if hint in _ARROW))
+        for name in sorted(_HINTS, key=_ORDER.index)
     ]
 )
+_NULLABLE = tuple(name for name, hint in _HINTS.items() if NoneType in get_args(hint))
+# Sets of earlier versions lack these.
 _OPTIONAL = ("stage1_ok", "stage2_ok", "stage2_reason", "conventions")
-_NULLABLE = ("bank", "candidate", "stage2_reason")
 _QUARANTINE = pa.schema([(name, pa.string()) for name in ("episode_id", "source", "reason", "detail", "evidence")])
 
 

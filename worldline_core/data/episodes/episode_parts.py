@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import ARRAYS, VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -76,16 +76,11 @@ def _arrays(
     episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
 ) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {
-        "state": episode.state.astype(np.float32),
-        "action": episode.action.astype(np.float32),
+        name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()
     }
     for view, camera in episode.cameras.items():
         arrays[f"K.{view}"] = camera.K.astype(np.float64)
         arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
-    if episode.T_base_ee is not None:
-        arrays["T_base_ee"] = episode.T_base_ee.astype(np.float64)
-    if episode.gripper is not None:
-        arrays["gripper"] = episode.gripper.astype(np.float64)
     for view, mask in (robot_masks or {}).items():
         arrays[f"mask.{view}"] = np.packbits(mask.astype(bool))
     for view, kept in stored.items():
@@ -97,21 +92,8 @@ def _description(
     episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
 ) -> dict[str, Any]:
     return {
-        "episode_id": episode.episode_id,
-        "source": episode.source,
-        "embodiment": episode.embodiment,
-        "scene": episode.scene,
-        "task_family": episode.task_family,
-        "instruction": episode.instruction,
-        "outcome": episode.outcome,
-        "split": episode.split,
+        **episode.described(),
         "fps": float(episode.fps),
-        "bank": episode.bank,
-        "candidate": episode.candidate,
-        "primary_view": episode.primary_view,
-        "state_names": None if episode.state_names is None else list(episode.state_names),
-        "state_kind": episode.state_kind,
-        "conventions": dict(episode.conventions),
         "num_frames": episode.num_frames,
         "video_frames": episode.num_video_frames,
         "views": [[view, *stored[view].size] for view in ordered_views(stored)],

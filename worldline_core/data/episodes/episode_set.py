@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import ARRAYS, LABELS, Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.sidecar import Sidecar
@@ -120,38 +120,22 @@ class EpisodeSet:
         """
         row = self.rows[i]
         dataset, sidecar = self._open(i)
-        stored = sidecar.trajectory(row.episode_index) or {}
-        state = stored.get("state")
-        action = stored.get("action")
         length = int(dataset.row(row.episode_index)["length"])
+        arrays = sidecar.trajectory(row.episode_index)
         if sidecar.contract["state_kind"] == "none":
-            state = action = np.zeros((length, 0), dtype=np.float32)
-        elif state is None or action is None:
-            state = dataset.column(row.episode_index, "observation.state").astype(np.float32, copy=False)
-            action = dataset.column(row.episode_index, "action").astype(np.float32, copy=False)
+            arrays |= dict.fromkeys(("state", "action"), np.zeros((length, 0), dtype=np.float32))
+        elif "state" not in arrays:
+            for name, column in (("state", "observation.state"), ("action", "action")):
+                arrays[name] = dataset.column(row.episode_index, column).astype(ARRAYS[name].dtype, copy=False)
         names = sidecar.contract.get("state_names")
         whole = Episode(
-            episode_id=row.episode_id,
-            source=row.source,
-            embodiment=row.embodiment,
-            scene=row.scene,
-            task_family=row.task_family,
-            instruction=row.instruction,
-            outcome=row.outcome,
-            split=row.split,
-            fps=row.fps,
-            state=state,
-            action=action,
-            timestamps=np.arange(len(state), dtype=np.float64) / row.fps,
+            **{name: getattr(row, name) for name in LABELS},
+            **arrays,
+            timestamps=np.arange(len(arrays["state"]), dtype=np.float64) / row.fps,
             cameras=sidecar.cameras(row.episode_index),
-            bank=row.bank,
-            candidate=row.candidate,
-            T_base_ee=stored.get("T_base_ee"),
-            gripper=stored.get("gripper"),
-            primary_view=row.primary_view,
             state_names=None if names is None else tuple(names),
             state_kind=sidecar.contract["state_kind"],
-            video_frames=None if length == len(state) else length,
+            video_frames=None if length == len(arrays["state"]) else length,
             conventions=_conventions(row),
         )
         if not 0 <= row.start < row.stop <= whole.num_frames:

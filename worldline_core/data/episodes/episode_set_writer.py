@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import LABELS, Episode
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
     EpisodeRow,
@@ -269,25 +269,14 @@ def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
     if part["state_kind"] == "none":
         stage2_reason = "missing_actions"
     return EpisodeRow(
-        episode_id=part["episode_id"],
+        **{name: part[name] for name in LABELS},
         dataset=dataset,
         episode_index=episode_index,
         start=0,
         stop=part["num_frames"],
         num_frames=part["num_frames"],
         video_frames=part["video_frames"],
-        fps=part["fps"],
-        source=part["source"],
-        embodiment=part["embodiment"],
-        scene=part["scene"],
-        task_family=part["task_family"],
-        instruction=part["instruction"],
-        outcome=part["outcome"],
-        split=part["split"],
         views=views,
-        bank=part["bank"],
-        candidate=part["candidate"],
-        primary_view=part["primary_view"],
         stage1_ok=part["primary_view"] in views,
         stage2_ok=stage2_reason is None,
         stage2_reason=stage2_reason,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
 from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, check_image_size, too_large
 from worldline_core.data.guards.plain_files import read_json, read_table, well_formed
@@ -42,15 +42,14 @@ _MASKS = pa.schema(
         ("bits", pa.binary()),
     ]
 )
+_PER_ARM = [name for name, stored in ARRAYS.items() if "A" in stored.axes]
 _TRAJECTORIES = pa.schema(
     [
         ("episode_index", pa.int64()),
         ("num_frames", pa.int64()),
-        ("state", pa.list_(pa.float32())),
-        ("action", pa.list_(pa.float32())),
+        *((name, pa.list_(pa.from_numpy_dtype(ARRAYS[name].dtype))) for name in ARRAYS if name not in _PER_ARM),
         ("num_arms", pa.int64()),
-        ("T_base_ee", pa.list_(pa.float64())),
-        ("gripper", pa.list_(pa.float64())),
+        *((name, pa.list_(pa.from_numpy_dtype(ARRAYS[name].dtype))) for name in _PER_ARM),
     ]
 )
 
@@ -77,20 +76,10 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
             mask = part.mask(view)
             bits = zlib.compress(np.packbits(mask).tobytes(), 9)
             masks.append({"episode_index": index, "view": view, "shape": list(mask.shape), "bits": bits})
-        tool = part.arrays.get("T_base_ee")
-        if tool is not None or part["video_frames"] != part["num_frames"]:
-            gripper = part.arrays.get("gripper")
-            trajectories.append(
-                {
-                    "episode_index": index,
-                    "num_frames": part["num_frames"],
-                    "state": part.arrays["state"].reshape(-1).tolist(),
-                    "action": part.arrays["action"].reshape(-1).tolist(),
-                    "num_arms": 0 if tool is None else tool.shape[1],
-                    "T_base_ee": None if tool is None else tool.reshape(-1).tolist(),
-                    "gripper": None if gripper is None else gripper.reshape(-1).tolist(),
-                }
-            )
+        arms = part.arrays["T_base_ee"].shape[1] if "T_base_ee" in part.arrays else 0
+        if arms or part["video_frames"] != part["num_frames"]:
+            values = {name: part.arrays[name].reshape(-1).tolist() for name in ARRAYS if name in part.arrays}
+            trajectories.append({"episode_index": index, "num_frames": part["num_frames"], "num_arms": arms, **values})
     write_table(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
     if masks:
         write_table(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
@@ -191,26 +180,22 @@ class Sidecar:
                     return np.unpackbits(packed, count=bits).reshape(count, height, width).astype(bool)
         return None
 
-    def trajectory(self, episode_index: int) -> dict[str, np.ndarray] | None:
-        """Full-length state, action and tool poses where they go beyond what the dataset holds, else None.
+    def trajectory(self, episode_index: int) -> dict[str, Any]:
+        """Full-length state, action and tool poses where they go beyond what the dataset holds, else nothing.
 
         Raises: RejectedInputError (unreadable) for numbers that do not fit their counts.
         """
         rows = self._of("trajectories.parquet", _TRAJECTORIES, episode_index, optional=True)
         if not rows:
-            return None
+            return {}
+        row = rows[0]
         with well_formed(f"{self.root}, episode {episode_index}, trajectory", "numbers of N frames and A arms"):
-            row = rows[0]
-            num_frames, num_arms = row["num_frames"], row["num_arms"]
-            result: dict[str, np.ndarray] = {
-                "state": np.asarray(row["state"], np.float32).reshape(num_frames, -1),
-                "action": np.asarray(row["action"], np.float32).reshape(num_frames, -1),
+            sizes = {"N": row["num_frames"], "A": row["num_arms"], "J": -1}
+            return {
+                name: stored.array(row[name], sizes)
+                for name, stored in ARRAYS.items()
+                if name not in _PER_ARM or row[name] is not None
             }
-            if row["T_base_ee"] is not None:
-                result["T_base_ee"] = np.asarray(row["T_base_ee"], np.float64).reshape(num_frames, num_arms, 4, 4)
-            if row["gripper"] is not None:
-                result["gripper"] = np.asarray(row["gripper"], np.float64).reshape(num_frames, num_arms)
-            return result
 
 
 def _unpacked(packed: bytes, length: int) -> bytes:
