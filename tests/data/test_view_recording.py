@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.episodes.source import LoadedEpisode, no_masks
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, read_clip
@@ -229,9 +229,19 @@ def test_images_come_one_at_a_time(sample: Make, tmp_path: Path) -> None:
 
 def test_a_source_without_clips_gives_its_images_one_by_one(sample: Make) -> None:
     episode, frames, _ = sample(0)
-    never: Callable[[str], np.ndarray] = lambda view: pytest.fail("decoded as a whole")  # noqa: E731
-    loaded = LoadedEpisode(episode, tuple(frames), never, no_masks, images=lambda view: iter(frames[view]))
-    assert np.array_equal(np.stack(list(loaded.each_image("head"))), frames["head"])
+    asked: list[int] = []
+
+    def images(view: str) -> Iterator[np.ndarray]:
+        for number, image in enumerate(frames[view]):
+            asked.append(number)
+            yield image
+
+    loaded = LoadedEpisode(episode, tuple(frames), images)
+    one_by_one = loaded.each_image("head")
+    assert np.array_equal(next(one_by_one), frames["head"][0])
+    assert asked == [0], "only what is looked at may be read"
+    assert np.array_equal(np.stack(list(one_by_one)), frames["head"][1:])
+    assert np.array_equal(loaded.frames("head"), frames["head"])
 
 
 def test_read_clip_says_the_range_of_its_luma(tmp_path: Path) -> None:

@@ -58,6 +58,31 @@ def camera_pose(
         return build(matrices, axes=axes, where=f"view {view}")
 
 
+class RecordedCameras:
+    """The cameras of one episode, as a reader finds them.
+
+    Attributes:
+        tracks: by view.
+    """
+
+    def __init__(self) -> None:
+        self.tracks: dict[str, CameraTrack] = {}
+        self._repairs: dict[str, RotationRepair] = {}
+
+    def add(self, view: str, K: np.ndarray, pose: CameraPose, size: tuple[int, ...]) -> None:
+        """Add a view.
+
+        Args:
+            K: (3, 3) for images of `size` (height, width).
+        """
+        self.tracks[view] = CameraTrack.from_pose(view, K, pose, width=size[1], height=size[0])
+        self._repairs[view] = pose.repair
+
+    def notes(self) -> dict[str, str | int | float]:
+        """`repair_notes` of the views."""
+        return repair_notes(self._repairs)
+
+
 def check_intrinsics(camera: CameraTrack, where: str) -> None:
     """Raises: RejectedInputError (singular_intrinsics)."""
     K = camera.K

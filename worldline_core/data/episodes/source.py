@@ -1,17 +1,12 @@
-"""What every episode source offers, and what their configurations share.
-
-Ids of episodes that are files: the label and the path, told apart where that is not enough.
-"""
+"""What every source of episodes offers, and what the configurations of sources share."""
 
 from __future__ import annotations
 
-import hashlib
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -32,44 +27,47 @@ EVALUATION_ONLY = "evaluation_only"
 _DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
 
 
+def no_masks(view: str) -> None:
+    """Robot masks of a source that has none."""
+    del view
+
+
 @dataclass(frozen=True)
 class LoadedEpisode:
-    """An episode at the source's own rate and image size.
-
-    A source whose views are videos names them in `clips` (`VideoClip.whole_file(path, num_frames, fps)`, or with
-    `from_time` inside of a joined file): curation then decodes them once, frame by frame, and stores them without
-    encoding where nothing changes. One whose images are single files or messages gives `images`, so that no view is ever
-    in memory as a whole. `frames` alone is enough for short recordings.
+    """An episode at the source's own rate and image size; images are read when they are asked for, one at a time.
 
     Attributes:
         views: views that have images.
-        frames: view -> uint8 (episode.num_video_frames, H, W, 3); decodes when called.
+        images: view -> uint8 (H, W, 3) RGB per frame; asked only for views that are not in `clips`.
         robot_masks: view -> bool (N, H, W), or None where the source has none.
         distortions: lenses of the views whose images are not those of a pinhole; K is then that of the lens.
-        clips: view -> its encoded video, of the views that are videos as they are.
-        images: view -> uint8 (H, W, 3) RGB frame by frame, for views that are no clips.
+        clips: view -> its encoded video, of the views that are videos; curation decodes it once, and stores it without
+            encoding where no picture changes.
     """
 
     episode: Episode
     views: tuple[str, ...]
-    frames: Callable[[str], np.ndarray]
-    robot_masks: Callable[[str], np.ndarray | None]
+    images: Callable[[str], Iterable[np.ndarray]] = lambda view: ()
+    robot_masks: Callable[[str], np.ndarray | None] = no_masks
     distortions: Mapping[str, Distortion] = field(default_factory=dict)
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
-    images: Callable[[str], Iterator[np.ndarray]] | None = None
 
     def each_image(self, view: str) -> Iterator[np.ndarray]:
-        """uint8 (H, W, 3) RGB frame by frame, in the way that holds the least of them in memory.
+        """uint8 (H, W, 3) RGB per frame.
 
         Raises: RejectedInputError, while it is iterated, for whatever cannot be read.
         """
         if view in self.clips:
-            for picture in read_clip(self.clips[view]):
-                yield picture.rgb
-        elif self.images is not None:
-            yield from self.images(view)
+            yield from (picture.rgb for picture in read_clip(self.clips[view]))
         else:
-            yield from self.frames(view)
+            yield from self.images(view)
+
+    def frames(self, view: str) -> np.ndarray:
+        """uint8 (episode.num_video_frames, H, W, 3) RGB, all in memory.
+
+        Raises: RejectedInputError for whatever cannot be read.
+        """
+        return np.stack(list(self.each_image(view)))
 
 
 class EpisodeSource(Protocol):
@@ -137,6 +135,19 @@ class ForeignSourceConfig(SourceConfigBase):
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
 
+    def declared(self, scene: str) -> dict[str, Any]:
+        """Fields of an `Episode` that the configuration decides.
+
+        Args:
+            scene: of the episode where the configuration names none.
+        """
+        return {
+            "source": self.label,
+            "scene": self.scene or scene,
+            "task_family": self.task_family,
+            "split": self.split,
+        }
+
 
 class EvaluationSourceConfig(ForeignSourceConfig):
     """A source that results are compared on, and that therefore never trains or selects a model."""
@@ -190,25 +201,3 @@ class GripperRange(StrictModel):
 def says_droid(*names: str) -> bool:
     """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
     return any(_DROID.search(name) for name in names)
-
-
-def no_masks(view: str) -> None:
-    """Robot masks of a source that has none."""
-    del view
-
-
-def unique_names(names: Mapping[str, str]) -> dict[str, str]:
-    """Id -> file, from file -> wanted id.
-
-    Files that would share an id (a-b/c and a/b-c both give a-b-c) get a digest of their path behind it.
-    """
-    count = Counter(names.values())
-    return {
-        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(file).encode()).hexdigest()[:8]}": file
-        for file, name in names.items()
-    }
-
-
-def printable(name: str) -> str:
-    """A path whose bytes are no UTF-8 as text that can be stored."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")

@@ -3,14 +3,14 @@
 A file may point outside of itself (external links, external storage, virtual datasets) or declare a huge array in a few
 bytes; both are refused before anything is read.
 
-Views of an HDF5 recording that are stored as one encoded image a frame.
+Views of such a recording are stored as one encoded image per frame.
 """
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ import numpy as np
 
 from worldline_core.data.guards.hdf5_heap import check_entries
 from worldline_core.data.guards.images import decode_image
-from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, MAX_FRAMES, regular_file, too_large
+from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, MAX_FRAMES, check_shape, regular_file, too_large
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
 from worldline_core.errors import UnavailableError
@@ -63,6 +63,20 @@ class Hdf5File:
             node = self._node(group)
             return sorted(node) if isinstance(node, self._h5py.Group) else []
 
+    def require_cameras(self, group: str, cameras: Mapping[str, str]) -> None:
+        """Raises: RejectedInputError (missing_view) where a group lacks the camera of a view."""
+        found = self.names(group)
+        missing = [view for view, camera in cameras.items() if camera not in found]
+        if missing:
+            raise RejectedInputError(
+                "missing_view",
+                "File lacks a camera",
+                where=f"{self._path}, {group}",
+                expected=", ".join(cameras[view] for view in missing),
+                got=", ".join(found) or "none",
+                evidence={"missing": missing, "found": found},
+            )
+
     def has(self, key: str) -> bool:
         """Whether `key` is a dataset that holds something: recorders write unused fields as empty ones.
 
@@ -84,7 +98,7 @@ class Hdf5File:
         dataset = self._dataset(key)
         if dataset.dtype.kind not in "fiu":
             raise self._rejected("unreadable", "Dataset is not numeric", key, "numbers", dataset.dtype)
-        self._check_shape(key, dataset.shape, shape)
+        check_shape("Dataset", f"{self._path}, {key}", dataset.shape, shape)
         with self._reading(key):
             values = np.asarray(dataset[()], dtype=np.float64)
         bad = ~np.isfinite(values)
@@ -119,7 +133,7 @@ class Hdf5File:
         """
         shape = self._dataset(key).shape
         if len(shape) not in (1, 2):
-            self._check_shape(key, shape, (None, None))
+            check_shape("Dataset", f"{self._path}, {key}", shape, (None, None))
         return int(shape[1]) if len(shape) == 2 else 1
 
     def is_flat(self, key: str) -> bool:
@@ -181,7 +195,7 @@ class Hdf5File:
             raise self._rejected(
                 "unreadable", "Images are not stored as encoded bytes", key, "(N,) byte strings", dataset.dtype
             )
-        self._check_shape(key, dataset.shape, (length,))
+        check_shape("Dataset", f"{self._path}, {key}", dataset.shape, (length,))
         rows = dataset.chunks[0] if dataset.chunks else _BLOCK_IMAGES
         rows = max(1, min(rows, _BLOCK_BYTES // max(dataset.dtype.itemsize, 1)))
         for start in range(0, length, rows):
@@ -224,20 +238,6 @@ class Hdf5File:
                     "Dataset claims too many images", where=where, limit=MAX_FRAMES, got=node.size, unit="images"
                 )
             return node
-
-    def _check_shape(self, key: str, found: tuple[int, ...], wanted: Sequence[int | None]) -> None:
-        fits = len(found) == len(wanted) and all(
-            size > 0 if want is None else size == want for size, want in zip(found, wanted, strict=True)
-        )
-        if not fits:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Dataset has a wrong shape",
-                where=f"{self._path}, {key}",
-                expected=tuple("N" if want is None else want for want in wanted),
-                got=found,
-                evidence={"dataset": key, "shape": list(found)},
-            )
 
     def _rejected(self, reason: Any, what: str, key: str, expected: object, got: object) -> RejectedInputError:
         return RejectedInputError(reason, what, where=f"{self._path}, {key}", expected=expected, got=got)

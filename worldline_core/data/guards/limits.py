@@ -7,6 +7,7 @@ with these limits before they decode or allocate; none of them stands in the way
 from __future__ import annotations
 
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -40,6 +41,22 @@ def too_large(what: str, *, where: object, limit: int, got: int, unit: str) -> R
         next_step="the file is damaged or hostile; if it is neither, cut the recording into shorter ones",
         evidence={"declared": int(got), "limit": int(limit), "unit": unit},
     )
+
+
+def check_shape(what: str, where: object, found: Sequence[int], wanted: Sequence[int | None]) -> None:
+    """Raises: RejectedInputError (length_mismatch) for an array of another shape; None stands for any size but 0."""
+    fits = len(found) == len(wanted) and all(
+        size > 0 if want is None else size == want for size, want in zip(found, wanted, strict=True)
+    )
+    if not fits:
+        raise RejectedInputError(
+            "length_mismatch",
+            f"{what} has a wrong shape",
+            where=where,
+            expected=tuple("N" if want is None else want for want in wanted),
+            got=tuple(found),
+            evidence={"shape": list(found)},
+        )
 
 
 def check_image_size(width: int, height: int, where: object) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
-from worldline_core.data.episodes.source import LoadedEpisode, no_masks
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap import resampling
 from worldline_core.data.mcap.cameras import camera_tracks, read_calibration
@@ -117,9 +117,7 @@ def read_episode(
         for view, topics in config.views.items()
     }
     reader = _ImageReader(file, tracks, cameras, config.views)
-    return LoadedEpisode(
-        episode, tuple(config.views), lambda view: np.stack(list(reader(view))), no_masks, lenses, images=reader
-    )
+    return LoadedEpisode(episode, tuple(config.views), reader, distortions=lenses)
 
 
 def _streams(

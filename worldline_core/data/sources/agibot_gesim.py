@@ -1,44 +1,49 @@
 """AgiBot World bundles of GE-Sim, both layouts.
 
-v1 (`sample_*`): some frames a view as PNG, tool poses of the state at 30 Hz (xyz, quaternion xyzw, gripper about 35 open
-.. 120 closed), one K and per-frame extrinsics a view. No commands are published: the action repeats the state.
-v2 (`demo_*`): the first frame a view, joints, poses of state and action (xyz, fixed-axes roll pitch yaw), gripper 0 open
-.. about 119 closed in the state and 0 open .. 1 closed in the action.
+v1 (`sample_*`): a few frames per view as PNG, tool poses of the state at 30 Hz (xyz, quaternion xyzw, gripper about 35
+open .. 120 closed), one K and per-frame extrinsics per view. No commands are published: the action repeats the state.
+v2 (`demo_*`): the first frame per view, joints, poses of state and action (xyz, fixed-axes roll pitch yaw), gripper 0
+open .. about 119 closed in the state and 0 open .. 1 closed in the action.
 Extrinsics are camera-to-base with OpenCV axes in both. The poses are of the arm's end link; the tool centre lies further
 along its +z (0.23 m with the hands of v1, 0.15 m with those of v2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
-from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
+from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode
 from worldline_core.data.guards.images import read_image
+from worldline_core.data.guards.limits import check_shape
 from worldline_core.data.guards.plain_files import read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
-from worldline_core.geometry.cameras import CameraPose
+from worldline_core.data.sources.reading import joint_names
 from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
 AGIBOT_CAMERAS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
 """View -> AgiBot's name of the camera, in file names of every layout."""
+AGIBOT_STATE_NAMES = joint_names({"left": 7, "right": 7})
 GRIPPER_STATE_RAW = GripperRange(closed=120.0, open=35.0)
 """Readings of AgiBot World's `state/effector/position`, checked on images."""
 GRIPPER_COMMAND_RAW = GripperRange(closed=1.0, open=0.0)
 TOOL_OFFSET_RAW_M = 0.23
 """From the arm's end link to between the fingertips of AgiBot World's hands, along +z."""
 
-_FOLDER_V1 = {"head": "head_color", "left_wrist": "hand_left_color", "right_wrist": "hand_right_color"}
 _IMAGE_V2 = {"head": "cur_head.png", "left_wrist": "cur_left.png", "right_wrist": "cur_right.png"}
 _POSTURE_V2 = ("head_yaw", "head_pitch", "waist_pitch", "waist_lift")
+_POSE_NAMES = tuple(
+    f"{arm}/{name}" for arm in ("left", "right") for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
+)
 
 
 class AgibotGesimSourceConfig(ForeignSourceConfig):
@@ -73,151 +78,138 @@ class AgibotGesimSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         found = self._folders[episode_id.removeprefix(f"{self._config.label}-")]
         folder = inside_folder(self._root, str(relative_name(found, self._root)))
-        is_v2 = is_file(folder / "state_joints_0.npy")
-        return self._load_v2(episode_id, folder) if is_v2 else self._load_v1(episode_id, folder)
+        read = self._read_v2 if is_file(folder / "state_joints_0.npy") else self._read_v1
+        return read(episode_id, folder)
 
-    def _common(self, episode_id: str, folder: AnyPath, num_frames: int) -> dict[str, Any]:
-        return {
-            "episode_id": episode_id,
-            "source": self._config.label,
-            "embodiment": self._config.embodiment,
-            "scene": self._config.scene or f"{self._config.label}-{folder.name}",
-            "task_family": self._config.task_family,
-            "outcome": self._config.outcome,
-            "split": self._config.split,
-            "fps": self._config.fps,
-            "timestamps": np.arange(num_frames) / self._config.fps,
-        }
-
-    def _load_v1(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
-        config = self._config
+    def _read_v1(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         raw = _array(folder / "actions.npy", (None, 16))
-        opening, overshoot = config.gripper_v1.opening(raw[:, [7, 15]])
+        opening, overshoot = self._config.gripper_v1.opening(raw[:, [7, 15]])
         with rejected_as("nan_state", folder / "actions.npy"):
             ends = [pose_from_quaternion_xyzw(raw[:, a : a + 3], raw[:, a + 3 : a + 7]) for a in (0, 8)]
-        poses = np.stack(ends, axis=1)
         state = raw.copy()
         state[:, [7, 15]] = opening
-        images = {view: _png_folder(folder / name) for view, name in _FOLDER_V1.items()}
+        images = {view: _numbered_images(folder / f"{name}_color") for view, name in AGIBOT_CAMERAS.items()}
         counts = {view: len(files) for view, files in images.items()}
         if len(set(counts.values())) != 1:
             raise RejectedInputError(
                 "length_mismatch", "Views differ in the number of images", where=folder, got=counts, evidence=counts
             )
-        cameras: dict[str, CameraTrack] = {}
-        recorded: dict[str, CameraPose] = {}
-        for view, name in AGIBOT_CAMERAS.items():
-            height, width = read_image(images[view][0]).shape[:2]
-            K = _array(folder / f"intrinsic_{name}.npy", (3, 3)).astype(np.float64)
-            track = _array(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)).astype(np.float64)
-            recorded[view] = camera_pose(view, track, extrinsics="camera_to_base", axes="opencv", where=folder)
-            cameras[view] = CameraTrack.from_pose(view, K, recorded[view], width=width, height=height)
-        episode = Episode(
-            **self._common(episode_id, folder, len(raw)),
-            instruction="",
-            state=state.astype(np.float32),
-            action=state.astype(np.float32),
-            cameras=cameras,
-            T_base_ee=along_tool_z(poses, config.tool_offset_v1_m),
-            gripper=opening,
-            state_names=tuple(
-                f"{arm}/{name}"
-                for arm in ("left", "right")
-                for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
-            ),
-            state_kind="ee_pose",
-            video_frames=_fewer(counts["head"], len(raw), folder),
-            conventions={
-                "layout": "agibot_gesim v1",
-                "action": "repeats the state: no commands are published",
-                "tool_offset_m": config.tool_offset_v1_m,
-                "gripper_overshoot": overshoot,
-                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
-            },
+        K = {view: _array(folder / f"intrinsic_{name}.npy", (3, 3)) for view, name in AGIBOT_CAMERAS.items()}
+        poses = {
+            view: _array(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)) for view, name in AGIBOT_CAMERAS.items()
+        }
+        notes = {"layout": "agibot_gesim v1", "action": "repeats the state: no commands are published"}
+        episode = self._episode(
+            episode_id, folder, state, state, ends, opening, overshoot, self._config.tool_offset_v1_m, notes
         )
-        frames: Callable[[str], np.ndarray] = lambda view: np.stack([read_image(path) for path in images[view]])  # noqa: E731
-        return LoadedEpisode(episode, VIEWS, frames, no_masks, config.lenses)
+        episode = replace(episode, state_names=_POSE_NAMES, state_kind="ee_pose")
+        return self._loaded(episode, folder, images, K, poses)
 
-    def _load_v2(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
-        config = self._config
+    def _read_v2(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         joints = _array(folder / "state_joints_0.npy", (None, 20))
         num_frames = len(joints)
         commands = _array(folder / "actions_0.npy", (num_frames, 16))
-        ends = _array(folder / "state_eef_poses_0.npy", (num_frames, 14))
-        opening, overshoot = config.gripper_v2.opening(joints[:, 14:16])
-        commanded, command_overshoot = GRIPPER_COMMAND_RAW.opening(commands[:, [7, 15]])
-        left, right = slice(0, 7), slice(7, 14)
-        state = np.concatenate([joints[:, left], opening[:, :1], joints[:, right], opening[:, 1:]], axis=1)
-        action = np.concatenate([commands[:, :7], commanded[:, :1], commands[:, 8:15], commanded[:, 1:]], axis=1)
-        poses = np.stack(
-            [pose_from_euler_fixed_xyz(ends[:, a : a + 3], ends[:, a + 3 : a + 6]) for a in (0, 7)], axis=1
+        recorded = _array(folder / "state_eef_poses_0.npy", (num_frames, 14))
+        ends = [pose_from_euler_fixed_xyz(recorded[:, a : a + 3], recorded[:, a + 3 : a + 6]) for a in (0, 7)]
+        opening, overshoot = self._config.gripper_v2.opening(joints[:, 14:16])
+        commanded, more = GRIPPER_COMMAND_RAW.opening(commands[:, [7, 15]])
+        state = np.hstack([joints[:, :7], opening[:, :1], joints[:, 7:14], opening[:, 1:]])
+        action = np.hstack([commands[:, :7], commanded[:, :1], commands[:, 8:15], commanded[:, 1:]])
+        notes = {
+            "layout": "agibot_gesim v2",
+            "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
+            **{name: float(joints[0, 16 + i]) for i, name in enumerate(_POSTURE_V2)},
+        }
+        episode = self._episode(
+            episode_id, folder, state, action, ends, opening, overshoot + more, self._config.tool_offset_v2_m, notes
         )
-        intrinsics = _array(folder / "intrinsic.npy", (3, 3, 3)).astype(np.float64)
-        tracks = _array(folder / "extrinsic_alignstate_0.npy", (3, num_frames, 4, 4)).astype(np.float64)
-        cameras: dict[str, CameraTrack] = {}
-        recorded: dict[str, CameraPose] = {}
-        for index, view in enumerate(VIEWS):
-            height, width = read_image(folder / _IMAGE_V2[view]).shape[:2]
-            recorded[view] = camera_pose(view, tracks[index], extrinsics="camera_to_base", axes="opencv", where=folder)
-            cameras[view] = CameraTrack.from_pose(view, intrinsics[index], recorded[view], width=width, height=height)
         task = folder / "task.txt"
-        posture = {name: float(joints[0, 16 + i]) for i, name in enumerate(_POSTURE_V2)}
-        names = [f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")]
-        episode = Episode(
-            **self._common(episode_id, folder, num_frames),
-            instruction=read_text(task).strip() if is_file(task) else "",
+        instruction = read_text(task).strip() if is_file(task) else ""
+        episode = replace(episode, state_names=AGIBOT_STATE_NAMES, instruction=instruction)
+        images = {view: [folder / name] for view, name in _IMAGE_V2.items()}
+        K = _array(folder / "intrinsic.npy", (3, 3, 3))
+        poses = _array(folder / "extrinsic_alignstate_0.npy", (3, num_frames, 4, 4))
+        return self._loaded(
+            episode, folder, images, dict(zip(VIEWS, K, strict=True)), dict(zip(VIEWS, poses, strict=True))
+        )
+
+    def _episode(
+        self,
+        episode_id: str,
+        folder: AnyPath,
+        state: np.ndarray,
+        action: np.ndarray,
+        ends: list[np.ndarray],
+        opening: np.ndarray,
+        overshoot: int,
+        tool_offset_m: float,
+        notes: Mapping[str, str | float],
+    ) -> Episode:
+        """Without cameras.
+
+        Args:
+            ends: (N, 4, 4) of the end link of the left and of the right arm.
+        """
+        config = self._config
+        return Episode(
+            **config.declared(f"{config.label}-{folder.name}"),
+            episode_id=episode_id,
+            embodiment=config.embodiment,
+            instruction="",
+            outcome=config.outcome,
+            fps=config.fps,
             state=state.astype(np.float32),
             action=action.astype(np.float32),
-            cameras=cameras,
-            T_base_ee=along_tool_z(poses, config.tool_offset_v2_m),
+            timestamps=np.arange(len(state)) / config.fps,
+            T_base_ee=along_tool_z(np.stack(ends, axis=1), tool_offset_m),
             gripper=opening,
-            state_names=tuple(names),
-            video_frames=_fewer(1, num_frames, folder),
-            conventions={
-                "layout": "agibot_gesim v2",
-                "tool_offset_m": config.tool_offset_v2_m,
-                "gripper_overshoot": overshoot + command_overshoot,
-                "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
-                **posture,
-                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
-            },
+            conventions={"tool_offset_m": tool_offset_m, "gripper_overshoot": overshoot, **notes},
         )
-        first: Callable[[str], np.ndarray] = lambda view: read_image(folder / _IMAGE_V2[view])[None]  # noqa: E731
-        return LoadedEpisode(episode, VIEWS, first, no_masks, config.lenses)
 
-
-def _fewer(images: int, states: int, folder: AnyPath) -> int | None:
-    if images > states:
-        raise RejectedInputError(
-            "length_mismatch",
-            "More images than states",
-            where=folder,
-            expected=f"at most {states} images",
-            got=images,
-            evidence={"images": images, "states": states},
+    def _loaded(
+        self,
+        episode: Episode,
+        folder: AnyPath,
+        images: Mapping[str, Sequence[AnyPath]],
+        K: Mapping[str, np.ndarray],
+        poses: Mapping[str, np.ndarray],
+    ) -> LoadedEpisode:
+        """With cameras, and images of the first frames or of all."""
+        num_images = len(images["head"])
+        if num_images > episode.num_frames:
+            raise RejectedInputError(
+                "length_mismatch",
+                "More images than states",
+                where=folder,
+                expected=f"at most {episode.num_frames} images",
+                got=num_images,
+                evidence={"images": num_images, "states": episode.num_frames},
+            )
+        cameras = RecordedCameras()
+        for view in VIEWS:
+            pose = camera_pose(view, poses[view], extrinsics="camera_to_base", axes="opencv", where=folder)
+            cameras.add(view, K[view], pose, read_image(images[view][0]).shape)
+        episode = replace(
+            episode,
+            cameras=cameras.tracks,
+            video_frames=None if num_images == episode.num_frames else num_images,
+            conventions={**episode.conventions, **cameras.notes()},
         )
-    return None if images == states else images
+        return LoadedEpisode(
+            episode, VIEWS, lambda view: map(read_image, images[view]), distortions=self._config.lenses
+        )
 
 
 def _array(path: AnyPath, shape: tuple[int | None, ...]) -> np.ndarray:
+    """float64 of a wanted shape; None for any size but 0."""
     values = read_npy(path)
     if values.dtype.kind not in "fiu":
         raise RejectedInputError("unreadable", "Array is not numeric", where=path, expected="numbers", got=values.dtype)
-    if values.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, values.shape, strict=True)
-    ):
-        raise RejectedInputError(
-            "length_mismatch",
-            "Array has a wrong shape",
-            where=path,
-            expected=shape,
-            got=values.shape,
-            evidence={"shape": list(values.shape)},
-        )
-    return values
+    check_shape("Array", path, values.shape, shape)
+    return values.astype(np.float64)
 
 
-def _png_folder(folder: AnyPath) -> list[AnyPath]:
+def _numbered_images(folder: AnyPath) -> list[AnyPath]:
     files = sorted((p for p in find_files(folder, "*.png") if p.stem.isdigit()), key=lambda p: int(p.stem))
     if not files:
         raise RejectedInputError("missing_file", "No images", where=folder, expected="0.png, 1.png, ...", got="none")

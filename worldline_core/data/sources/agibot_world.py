@@ -1,4 +1,4 @@
-"""AgiBot World as published: HDF5 proprioception, one mp4 and two JSON files of camera parameters a view.
+"""AgiBot World as published: HDF5 proprioception; per view one mp4 and two JSON files of camera parameters.
 
     task_info/task_<task>.json                                   instructions and labelled steps of all episodes
     proprio_stats/<task>/<episode>/proprio_stats.h5              timestamp [ns], state/*, action/*
@@ -6,7 +6,7 @@
     parameters/<task>/<episode>/parameters/camera/<camera>_{intrinsic_params,extrinsic_params_aligned}.json
 
 Joints are left then right [rad]; poses are of the arm's end link (xyz [m], quaternion xyzw) in the base frame of the
-extrinsics, which are camera-to-base with OpenCV axes, one a frame or one for all. The gripper's state reads about 35 open
+extrinsics, which are camera-to-base with OpenCV axes, one per frame or one for all. The gripper's state reads about 35 open
 .. 120 closed, its command 0 open .. 1 closed. Episodes with dexterous hands (12 effector values) are quarantined: their
 state is not the two-gripper layout of this embodiment.
 """
@@ -20,28 +20,26 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
-from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode, no_masks
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode
 from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_folders, inside
 from worldline_core.data.sources.agibot_gesim import (
     AGIBOT_CAMERAS,
+    AGIBOT_STATE_NAMES,
     GRIPPER_COMMAND_RAW,
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
+from worldline_core.data.sources.reading import check_rate
 from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import decode_video, video_size
-from worldline_core.geometry.cameras import CameraPose
+from worldline_core.data.video.decode import video_size
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
 View = Literal["head", "left_wrist", "right_wrist"]
-_STATE_NAMES = tuple(
-    f"{arm}/{n}" for arm in ("left", "right") for n in (*(f"joint_{j}" for j in range(1, 8)), "gripper")
-)
 _POSTURE = {"head": ("head_yaw_rad", "head_pitch_rad"), "waist": ("waist_pitch_rad", "waist_lift_m")}
 _MAX_NUMBER = 1e12
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
@@ -73,7 +71,7 @@ class AgibotWorldSourceConfig(ForeignSourceConfig):
 class AgibotWorldSource:
     """Reads every `<task>/<episode>` that `proprio_stats` or `observations` has a folder of; ids are label-task-episode.
 
-    Arrays are read an episode at a time, videos when their frames are asked for.
+    Arrays are read one episode at a time, videos when their frames are asked for.
     """
 
     def __init__(self, config: AgibotWorldSourceConfig, root: AnyPath) -> None:
@@ -116,30 +114,26 @@ class AgibotWorldSource:
             }
         with rejected_as("nan_state", path):
             ends = pose_from_quaternion_xyzw(positions, quaternions)
-        cameras: dict[str, CameraTrack] = {}
-        recorded: dict[str, CameraPose] = {}
-        distortion = 0.0
-        for view in config.views:
-            cameras[view], recorded[view], largest = self._camera(task, number, view, sizes[view], length)
-            distortion = max(distortion, largest)
+        cameras = RecordedCameras()
+        distortion = max(
+            self._add_camera(cameras, view, f"parameters/{task}/{number}/parameters/camera", sizes[view], length)
+            for view in config.views
+        )
         episode = Episode(
+            **config.declared(f"{config.label}-{task}"),
             episode_id=episode_id,
-            source=config.label,
             embodiment=config.embodiment,
-            scene=config.scene or f"{config.label}-{task}",
-            task_family=config.task_family,
             instruction=str(info.get("task_name") or "").strip(),
             outcome=config.outcome,
-            split=config.split,
             fps=config.fps,
             state=state.astype(np.float32),
             action=action.astype(np.float32),
             timestamps=times,
-            cameras=cameras,
+            cameras=cameras.tracks,
             T_base_ee=along_tool_z(ends, config.tool_offset_m),
             gripper=opening,
             primary_view=config.views[0],
-            state_names=_STATE_NAMES,
+            state_names=AGIBOT_STATE_NAMES,
             conventions={
                 "layout": "agibot_world",
                 "tool_offset_m": config.tool_offset_m,
@@ -147,15 +141,13 @@ class AgibotWorldSource:
                 "distortion_not_applied": distortion if not config.distortions else 0.0,
                 "steps": _steps(info),
                 **posture,
-                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+                **cameras.notes(),
             },
         )
         return LoadedEpisode(
             episode,
             config.views,
-            lambda view: decode_video(videos[view], length),
-            no_masks,
-            {view: lens.distortion for view, lens in config.distortions.items()},
+            distortions={view: lens.distortion for view, lens in config.distortions.items()},
             clips={view: VideoClip.whole_file(video, length, config.fps) for view, video in videos.items()},
         )
 
@@ -170,7 +162,7 @@ class AgibotWorldSource:
                 "invalid_gripper",
                 "Effectors are no two grippers",
                 where=f"{path}, {track}/effector/position",
-                expected="2 values a frame, left and right gripper",
+                expected="2 values per frame, left and right gripper",
                 got=f"{effector.shape[1]} (12: dexterous hands)",
                 evidence={"values": int(effector.shape[1])},
             )
@@ -181,24 +173,16 @@ class AgibotWorldSource:
     def _size(self, path: AnyPath) -> tuple[int, int]:
         """(height, width) of a video of the right rate."""
         height, width, rate = video_size(path)
-        if abs(rate - self._config.fps) > 0.02:
-            raise RejectedInputError(
-                "wrong_fps",
-                "Video has another frame rate",
-                where=path,
-                expected=f"{self._config.fps} fps",
-                got=f"{rate:.3f} fps",
-                evidence={"expected_fps": self._config.fps, "found_fps": rate},
-            )
+        check_rate(rate, self._config.fps, path, tolerance=0.02)
         return height, width
 
-    def _camera(
-        self, task: str, number: str, view: str, size: tuple[int, int], length: int
-    ) -> tuple[CameraTrack, CameraPose, float]:
-        """The track, its recorded poses, and the largest recorded distortion coefficient."""
-        folder = f"parameters/{task}/{number}/parameters/camera/{AGIBOT_CAMERAS[view]}"
-        intrinsic_path = inside(self._root, f"{folder}_intrinsic_params.json")
-        extrinsic_path = inside(self._root, f"{folder}_extrinsic_params_aligned.json")
+    def _add_camera(
+        self, cameras: RecordedCameras, view: str, folder: str, size: tuple[int, int], length: int
+    ) -> float:
+        """Add a view's camera; returns its largest recorded distortion coefficient."""
+        name = AGIBOT_CAMERAS[view]
+        intrinsic_path = inside(self._root, f"{folder}/{name}_intrinsic_params.json")
+        extrinsic_path = inside(self._root, f"{folder}/{name}_extrinsic_params_aligned.json")
         record = read_json(intrinsic_path)
         intrinsic = record.get("intrinsic") if isinstance(record, dict) else None
         fx, fy, cx, cy = (_number(intrinsic, key, intrinsic_path) for key in ("fx", "fy", "ppx", "ppy"))
@@ -213,15 +197,10 @@ class AgibotWorldSource:
                 evidence={"view": view, "ppx": cx, "ppy": cy, "width": width, "height": height},
             )
         coefficients = [abs(_number(intrinsic, key, intrinsic_path)) for key in _DISTORTION if key in (intrinsic or {})]
-        pose = camera_pose(
-            view,
-            _extrinsics(extrinsic_path, length),
-            extrinsics="camera_to_base",
-            axes="opencv",
-            where=extrinsic_path,
-        )
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return CameraTrack.from_pose(view, K, pose, width=width, height=height), pose, max(coefficients, default=0.0)
+        matrices = _extrinsics(extrinsic_path, length)
+        pose = camera_pose(view, matrices, extrinsics="camera_to_base", axes="opencv", where=extrinsic_path)
+        cameras.add(view, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), pose, size)
+        return max(coefficients, default=0.0)
 
     def _info(self, task: str, number: str) -> dict[str, Any]:
         """What `task_info` says about an episode; the last task's file is kept, episodes are read in order of tasks."""

@@ -7,7 +7,7 @@
         K: [[910.0, 0.0, 640.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]]
         maps: camera_to_base         # what T maps: camera_to_base or base_to_camera
         axes: opencv                 # opencv (x right, y down, z forward) or opengl (x right, y up, z backward)
-        T: [[...], [...], [...], [0, 0, 0, 1]]        # one matrix of a fixed camera, or a list of one a frame; metres
+        T: [[...], [...], [...], [0, 0, 0, 1]]        # one matrix of a fixed camera, or a list of one per frame; metres
         distortion: {model: radtan, coefficients: [...]}      # only where the images still have it
 
 Instead of T a view may name a feature of the dataset that holds the pose of each frame: `T_feature: {name: ..., format:
@@ -24,19 +24,20 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import StrictModel, read_yaml
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
 from worldline_core.data.episodes.source import LensConfig
-from worldline_core.data.guards.limits import regular_file, too_large
+from worldline_core.data.guards.limits import check_shape, regular_file, too_large
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 MAX_YAML_BYTES = 16 << 20
-"""PyYAML takes about a hundred bytes of memory for each; calibrations of each frame belong into JSON."""
+"""PyYAML takes about a hundred bytes of memory for each; calibrations per frame belong in JSON."""
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -113,9 +114,6 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
 
 
 def _yaml(path: AnyPath) -> Any:
-    from worldline_core.config import read_yaml
-    from worldline_core.errors import ConfigError
-
     file = regular_file(path, "Calibration file")
     size = file.stat().st_size
     if size > MAX_YAML_BYTES:
@@ -175,12 +173,12 @@ def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
             "invalid_extrinsics", "Camera matrices have a wrong shape", where=where, expected="(4, 4)", got=str(error)
         ) from error
     values = values[None] if values.ndim == 2 else values
-    if values.ndim != 3 or values.shape[1:] != (4, 4):
+    if values.shape[1:] != (4, 4):
         raise RejectedInputError(
             "invalid_extrinsics",
             "Camera matrices have a wrong shape",
             where=where,
-            expected="(4, 4), or (N, 4, 4) with one a frame",
+            expected="(4, 4), or (N, 4, 4) with one per frame",
             got=values.shape,
             evidence={"shape": list(values.shape)},
         )
@@ -202,15 +200,7 @@ def _feature_poses(
     """(N or 1, 4, 4); one where all frames agree; None where nothing but zeros is written."""
     values = read_feature(feature.name).astype(np.float64)
     wanted = 6 if feature.format == "xyz_rpy_fixed" else 16
-    if values.shape != (num_frames, wanted):
-        raise RejectedInputError(
-            "length_mismatch",
-            "Camera poses have a wrong shape",
-            where=f"{where}, {feature.name}",
-            expected=(num_frames, wanted),
-            got=values.shape,
-            evidence={"feature": feature.name, "shape": list(values.shape)},
-        )
+    check_shape("Camera pose", f"{where}, {feature.name}", values.shape, (num_frames, wanted))
     if not values.any():
         return None
     if (values == values[0]).all():

@@ -39,7 +39,7 @@ class EpisodeSetSource:
                 "duplicate_id",
                 "Several episodes of the set have this id",
                 where=str(self._set.root),
-                expected="one row an episode",
+                expected="one row per episode",
                 got=f"{self._listed[episode_id]} rows of {episode_id}",
                 evidence={"rows": self._listed[episode_id]},
             )
@@ -47,10 +47,10 @@ class EpisodeSetSource:
         episode = with_rigid_poses(self._set.episode(position))
         if self._name is not None:
             episode = replace(episode, source=self._name)
+        views = self._set.rows[position].views
         return LoadedEpisode(
             episode,
-            self._set.rows[position].views,
-            lambda view: self._set.frames(position, view),
-            lambda view: self._set.robot_masks(position, view),
-            clips={view: self._set.clip(position, view) for view in self._set.rows[position].views},
+            views,
+            robot_masks=lambda view: self._set.robot_masks(position, view),
+            clips={view: self._set.clip(position, view) for view in views},
         )

@@ -1,9 +1,8 @@
 """Foreign LeRobot datasets, v2.1 and v3.0 (Galaxea, RoboCOIN, DROID's port and many more), without our camera sidecar.
 
 LeRobot states neither the unit of joint angles, nor what a gripper reading means, nor where cameras are, so all three are
-declared in the configuration. Without calibration such episodes serve action-free training.
-
-Every LeRobot dataset below a folder: RoboCOIN and Galaxea publish one a task, hundreds of them.
+declared in the configuration. Without calibration such episodes serve action-free training. RoboCOIN and Galaxea publish
+one dataset per task, hundreds of them: a collection reads every dataset below a folder.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
-from worldline_core.data.episodes.source import EVALUATION_ONLY, LoadedEpisode, no_masks, says_droid
+from worldline_core.data.episodes.source import EVALUATION_ONLY, EpisodeSource, LoadedEpisode, says_droid
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
@@ -26,7 +25,8 @@ from worldline_core.data.sources.calibration_file import (
     calibrated_view,
     read_calibration,
 )
-from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, flat_names
+from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, WholeVectors, flat_names
+from worldline_core.data.sources.reading import check_rate
 from worldline_core.errors import ConfigError, DataError
 
 _RATE_TOLERANCE = 1e-2
@@ -67,7 +67,10 @@ class LeRobotSource:
                     expected=", ".join(known[what]),
                     got=", ".join(unknown),
                 )
-        self._arms = None if config.arms is None else ArmVectors(config.arms, features, str(root))
+        arms = config.arms
+        self._columns = (
+            WholeVectors(self._names, config.grippers) if arms is None else ArmVectors(arms, features, str(root))
+        )
         self._calibration: tuple[str, CalibrationFile] | None = None
 
     def episode_ids(self) -> list[str]:
@@ -76,36 +79,36 @@ class LeRobotSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         config, dataset = self._config, self._dataset
         index = int(episode_id.rsplit("-", 1)[1])
-        state, action, overshoot = self._vectors(index)
+        state, action, overshoot = self._columns.read(
+            lambda feature: dataset.column(index, feature), degrees=config.angle_unit == "deg"
+        )
         times = dataset.column(index, "timestamp").reshape(-1).astype(np.float64)
         instruction, tasks = self._instruction(index)
         key_of = {view: key for key, view in config.views.items()}
         clips = {view: dataset.clip(index, key) for view, key in key_of.items()}
         for view, key in key_of.items():
-            self._check_rate(dataset.video_rate(index, key), f"{episode_id}, view {view}")
+            rate = dataset.video_rate(index, key)
+            check_rate(rate, dataset.fps, f"{episode_id}, view {view}", tolerance=_RATE_TOLERANCE * dataset.fps)
         cameras = self._cameras(index, key_of, len(times))
         episode = Episode(
+            **config.declared(self._label),
             episode_id=episode_id,
-            source=config.label,
             embodiment=config.embodiment,
-            scene=config.scene or self._label,
-            task_family=config.task_family,
             instruction=instruction,
             outcome=self._outcome(index),
-            split=config.split,
             fps=dataset.fps,
             state=state,
             action=action,
             timestamps=times - times[0],
             cameras={view: camera.track for view, camera in cameras.items()},
             primary_view=config.primary_view or "head",
-            state_names=self._arms.names if self._arms is not None else tuple(self._names) or None,
+            state_names=self._columns.names,
             conventions={
                 "layout": f"lerobot {dataset.info['codebase_version']}",
                 "declared_angle_unit": config.angle_unit,
                 "gripper_overshoot": overshoot,
                 **({EVALUATION_ONLY: "true"} if self._evaluation_only else {}),
-                **({"action": "repeats the state"} if self._arms is not None and self._arms.repeats_state else {}),
+                **({"action": "repeats the state"} if self._columns.repeats_state else {}),
                 **({"tasks": tasks} if tasks > 1 else {}),
                 **repair_notes({view: camera.pose.repair for view, camera in cameras.items()}),
             },
@@ -113,33 +116,9 @@ class LeRobotSource:
         return LoadedEpisode(
             episode,
             tuple(key_of),
-            lambda view: dataset.frames(index, key_of[view]),
-            no_masks,
-            {view: camera.lens.distortion for view, camera in cameras.items() if camera.lens is not None},
+            distortions={view: camera.lens.distortion for view, camera in cameras.items() if camera.lens is not None},
             clips=clips,
         )
-
-    def _vectors(self, index: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """State and action in the contract's layout, and how many gripper readings were clipped."""
-        if self._arms is not None:
-            degrees = self._config.angle_unit == "deg"
-            return self._arms.read(lambda feature: self._dataset.column(index, feature), degrees=degrees)
-        state, overshoot = self._normalised(self._dataset.column(index, "observation.state"))
-        action, more = self._normalised(self._dataset.column(index, "action"))
-        return state, action, overshoot + more
-
-    def _normalised(self, values: np.ndarray) -> tuple[np.ndarray, int]:
-        result = values.astype(np.float64)
-        result = result[:, None] if result.ndim == 1 else result
-        grippers = [self._names.index(name) for name in self._config.grippers]
-        if self._config.angle_unit == "deg":
-            joints = [column for column in range(result.shape[1]) if column not in grippers]
-            result[:, joints] = np.deg2rad(result[:, joints])
-        overshoot = 0
-        for column, span in zip(grippers, self._config.grippers.values(), strict=True):
-            result[:, column], outside = span.opening(result[:, column])
-            overshoot += outside
-        return result.astype(np.float32), overshoot
 
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
@@ -154,17 +133,6 @@ class LeRobotSource:
         return (
             "success" if bool(self._dataset.column(index, self._config.success_column).reshape(-1)[-1]) else "failure"
         )
-
-    def _check_rate(self, rate: float, where: str) -> None:
-        if abs(rate - self._dataset.fps) > _RATE_TOLERANCE * self._dataset.fps:
-            raise RejectedInputError(
-                "wrong_fps",
-                "Video and dataset differ in frame rate",
-                where=where,
-                expected=f"{self._dataset.fps} fps",
-                got=f"{rate} fps",
-                evidence={"expected_fps": self._dataset.fps, "video_fps": rate},
-            )
 
     def _cameras(self, index: int, key_of: dict[str, str], length: int) -> dict[str, CalibratedView]:
         """Calibrated views; one whose pose was never measured is left out."""
@@ -190,23 +158,12 @@ class LeRobotSource:
                 entry,
                 image_size=self._dataset.image_size(index, key_of[view]),
                 num_frames=length,
-                read_feature=lambda feature: self._pose_column(index, feature, where),
+                read_feature=lambda feature: self._dataset.column(index, feature),
                 where=where,
             )
             for view, entry in self._calibration[1].views.items()
         }
         return {view: camera for view, camera in found.items() if camera is not None}
-
-    def _pose_column(self, index: int, feature: str, where: str) -> np.ndarray:
-        if feature not in self._dataset.features:
-            raise RejectedInputError(
-                "missing_column",
-                "Calibration names a feature that the dataset does not have",
-                where=where,
-                expected=", ".join(self._dataset.features),
-                got=feature,
-            )
-        return self._dataset.column(index, feature)
 
 
 def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: dict[str, Any]) -> bool:
@@ -259,3 +216,8 @@ class LeRobotCollection:
         if episode_id in self._roots:
             self._open(episode_id).episode_ids()  # raises what the listing met
         return self._open(episode_id.rsplit("-", 1)[0]).load(episode_id)
+
+
+def open_lerobot(config: LeRobotSourceConfig, root: AnyPath) -> EpisodeSource:
+    """The dataset, or the collection of datasets, that the configuration names."""
+    return LeRobotCollection(config, root) if config.collection else LeRobotSource(config, root)

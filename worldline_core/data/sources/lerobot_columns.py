@@ -1,9 +1,8 @@
 """Which columns of a LeRobot dataset are an arm's joints and gripper.
 
-LeRobot fixes neither: RoboCOIN has one vector with a name for each column, Galaxea one feature for each arm and gripper.
-What is picked here becomes the state of the contract: for each arm in order joints [rad], then gripper opening.
-
-What a LeRobot dataset does not say about itself and the user therefore declares.
+LeRobot fixes neither: RoboCOIN has one vector with a name per column, Galaxea one feature per arm and gripper. What is
+picked here becomes the state of the contract: for each arm in order joints [rad], then gripper opening. The configuration
+also declares whatever else a LeRobot dataset does not say about itself.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -163,19 +163,38 @@ class ArmVectors:
 
         Raises: RejectedInputError (length_mismatch) where a feature has another width than the dataset says.
         """
-        cached: dict[str, np.ndarray] = {}
-
-        def column(feature: str) -> np.ndarray:
-            if feature not in cached:
-                values = read(feature).astype(np.float64)
-                cached[feature] = values[:, None] if values.ndim == 1 else values
-            return cached[feature]
-
+        column = cache(lambda feature: _matrix(read(feature)))
         state, overshoot = _vector(self._state, column, degrees)
         if self.repeats_state:
             return state, state.copy(), overshoot
         action, more = _vector(self._action, column, degrees)
         return state, action, overshoot + more
+
+
+class WholeVectors:
+    """Takes state and action whole, with the named columns as grippers."""
+
+    repeats_state = False
+
+    def __init__(self, names: list[str], grippers: Mapping[str, GripperRange]) -> None:
+        self.names = tuple(names) or None
+        self._grippers = {names.index(name): span for name, span in grippers.items()}
+
+    def read(self, read: ReadColumn, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
+        """As `ArmVectors.read`."""
+        state, overshoot = self._track(_matrix(read("observation.state")), degrees)
+        action, more = self._track(_matrix(read("action")), degrees)
+        return state, action, overshoot + more
+
+    def _track(self, values: np.ndarray, degrees: bool) -> tuple[np.ndarray, int]:
+        parts = [Picked("", (column,), self._grippers.get(column)) for column in range(values.shape[1])]
+        return _vector(parts, lambda _: values, degrees)
+
+
+def _matrix(values: np.ndarray) -> np.ndarray:
+    """(N,) or (N, D) as (N, D) float64."""
+    values = values.astype(np.float64)
+    return values[:, None] if values.ndim == 1 else values
 
 
 def _pick(track: ArmTrack, features: Mapping[str, Mapping[str, Any]], where: str) -> list[Picked]:

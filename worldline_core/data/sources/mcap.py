@@ -1,10 +1,9 @@
-"""MCAP files written by `worldline_core.data.mcap.io`, one episode a file.
+"""MCAP files: those written by this project, one episode per file, and recordings of other tools (ROS 2, Foxglove).
 
-MCAP recordings of other tools (ROS 2, Foxglove), brought to a fixed rate.
-
-Topics are declared (`McapTopicsSourceConfig`), nothing is guessed. Every instant gets the nearest image of each view,
-joints and poses between their neighbours, transforms by slerp; how far off in time that is, what was out of order, lost
-or timed by another clock is written into the episode's conventions. See docs/mcap.md.
+Of the latter, topics are declared (`McapTopicsSourceConfig`), nothing is guessed, and the recording is brought to a fixed
+rate: every instant gets the nearest image of each view, joints and poses between their neighbours, transforms by slerp.
+How far off in time that is, what was out of order, lost or timed by another clock is written into the episode's
+conventions. See docs/mcap.md.
 """
 
 from __future__ import annotations

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from worldline_core.data.episodes.source import EpisodeSource
+from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
 from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
 from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, DroidAnnotationSourceConfig
 from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
-from worldline_core.data.sources.lerobot import LeRobotCollection, LeRobotSource, LeRobotSourceConfig
+from worldline_core.data.sources.lerobot import LeRobotSourceConfig, open_lerobot
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapTopicsSource, McapTopicsSourceConfig
-from worldline_core.data.sources.repaired import PinholeSource, RepairedSource
+from worldline_core.data.sources.repaired import repair, undistorted
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
@@ -35,37 +37,38 @@ SourceConfig = Annotated[
 ]
 
 
+_READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
+    EpisodeSetSourceConfig: EpisodeSetSource,
+    LeRobotSourceConfig: open_lerobot,
+    AgibotGesimSourceConfig: AgibotGesimSource,
+    AgibotWorldSourceConfig: AgibotWorldSource,
+    DroidAnnotationSourceConfig: DroidAnnotationSource,
+    McapSourceConfig: McapSource,
+    McapTopicsSourceConfig: McapTopicsSource,
+    RobomindSourceConfig: RobomindSource,
+    RobotwinSourceConfig: RobotwinSource,
+    VideoFolderSourceConfig: VideoFolderSource,
+}
+
+
 def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
-    """The reader of a configured source: it repairs what the configuration declares as departing from the contract, and
-    takes out lens distortion.
+    """The reader of a configured source. Its episodes keep the contract's conventions, whatever the configuration declares
+    as departing from them, and are those of pinhole cameras.
 
     Raises: DataError when the folder is missing or not of that kind.
     """
     if not exists(root):
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
-    source = _reader(config, root)
-    return PinholeSource(RepairedSource(source, config.conventions) if config.conventions.departures else source)
+    return _RepairedSource(_READERS[type(config)](config, root), config.conventions)
 
 
-def _reader(config: SourceConfig, root: AnyPath) -> EpisodeSource:
-    match config:
-        case EpisodeSetSourceConfig():
-            return EpisodeSetSource(config, root)
-        case LeRobotSourceConfig():
-            return LeRobotCollection(config, root) if config.collection else LeRobotSource(config, root)
-        case AgibotGesimSourceConfig():
-            return AgibotGesimSource(config, root)
-        case AgibotWorldSourceConfig():
-            return AgibotWorldSource(config, root)
-        case DroidAnnotationSourceConfig():
-            return DroidAnnotationSource(config, root)
-        case McapSourceConfig():
-            return McapSource(config, root)
-        case McapTopicsSourceConfig():
-            return McapTopicsSource(config, root)
-        case RobomindSourceConfig():
-            return RobomindSource(config, root)
-        case RobotwinSourceConfig():
-            return RobotwinSource(config, root)
-        case VideoFolderSourceConfig():
-            return VideoFolderSource(config, root)
+class _RepairedSource:
+    def __init__(self, source: EpisodeSource, conventions: RecordedConventions) -> None:
+        self._source = source
+        self._conventions = conventions
+
+    def episode_ids(self) -> list[str]:
+        return self._source.episode_ids()
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        return undistorted(repair(self._source.load(episode_id), self._conventions))

@@ -1,4 +1,4 @@
-"""RoboMIND 1 and 2: one HDF5 file an episode, images as JPEG bytes, joints of the robot (puppet) and of what leads it (master).
+"""RoboMIND 1 and 2: one HDF5 file per episode, images as JPEG bytes, joints of the robot (puppet) and of what leads it (master).
 
     <robot>/<task>/success_episodes/[train|val/]<episode>/data/trajectory.hdf5
     version 1: observations/rgb_images/<camera>, {puppet,master}/joint_position[_left,_right]
@@ -11,7 +11,6 @@ rate of the images, in tracks of different lengths) and robots with dexterous ha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import PurePosixPath
 from typing import Literal
 
@@ -19,18 +18,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.episodes.source import (
-    ForeignSourceConfig,
-    GripperRange,
-    LoadedEpisode,
-    no_masks,
-    printable,
-    unique_names,
-)
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LoadedEpisode
 from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
-from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS, ArmPlace, RobomindLayout, Track
+from worldline_core.data.sources.reading import file_ids, joint_names, printable
+from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS, RobomindLayout, Track
 from worldline_core.data.sources.video_folder import caption_table
 
 LayoutName = Literal[
@@ -101,7 +94,7 @@ class RobomindSource:
         self._layout: RobomindLayout = ROBOMIND_LAYOUTS[config.layout]
         self._root = root
         found = [relative_name(path, root) for path in find_files(root, _FILE)]
-        self._files = unique_names({str(file): "-".join([config.label, *_episode_parts(file)]) for file in found})
+        self._files = file_ids(config.label, {str(file): _episode_parts(file) for file in found})
         table = config.instructions
         self._instructions = None if table is None else caption_table(inside(root, table), "task", "instruction")
 
@@ -116,42 +109,42 @@ class RobomindSource:
         with open_hdf5(path) as file:
             state, overshoot = self._vector(file, path, "puppet")
             action, more = (state, 0) if config.command == "puppet" else self._vector(file, path, "master")
-            self._check_images(file, path, views)
-            recorded = self._recorded(file)
+            self._check_compression(file, path)
+            file.require_cameras(layout.images, views)
+            # Who collected it: some stations recorded the arms exchanged.
+            collector = file.attribute("metadata", "collector") if layout.version == 2 else None
             text = self._text(file, relative, path)
-        names = [
-            f"{arm.name}/{name}"
+        names = tuple(
+            name
             for arm in layout.arms
-            for name in (*(f"joint_{i + 1}" for i in range(arm.num_joints)), *(("gripper",) if arm.gripper else ()))
-        ]
+            for name in joint_names({arm.name: arm.num_joints}, gripper=arm.gripper is not None)
+        )
         episode = Episode(
+            **config.declared("-".join([config.label, *_task_parts(PurePosixPath(relative))])),
             episode_id=episode_id,
-            source=config.label,
             embodiment=config.embodiment or layout.embodiment,
-            scene=config.scene or "-".join([config.label, *_task_parts(PurePosixPath(relative))]),
-            task_family=config.task_family,
             instruction=text,
             outcome=_outcome(relative, config.outcome),
-            split=config.split,
             fps=config.fps,
             state=state,
             action=action,
             timestamps=np.arange(len(state)) / config.fps,
             primary_view=next(iter(views)),
-            state_names=tuple(names),
+            state_names=names,
             conventions={
                 "layout": f"robomind {layout.version}",
                 "gripper_overshoot": overshoot + more,
                 **({"action": "repeats the state"} if config.command == "puppet" else {}),
-                **recorded,
+                **({} if collector is None else {"collector": collector}),
             },
         )
         channels: Channels = config.channels or layout.channels or "standard"
 
-        def images(view: str) -> Iterator[np.ndarray]:
-            return hdf5_images(path, f"{layout.images}/{views[view]}", len(state), channels)
-
-        return LoadedEpisode(episode, tuple(views), lambda view: np.stack(list(images(view))), no_masks, images=images)
+        return LoadedEpisode(
+            episode,
+            tuple(views),
+            lambda view: hdf5_images(path, f"{layout.images}/{views[view]}", len(state), channels),
+        )
 
     def _vector(self, file: Hdf5File, path: AnyPath, track: Track) -> tuple[np.ndarray, int]:
         """(N, J) float32 in the contract's layout, and how many gripper readings were clipped."""
@@ -162,7 +155,15 @@ class RobomindSource:
             key = arm.joints.format(track=track)
             width = file.width(key)
             if width not in arm.widths:
-                raise _other_width(path, key, arm, width)
+                raise RejectedInputError(
+                    "length_mismatch",
+                    "Joints have another number of columns than this robot's",
+                    where=f"{path}, {key}",
+                    expected=" or ".join(map(str, arm.widths)),
+                    got=width,
+                    next_step="check curate.sources[].layout: each robot has a folder and a layout of its own",
+                    evidence={"expected": list(arm.widths), "found": width},
+                )
             values = file.array(key, (length, width))
             length = len(values)
             blocks.append(values[:, arm.start : arm.start + arm.num_joints])
@@ -182,14 +183,14 @@ class RobomindSource:
                 "invalid_gripper",
                 "End effector is no gripper of one value",
                 where=f"{path}, {key}",
-                expected="1 value a frame",
+                expected="1 value per frame",
                 got=f"{width} (a dexterous hand?)",
                 evidence={"values": width},
             )
         values = file.array(key, (length,) if file.is_flat(key) else (length, width)).reshape(length, -1)
         return values[:, column : column + 1]
 
-    def _check_images(self, file: Hdf5File, path: AnyPath, views: dict[str, str]) -> None:
+    def _check_compression(self, file: Hdf5File, path: AnyPath) -> None:
         compressed = file.attribute("/", "compress") if self._layout.version == 1 else None
         if compressed is not None and compressed not in ("True", "1"):
             raise RejectedInputError(
@@ -199,24 +200,6 @@ class RobomindSource:
                 expected="True: encoded images",
                 got=compressed,
             )
-        found = file.names(self._layout.images)
-        missing = [view for view, camera in views.items() if camera not in found]
-        if missing:
-            raise RejectedInputError(
-                "missing_view",
-                "File lacks a camera",
-                where=f"{path}, {self._layout.images}",
-                expected=", ".join(views[view] for view in missing),
-                got=", ".join(found) or "none",
-                evidence={"missing": missing, "found": found},
-            )
-
-    def _recorded(self, file: Hdf5File) -> dict[str, str]:
-        """What version 2 says of a recording: who collected it (some stations recorded the arms exchanged)."""
-        if self._layout.version == 1:
-            return {}
-        collector = file.attribute("metadata", "collector")
-        return {} if collector is None else {"collector": collector}
 
     def _text(self, file: Hdf5File, relative: str, path: AnyPath) -> str:
         if self._instructions is not None:
@@ -238,13 +221,14 @@ class RobomindSource:
 def _episode_parts(file: PurePosixPath) -> tuple[str, ...]:
     """The path that names an episode: without the file's own name and the folder `data`, the same for all."""
     parts = file.parts[:-1]
-    return tuple(printable(part) for part in (parts[:-1] if parts and parts[-1] == "data" else parts))
+    return parts[:-1] if parts and parts[-1] == "data" else parts
 
 
 def _task_parts(file: PurePosixPath) -> tuple[str, ...]:
     """The folders down to the task's: what stands before `success_episodes`, else all but the episode's own."""
     parts = _episode_parts(file)
-    return parts[: parts.index(_SUCCESS)] if _SUCCESS in parts else parts[:-1]
+    named = parts[: parts.index(_SUCCESS)] if _SUCCESS in parts else parts[:-1]
+    return tuple(map(printable, named))
 
 
 def _outcome(relative: str, declared: str) -> str:
@@ -254,15 +238,3 @@ def _outcome(relative: str, declared: str) -> str:
     if _SUCCESS in parts:
         return "success"
     return "failure" if any(part.lower().startswith(_FAILURE) for part in parts[:-2]) else "unknown"
-
-
-def _other_width(path: AnyPath, key: str, arm: ArmPlace, width: int) -> RejectedInputError:
-    return RejectedInputError(
-        "length_mismatch",
-        "Joints have another number of columns than this robot's",
-        where=f"{path}, {key}",
-        expected=" or ".join(map(str, arm.widths)),
-        got=width,
-        next_step="check curate.sources[].layout: each robot has a folder and a layout of its own",
-        evidence={"expected": list(arm.widths), "found": width},
-    )

@@ -11,31 +11,27 @@ repeats it. Images are JPEG files that OpenCV wrote from RGB arrays, so their ch
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as, repair_notes
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
     EvaluationSourceConfig,
     GripperRange,
     LoadedEpisode,
-    no_masks,
 )
 from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.images import image_size
 from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.geometry.cameras import CameraPose
+from worldline_core.data.sources.reading import by_number, file_ids, joint_names
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
-_DIGITS = re.compile(r"(\d+)")
 _ARMS = ("left", "right")
 _GRIPPER = GripperRange(closed=0.0, open=1.0)
 _MAX_DISAGREEMENT = 1e-3
@@ -67,17 +63,16 @@ class RobotwinSource:
         require_h5py()
         self._config = config
         self._root = root
-        found = find_files(root, "episode*.hdf5")
-        self._files = {"-".join([config.label, *relative_name(p, root).with_suffix("").parts]): p for p in found}
+        found = [relative_name(path, root) for path in find_files(root, "episode*.hdf5")]
+        self._files = file_ids(config.label, {str(file): file.with_suffix("").parts for file in found})
 
     def episode_ids(self) -> list[str]:
-        return sorted(self._files, key=lambda name: [int(t) if t.isdigit() else t for t in _DIGITS.split(name)])
+        return sorted(self._files, key=by_number)
 
     def load(self, episode_id: str) -> LoadedEpisode:
         config = self._config
-        path = inside(self._root, str(relative_name(self._files[episode_id], self._root)))
-        cameras: dict[str, CameraTrack] = {}
-        recorded: dict[str, CameraPose] = {}
+        path = inside(self._root, self._files[episode_id])
+        cameras = RecordedCameras()
         with open_hdf5(path) as file:
             ends, grippers, blocks = [], [], []
             length = len(file.array("endpose/left_endpose", (None, 7)))
@@ -88,99 +83,47 @@ class RobotwinSource:
                     ends.append(pose_from_quaternion_wxyz(end[:, :3], end[:, 3:]))
                 grippers.append(file.array(f"endpose/{arm}_gripper", (length,)))
                 blocks.append((joints, file.array(f"joint_action/{arm}_gripper", (length,))))
-
+            file.require_cameras("observation", config.views)
             for view, camera in config.views.items():
-                cameras[view], recorded[view] = self._camera(file, path, view, camera, length)
+                _add_camera(cameras, file, path, view, f"observation/{camera}", length)
         opening, overshoot = _GRIPPER.opening(np.stack(grippers, axis=1))
         clipped = [(joints, *_GRIPPER.opening(gripper)) for joints, gripper in blocks]
         state = np.concatenate([part for joints, grip, _ in clipped for part in (joints, grip[:, None])], axis=1)
-        names = [
-            f"{arm}/{name}"
-            for arm, (joints, _) in zip(_ARMS, blocks, strict=True)
-            for name in (*(f"joint_{j + 1}" for j in range(joints.shape[1])), "gripper")
-        ]
+        names = joint_names({arm: joints.shape[1] for arm, (joints, _) in zip(_ARMS, blocks, strict=True)})
         # From between the fingertips, with +z out of the gripper, to the recorded end pose.
         T_end_tool = _END_FROM_TOOL.copy()
         T_end_tool[0, 3] = config.tool_offset_m
         setting = "-".join(relative_name(path, self._root).parts[:-2])
         episode = Episode(
+            **config.declared(f"{config.label}-{setting}-{path.stem}"),
             episode_id=episode_id,
-            source=config.label,
             embodiment=config.embodiment,
-            scene=config.scene or f"{config.label}-{setting}-{path.stem}",
-            task_family=config.task_family,
             instruction=self._instruction(path),
             outcome=config.outcome,
-            split=config.split,
             fps=config.fps,
             state=state.astype(np.float32),
             action=state.astype(np.float32),
             timestamps=np.arange(length) / config.fps,
-            cameras=cameras,
+            cameras=cameras.tracks,
             T_base_ee=np.stack(ends, axis=1) @ T_end_tool,
             gripper=opening,
             primary_view=next(iter(config.views)),
-            state_names=tuple(names),
+            state_names=names,
             conventions={
                 "layout": EVALUATION_LAYOUTS[1],
                 "action": "repeats the state: one joint track is recorded",
                 "base_frame": "world of the simulation",
                 "tool_offset_m": config.tool_offset_m,
                 "gripper_overshoot": overshoot + sum(count for *_, count in clipped),
-                **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+                **cameras.notes(),
             },
         )
 
-        def images(view: str) -> Iterator[np.ndarray]:
-            return hdf5_images(path, f"observation/{config.views[view]}/rgb", length, config.channels)
-
         return LoadedEpisode(
-            episode, tuple(config.views), lambda view: np.stack(list(images(view))), no_masks, images=images
+            episode,
+            tuple(config.views),
+            lambda view: hdf5_images(path, f"observation/{config.views[view]}/rgb", length, config.channels),
         )
-
-    def _camera(
-        self, file: Hdf5File, path: AnyPath, view: str, camera: str, length: int
-    ) -> tuple[CameraTrack, CameraPose]:
-        group = f"observation/{camera}"
-        found = file.names("observation")
-        if camera not in found:
-            raise RejectedInputError(
-                "missing_view",
-                "File lacks a camera",
-                where=path,
-                expected=camera,
-                got=", ".join(found) or "none",
-                evidence={"missing": [view], "found": found},
-            )
-        first = next(file.image_files(f"{group}/rgb", length))
-        intrinsics = file.array(f"{group}/intrinsic_cv", (length, 3, 3))
-        if np.ptp(intrinsics, axis=0).max() > 1e-6:
-            raise RejectedInputError(
-                "singular_intrinsics",
-                "Camera matrix changes during the episode",
-                where=f"{path}, {group}/intrinsic_cv",
-                expected="one K an episode",
-                got=f"changes of up to {np.ptp(intrinsics, axis=0).max():.3g} pixels",
-                evidence={"view": view, "largest_change": float(np.ptp(intrinsics, axis=0).max())},
-            )
-        world_to_camera = np.tile(np.eye(4), (length, 1, 1))
-        world_to_camera[:, :3] = file.array(f"{group}/extrinsic_cv", (length, 3, 4))
-        where = f"{path}, {group}/extrinsic_cv"
-        pose = camera_pose(view, world_to_camera, extrinsics="base_to_camera", axes="opencv", where=where)
-        model = file.array(f"{group}/cam2world_gl", (length, 4, 4))
-        other = camera_pose(view, model, axes="opengl", where=f"{path}, {group}/cam2world_gl")
-        disagreement = float(np.abs(pose.T_base_camera - other.T_base_camera).max())
-        if disagreement > _MAX_DISAGREEMENT:
-            raise RejectedInputError(
-                "invalid_extrinsics",
-                "The two recorded camera matrices disagree",
-                where=where,
-                expected="extrinsic_cv = the inverse of cam2world_gl, up to the axes",
-                got=f"{disagreement:.3g} apart",
-                evidence={"view": view, "disagreement": disagreement, "largest_allowed": _MAX_DISAGREEMENT},
-            )
-        height, width = image_size(first, f"{path}, {group}/rgb, frame 0")
-        return CameraTrack.from_pose(view, intrinsics[0], pose, width=width, height=height), pose
 
     def _instruction(self, path: AnyPath) -> str:
         """The first of the seen instructions; they are generated apart from the recording and may not be there."""
@@ -195,3 +138,35 @@ class RobotwinSource:
                 "missing_column", "Instructions lack the seen ones", where=file, expected='{"seen": [...]}', got=record
             )
         return str(seen[0])
+
+
+def _add_camera(cameras: RecordedCameras, file: Hdf5File, path: AnyPath, view: str, group: str, length: int) -> None:
+    first = next(file.image_files(f"{group}/rgb", length))
+    intrinsics = file.array(f"{group}/intrinsic_cv", (length, 3, 3))
+    change = float(np.ptp(intrinsics, axis=0).max())
+    if change > 1e-6:
+        raise RejectedInputError(
+            "singular_intrinsics",
+            "Camera matrix changes during the episode",
+            where=f"{path}, {group}/intrinsic_cv",
+            expected="one K per episode",
+            got=f"changes of up to {change:.3g} pixels",
+            evidence={"view": view, "largest_change": change},
+        )
+    world_to_camera = np.tile(np.eye(4), (length, 1, 1))
+    world_to_camera[:, :3] = file.array(f"{group}/extrinsic_cv", (length, 3, 4))
+    where = f"{path}, {group}/extrinsic_cv"
+    pose = camera_pose(view, world_to_camera, extrinsics="base_to_camera", axes="opencv", where=where)
+    model = file.array(f"{group}/cam2world_gl", (length, 4, 4))
+    other = camera_pose(view, model, axes="opengl", where=f"{path}, {group}/cam2world_gl")
+    disagreement = float(np.abs(pose.T_base_camera - other.T_base_camera).max())
+    if disagreement > _MAX_DISAGREEMENT:
+        raise RejectedInputError(
+            "invalid_extrinsics",
+            "The two recorded camera matrices disagree",
+            where=where,
+            expected="extrinsic_cv = the inverse of cam2world_gl, up to the axes",
+            got=f"{disagreement:.3g} apart",
+            evidence={"view": view, "disagreement": disagreement, "largest_allowed": _MAX_DISAGREEMENT},
+        )
+    cameras.add(view, intrinsics[0], pose, image_size(first, f"{path}, {group}/rgb, frame 0"))

@@ -22,13 +22,14 @@ from pydantic import Field
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode, no_masks, printable, unique_names
+from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode
 from worldline_core.data.guards.limits import MAX_TEXT_BYTES, regular_file, too_large
 from worldline_core.data.guards.plain_files import read_json, read_json_lines
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.sources.reading import file_ids, printable
 from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import decode_video, frame_times, video_size
+from worldline_core.data.video.decode import frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
 
 MAX_CAPTION_BYTES = 1 << 16
@@ -147,9 +148,7 @@ class VideoFolderSource:
         self._root = root
         suffixes = {suffix.lower() for suffix in config.suffixes}
         found = [str(relative_name(p, root)) for p in find_files(root, "*") if p.suffix.lower() in suffixes]
-        self._files = unique_names(
-            {file: "-".join([config.label, *PurePosixPath(printable(file)).with_suffix("").parts]) for file in found}
-        )
+        self._files = file_ids(config.label, {file: PurePosixPath(file).with_suffix("").parts for file in found})
         table = config.captions
         self._captions = None if table is None else caption_table(inside(root, table.file), table.video, table.caption)
 
@@ -167,14 +166,11 @@ class VideoFolderSource:
         folder = PurePosixPath(relative).parent.parts
         nothing = np.zeros((len(times), 0), dtype=np.float32)
         episode = Episode(
+            **config.declared("-".join([config.label, *folder])),
             episode_id=episode_id,
-            source=config.label,
             embodiment=config.embodiment,
-            scene=config.scene or "-".join([config.label, *folder]),
-            task_family=config.task_family,
             instruction=self._caption(relative, path),
             outcome=config.outcome,
-            split=config.split,
             fps=rate,
             state=nothing,
             action=nothing,
@@ -183,13 +179,7 @@ class VideoFolderSource:
             state_kind="none",
             conventions={"layout": "video_folder", "file": printable(relative)},
         )
-        return LoadedEpisode(
-            episode,
-            (config.view,),
-            lambda view: decode_video(path, len(times)),
-            no_masks,
-            clips={config.view: VideoClip.whole_file(path, len(times), rate)},
-        )
+        return LoadedEpisode(episode, (config.view,), clips={config.view: VideoClip.whole_file(path, len(times), rate)})
 
     def _caption(self, relative: str, path: AnyPath) -> str:
         if self._captions is None:
