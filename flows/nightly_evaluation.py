@@ -6,7 +6,7 @@ from pathlib import Path
 
 from prefect import flow, task
 
-from tasks.artifact_task import ArtifactReference, artifact_task
+from tasks.run_nodes import run_nodes
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
@@ -28,11 +28,6 @@ def nightly_evaluation(
 ) -> Path:
     """Rollouts and evaluations of the shipped checkpoints; returns the folder of the comparison."""
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
-    done: dict[str, ArtifactReference] = {}
-    for node in without_training(plan(settings, Path.cwd())):
-        inputs = {name: done[source] if isinstance(source, str) else source for name, source in node.inputs.items()}
-        done[node.name] = artifact_task(node.step)(
-            node.config, inputs, store_root=artifacts.resolve(), name=node.name, runner=settings.runner
-        )
+    done = run_nodes(without_training(plan(settings, Path.cwd())), artifacts.resolve(), settings.runner)
     scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
     return compare_nights(scores, artifacts.resolve() / "nightly")

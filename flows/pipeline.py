@@ -6,7 +6,9 @@ from pathlib import Path
 
 from prefect import flow
 
-from tasks.artifact_task import ArtifactReference, artifact_task
+from tasks.artifact_task import ArtifactReference
+from tasks.run_nodes import run_nodes
+from tasks.run_page import RunPage
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
@@ -21,13 +23,10 @@ def pipeline(
 ) -> ArtifactReference:
     """Curate, filter, render actions, encode latents, train, distill, roll out, evaluate, report.
 
-    Each node of the plan is one Prefect task; finished artifacts are found, not made again. Returns the report.
+    Each node of the plan is one Prefect task; finished artifacts are found, not made again. From the first finished node
+    on ``artifacts/report/latest`` shows how far the run is; in the end it leads to the report. Returns the report.
     """
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
-    done: dict[str, ArtifactReference] = {}
-    for node in plan(settings, Path.cwd()):
-        inputs = {name: done[source] if isinstance(source, str) else source for name, source in node.inputs.items()}
-        done[node.name] = artifact_task(node.step)(
-            node.config, inputs, store_root=artifacts.resolve(), name=node.name, runner=settings.runner
-        )
-    return done["report"]
+    nodes = plan(settings, Path.cwd())
+    with RunPage(artifacts.resolve(), [node.name for node in nodes]) as page:
+        return run_nodes(nodes, artifacts.resolve(), settings.runner, page)["report"]

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from prefect import Task
 from prefect.cache_policies import CachePolicy
 from prefect.context import TaskRunContext
+from prefect.futures import PrefectFuture
+from prefect.task_runners import TaskRunner
 
+from tasks.command_line import log_to_stderr
 from tasks.shard_mapper import shard_mapper
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
@@ -56,18 +64,54 @@ class ArtifactTask:
     ) -> ArtifactReference:
         """Run the step (or find it done). ``name`` is what Prefect shows; the step's name by default. ``runner`` says
         where a step that maps its episodes works on them."""
+        task, parameters, _ = self._prepared(config, inputs, store_root, name, runner)
+        return ArtifactReference.model_validate(task(**parameters))
+
+    def start(
+        self,
+        config: StrictModel,
+        inputs: Mapping[str, Path | ArtifactReference],
+        *,
+        store_root: Path,
+        name: str,
+        runner: RunnerConfig,
+        pool: Callable[[], TaskRunner[Any]] | None,
+        after: Sequence[PrefectFuture[Any]] = (),
+    ) -> tuple[PrefectFuture[Any] | ArtifactReference, bool]:
+        """Start the step in a pool's process, or, where it is finished or there is no pool, do it here and now.
+
+        Args:
+            after: finished tasks whose artifacts it uses, so that Prefect shows what depends on what.
+
+        Returns:
+            The running task, or the artifact; and whether the artifact was there already.
+        """
+        task, parameters, finished = self._prepared(config, inputs, store_root, name, runner)
+        if pool is None or finished:
+            return ArtifactReference.model_validate(task(**parameters, wait_for=after)), finished
+        return pool().submit(task, parameters, wait_for=after), False
+
+    def _prepared(
+        self,
+        config: StrictModel,
+        inputs: Mapping[str, Path | ArtifactReference],
+        store_root: Path,
+        name: str | None,
+        runner: RunnerConfig | None,
+    ) -> tuple[Task[..., dict[str, Any]], dict[str, Any], bool]:
+        """Prefect's task, its parameters, and whether the store has the artifact."""
         store = ArtifactStore(store_root)
         references = {key: _reference(value, store) for key, value in inputs.items()}
         finished = store.find(self.step.name, _key(store, self.step, config, references)) is not None
-        runnable = self._task.with_options(refresh_cache=not finished, task_run_name=name or self.step.name)
-        result = runnable(
-            self.step.name,
-            config.model_dump(mode="json"),
-            {key: value.model_dump(mode="json") for key, value in references.items()},
-            str(store.root),
-            (runner or RunnerConfig()).model_dump(mode="json"),
-        )
-        return ArtifactReference.model_validate(result)
+        task = self._task.with_options(refresh_cache=not finished, task_run_name=name or self.step.name)
+        parameters = {
+            "step_name": self.step.name,
+            "config": config.model_dump(mode="json"),
+            "inputs": {key: value.model_dump(mode="json") for key, value in references.items()},
+            "store_root": str(store.root),
+            "runner": (runner or RunnerConfig()).model_dump(mode="json"),
+        }
+        return task, parameters, finished
 
 
 def _run_step(
@@ -78,11 +122,27 @@ def _run_step(
     runner: dict[str, Any],
 ) -> dict[str, Any]:
     """The body of every task: plain JSON in and out, so that any task runner can carry it."""
+    if multiprocessing.parent_process() is not None:
+        _end_with_parent()
+        log_to_stderr()
     folders = {name: parse_location(value["path"]) for name, value in inputs.items()}
     model = get_step(step_name).load_config().model_validate(config)
     mapper = shard_mapper(RunnerConfig.model_validate(runner))
     artifact = run_step(ArtifactStore(Path(store_root)), step_name, model, folders, mapper)
     return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest).model_dump(mode="json")
+
+
+@functools.cache
+def _end_with_parent() -> None:
+    """Let this process of a pool end when the one that started it has ended: killed, it cannot say so."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="end with parent", daemon=True).start()
 
 
 def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TextIO
 
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, WorldLineError
@@ -100,7 +101,7 @@ def print_artifact(artifact: Artifact) -> None:
 
 def exit_with_clear_errors(action: Callable[[], object]) -> None:
     """Run a command; a WorldLineError is printed without a traceback and ends it with status 1."""
-    _log_to_stderr()
+    log_to_stderr()
     try:
         action()
     except WorldLineError as error:
@@ -108,9 +109,17 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
         raise SystemExit(1) from error
 
 
-def _log_to_stderr() -> None:
+class _StderrHandler(logging.StreamHandler[TextIO]):
+    """Prints a message unless Prefect, which gives the root logger a handler of its own when it is imported, prints it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not any(type(handler).__name__ == "PrefectConsoleHandler" for handler in logging.getLogger().handlers):
+            super().emit(record)
+
+
+def log_to_stderr() -> None:
     """Show this project's messages; Prefect and the libraries keep their own handlers."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _StderrHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(asctime)s | %(levelname)-7s | %(message)s", datefmt="%H:%M:%S"))
     for name in ("worldline_core", "tasks", "flows"):
         project_logger = logging.getLogger(name)

@@ -32,7 +32,7 @@ _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
 )
 """How the runners say that a worker ended without an answer (concurrent.futures, distributed, ray)."""
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def shard_mapper(config: RunnerConfig) -> ShardMapper:
@@ -115,7 +115,7 @@ class PrefectMapper:
         )
         token = _round.set(_Round(waiting, hand_out, take, limit))
         try:
-            with _single_threaded_children():
+            with limited_threads(1):
                 shards()
         finally:
             _round.reset(token)
@@ -135,7 +135,7 @@ class PrefectMapper:
             case "ray":
                 return _ray_runner(workers, self.config.address)
             case _:
-                return _process_runner(workers)
+                return process_runner(workers)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,8 @@ def _outcome[J: Job](job: J, future: Any) -> Outcome[J, Any]:
         return Outcome(job, error=died)
 
 
-def _process_runner(workers: int) -> Any:
+def process_runner(workers: int) -> Any:
+    """Prefect's pool of processes of this machine."""
     from prefect.task_runners import ProcessPoolTaskRunner
 
     class ProcessRunner(ProcessPoolTaskRunner):
@@ -255,10 +256,10 @@ def _missing(extra: str, error: ImportError) -> UnavailableError:
 
 
 @contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Processes that are started within inherit one thread each for linear algebra; read when they import numpy."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+def limited_threads(threads: int) -> Iterator[None]:
+    """Processes that are started within have this many threads for linear algebra; read when they import numpy."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     try:
         yield
     finally:

@@ -196,6 +196,8 @@ def load_config[Model: BaseModel](
 ) -> Model:
     """Load a preset or a file, apply overrides, and validate.
 
+    A file may begin with ``extends: PRESET``: it then states only what differs from that preset.
+
     ``section`` picks one top-level mapping of the file (a single step's config out of a whole preset); overrides are
     still written from the top (``train_stage2.steps=10``).
 
@@ -207,12 +209,36 @@ def load_config[Model: BaseModel](
     source = preset_path(preset) if preset is not None else path
     if source is None:
         raise ConfigError("No configuration given")
-    values = apply_overrides(read_yaml(source), overrides)
+    values = apply_overrides(_with_extended(source), overrides)
     if section is not None:
         values = values.get(section) or {}
         if not isinstance(values, Mapping):
             raise ConfigError("A section is a mapping", where=f"{source}: {section}", got=type(values).__name__)
     return validate(model, values, where=source if section is None else f"{source}: {section}")
+
+
+def _with_extended(source: Path) -> dict[str, Any]:
+    """The values of a file over those of the preset that it extends. Mappings are merged, null takes a key away."""
+    values = read_yaml(source)
+    if "extends" not in values:
+        return values
+    base = preset_path(str(values.pop("extends")))
+    if base.resolve() == source.resolve():
+        raise ConfigError("A preset cannot extend itself", where=source, got=f"extends: {base.stem}")
+    return _merged(_with_extended(base), values)
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, change in changes.items():
+        below = result.get(key)
+        if change is None:
+            result.pop(key, None)
+        elif isinstance(change, Mapping) and isinstance(below, Mapping):
+            result[key] = _merged(below, change)
+        else:
+            result[key] = change
+    return result
 
 
 class StrictModel(BaseModel):

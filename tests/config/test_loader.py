@@ -18,6 +18,7 @@ from worldline_core.config import (
     validate,
 )
 from worldline_core.errors import ConfigError
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 
 
 class Inner(StrictModel):
@@ -134,3 +135,21 @@ def test_keys_inside_of_unions_lists_and_mappings_are_known(values: dict[str, An
     with pytest.raises(ConfigError, match=message) as caught:
         validate(Basket, values, where="here")
     assert "at least 1 item" not in str(caught.value)
+
+
+def test_a_file_that_extends_a_preset_states_only_what_differs(tmp_path: Path) -> None:
+    smoke = load_config(PipelineConfig, preset="smoke")
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: smoke\ntrain_stage1: {trainer: {steps: 3}}\nrollouts: {copy_first_frame: null}\n")
+    mine = load_config(PipelineConfig, path=path)
+    assert mine.train_stage1.trainer.steps == 3
+    assert mine.train_stage1.trainer.batch_size == smoke.train_stage1.trainer.batch_size
+    assert set(smoke.rollouts) - set(mine.rollouts) == {"copy_first_frame"}
+    assert mine.curate == smoke.curate
+
+
+def test_a_preset_cannot_extend_one_that_does_not_exist(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: smokey\n")
+    with pytest.raises(ConfigError, match="Unknown preset"):
+        load_config(PipelineConfig, path=path)

@@ -231,6 +231,11 @@ class RunnerConfig(StrictModel):
         default=DEFAULT_RETRY_SECONDS, ge=0, description="pause before the first of them; doubles"
     )
     remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, each worker")
+    nodes_at_once: int = Field(
+        default=1,
+        ge=1,
+        description="nodes of a run side by side, each in a process with its share of the cores; for runs on a CPU",
+    )
 
     @model_validator(mode="after")
     def _address_is_of_a_cluster(self) -> RunnerConfig:

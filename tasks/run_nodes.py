@@ -1,0 +1,121 @@
+"""The nodes of a run as Prefect tasks: each starts when the artifacts that it needs are finished, some side by side."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Protocol
+
+from prefect.client.orchestration import get_client
+from prefect.futures import PrefectFuture, as_completed
+from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.task_runners import TaskRunner
+
+from tasks.artifact_task import ArtifactReference, artifact_task
+from tasks.shard_mapper import limited_threads, process_runner
+from worldline_core.pipeline.plan import Node
+from worldline_core.scale.mapping import RunnerConfig
+
+
+class RunWatcher(Protocol):
+    """Is told what happens to the nodes of a run."""
+
+    def started(self, node: str) -> None: ...
+
+    def finished(self, node: str, artifact: ArtifactReference, cached: bool) -> None: ...
+
+
+def run_nodes(
+    nodes: Sequence[Node], store_root: Path, runner: RunnerConfig, watcher: RunWatcher | None = None
+) -> dict[str, ArtifactReference]:
+    """Run every node, or find its artifact; returns the artifacts by the nodes' names.
+
+    With ``runner.nodes_at_once`` of 1 everything happens in this process. Otherwise nodes that wait for nothing run side
+    by side in processes that share the cores. When a node fails, nothing more is started, what runs is let finish, and
+    its error is raised.
+    """
+    with ExitStack() as stack:
+        run = _Run(store_root, runner, watcher, _pool(runner, stack))
+        waiting = list(nodes)
+        while waiting or run.running:
+            for node in [node for node in waiting if run.has_inputs(node)]:
+                if len(run.running) < runner.nodes_at_once:
+                    waiting.remove(node)
+                    run.start(node)
+            run.take_finished()
+        return run.done
+
+
+class _Run:
+    """The state of `run_nodes`."""
+
+    def __init__(
+        self,
+        store_root: Path,
+        runner: RunnerConfig,
+        watcher: RunWatcher | None,
+        pool: Callable[[], TaskRunner[Any]] | None,
+    ) -> None:
+        self.store_root = store_root
+        self.runner = runner
+        self.watcher = watcher
+        self.pool = pool
+        self.done: dict[str, ArtifactReference] = {}
+        self.running: dict[str, PrefectFuture[Any]] = {}
+        self._ended: dict[str, PrefectFuture[Any]] = {}
+
+    def has_inputs(self, node: Node) -> bool:
+        return all(source in self.done for source in node.inputs.values() if isinstance(source, str))
+
+    def start(self, node: Node) -> None:
+        if self.watcher is not None:
+            self.watcher.started(node.name)
+        sources = [source for source in node.inputs.values() if isinstance(source, str)]
+        begun, cached = artifact_task(node.step).start(
+            node.config,
+            {name: self.done[source] if isinstance(source, str) else source for name, source in node.inputs.items()},
+            store_root=self.store_root,
+            name=node.name,
+            runner=self.runner,
+            pool=self.pool,
+            after=[self._ended[source] for source in sources if source in self._ended],
+        )
+        if isinstance(begun, ArtifactReference):
+            self._take(node.name, begun, cached)
+        else:
+            self.running[node.name] = begun
+
+    def take_finished(self) -> None:
+        """Wait until one of the running nodes has ended, if any runs."""
+        if not self.running:
+            return
+        first = next(as_completed(list(self.running.values())))
+        name = next(name for name, future in self.running.items() if future is first)
+        self._ended[name] = self.running.pop(name)
+        self._take(name, ArtifactReference.model_validate(first.result()), cached=False)
+
+    def _take(self, name: str, artifact: ArtifactReference, cached: bool) -> None:
+        self.done[name] = artifact
+        if self.watcher is not None:
+            self.watcher.finished(name, artifact, cached)
+
+
+def _pool(runner: RunnerConfig, stack: ExitStack) -> Callable[[], TaskRunner[Any]] | None:
+    """Makes the pool of processes when it is first asked for: a run that finds everything finished needs none."""
+    if runner.nodes_at_once == 1:
+        return None
+    made: list[TaskRunner[Any]] = []
+
+    def pool() -> TaskRunner[Any]:
+        if not made:
+            cores = len(os.sched_getaffinity(0))
+            stack.enter_context(limited_threads(max(1, cores // runner.nodes_at_once)))
+            # The processes speak to this run's server; by themselves each would start a temporary one of its own.
+            with get_client(sync_client=True) as client:
+                stack.enter_context(temporary_settings({PREFECT_API_URL: str(client.api_url)}))
+            made.append(stack.enter_context(process_runner(runner.nodes_at_once)))
+        return made[0]
+
+    return pool

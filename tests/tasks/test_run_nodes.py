@@ -1,0 +1,159 @@
+"""Nodes of a run: started when their inputs are finished, side by side in processes, with a page that stays true."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect import flow
+from prefect.events.worker import EventsWorker
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
+from prefect.testing.utilities import prefect_test_harness
+
+from tasks.artifact_task import ArtifactReference
+from tasks.run_nodes import run_nodes
+from tasks.run_page import RunPage
+from worldline_core.config import StrictModel, load_config
+from worldline_core.errors import DataError
+from worldline_core.pipeline import steps
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import Node, plan
+from worldline_core.pipeline.steps import Step
+from worldline_core.scale.mapping import RunnerConfig
+
+
+class WriteConfig(StrictModel):
+    text: str
+
+
+def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+    if config.text == "broken":
+        raise DataError("This node cannot work")
+    before = "".join((folder / "text").read_text() for folder in inputs.values())
+    (output / "text").write_text(before + config.text)
+    return {"written": len(before) + 1}
+
+
+class WriteStep(Step):
+    def load_function(self) -> Any:
+        return write
+
+    def load_config(self) -> type[StrictModel]:
+        return WriteConfig
+
+
+class Watcher:
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def started(self, node: str) -> None:
+        self.events.append(f"started {node}")
+
+    def finished(self, node: str, artifact: ArtifactReference, cached: bool) -> None:
+        self.events.append(f"{'found' if cached else 'made'} {node}")
+
+
+@pytest.fixture(scope="module")
+def prefect_server() -> Iterator[None]:
+    EventsWorker.drain_all(timeout=10)
+    with prefect_test_harness(server_startup_timeout=90):
+        yield
+
+
+@pytest.fixture
+def storage(prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    for name, inputs in (("write_first", ()), ("write_next", ("before",))):
+        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        yield tmp_path / "store"
+
+
+def nodes(second: str = "b") -> list[Node]:
+    # Given in an order in which they cannot be started.
+    return [
+        Node("write_next.second", "write_next", WriteConfig(text=second), {"before": "write_first"}),
+        Node("write_first", "write_first", WriteConfig(text="a"), {}),
+    ]
+
+
+def run(store: Path, second: str = "b", watcher: Any = None) -> dict[str, ArtifactReference]:
+    @flow
+    def some_nodes() -> dict[str, ArtifactReference]:
+        return run_nodes(nodes(second), store, RunnerConfig(), watcher)
+
+    return some_nodes()
+
+
+def test_a_node_starts_when_its_inputs_are_finished_and_is_found_the_second_time(storage: Path) -> None:
+    watcher = Watcher()
+    done = run(storage, watcher=watcher)
+    assert (done["write_next.second"].path / "text").read_text() == "ab"
+    assert watcher.events == ["started write_first", "made write_first", "started write_next.second", "made write_next.second"]  # fmt: skip
+    again = Watcher()
+    assert run(storage, watcher=again) == done
+    assert [event for event in again.events if "started" not in event] == [
+        "found write_first",
+        "found write_next.second",
+    ]
+
+
+def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:
+    with pytest.raises(DataError, match="This node cannot work"), RunPage(storage, ["write_next.second", "write_first"]) as page:  # fmt: skip
+        run(storage, "broken", page)
+    text = (storage / "report" / "latest" / "index.html").read_text()
+    assert "This node cannot work" in text
+    assert "write_first" in text
+
+
+def test_nodes_side_by_side_give_the_artifacts_of_one_process(
+    prefect_server: None, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(project_root)
+    settings = load_config(PipelineConfig, preset="smoke")
+    some = [node for node in plan(settings, project_root) if node.step in ("curate", "render_actions", "filter")]
+
+    @flow
+    def side_by_side(at_once: int) -> dict[str, ArtifactReference]:
+        return run_nodes(some, tmp_path / f"store{at_once}", RunnerConfig(nodes_at_once=at_once))
+
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        digests = [{name: artifact.digest for name, artifact in side_by_side(n).items()} for n in (1, 2)]
+    assert set(digests[0]) == {"curate", "filter", "render_actions", "curate.banks", "render_actions.banks"}
+    assert digests[0] == digests[1]
+
+
+def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:
+    code = """
+        import multiprocessing, os, time
+        from tasks.artifact_task import _end_with_parent
+
+        def work(pid):
+            _end_with_parent()
+            pid.value = os.getpid()
+            time.sleep(60)
+
+        if __name__ == "__main__":
+            context = multiprocessing.get_context("fork")
+            pid = context.Value("i", 0)
+            context.Process(target=work, args=(pid,)).start()
+            while not pid.value:
+                time.sleep(0.05)
+            print(pid.value, flush=True)
+            os._exit(0)
+    """
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], cwd=project_root, capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": str(project_root)}, timeout=120,
+    )  # fmt: skip
+    worker = int(result.stdout)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not Path(f"/proc/{worker}").exists()
