@@ -32,10 +32,10 @@ import numpy as np
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.frame_decoder import torchcodec_fault
+from worldline_core.training.clip_loader import ClipReader
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_reader import ClipReader
-from worldline_core.training.clip_sampler import Clip, ClipSampler, ClipSampling
-from worldline_core.training.clip_source import FrameInput
+from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_source import Clip, FrameInput
 from worldline_core.training.frame_source import FrameSource, frame_rows
 
 TICK = os.sysconf("SC_CLK_TCK")
@@ -101,7 +101,7 @@ def processor_seconds(processes: Sequence[int]) -> float:
 def decode_raw(source: FrameSource, clips: Sequence[Clip]) -> None:
     """Every frame of the clips, and nothing more."""
     for clip in clips:
-        position = source.row(clip.episode_id).position
+        position = source.episodes.position(clip.episode_id)
         for view in VIEWS:
             for _ in source.decoder.frames(source.episodes.clip(position, view), clip.frames):
                 pass
@@ -111,13 +111,13 @@ def decode_whole(source: FrameSource, clips: Sequence[Clip]) -> None:
     """Whole clips as arrays of their own, as one would write it first."""
     if source.config.decoder == "pyav":
         for clip in clips:
-            position = source.row(clip.episode_id).position
+            position = source.episodes.position(clip.episode_id)
             np.stack([source.episodes.frames(position, view, list(clip.frames)) for view in VIEWS])
         return
     from torchcodec.decoders import VideoDecoder
 
     for clip in clips:
-        position = source.row(clip.episode_id).position
+        position = source.episodes.position(clip.episode_id)
         views = []
         for view in VIEWS:
             video = source.episodes.clip(position, view)

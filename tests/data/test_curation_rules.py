@@ -260,19 +260,16 @@ def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
 def test_the_clip_sampler_follows_these_weights() -> None:
     """Drawn clips against the shares that the weights were made for."""
     from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-    from worldline_core.training.latent_store import LatentRow
+    from worldline_core.training.clip_source import ClipRow
 
     rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
     sampling = SourceSampling(shares={"large": 0.4, "small": 0.6})
 
-    stored = [LatentRow(r.episode_id, "x", r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
+    stored = [ClipRow(r.episode_id, r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
 
     class Store:
         start_step = 1
         rows = stored
-
-        def max_frames(self, row: LatentRow, start: int, stride: int) -> int:
-            return (row.num_frames - 1 - start) // stride + 1
 
     config = ClipSampling(lengths=(33,), source_weights=source_weights(rows, sampling))
     sampler = ClipSampler(Store(), config, splits=["train"], batch_size=50, seed=0)  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ from worldline_core.errors import ArtifactError, CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.store.digest import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import Clip
 from worldline_core.training.latent_store import LatentStore
 
 

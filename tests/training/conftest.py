@@ -75,7 +75,7 @@ def write_latents(root: Path, count: int, validation: int) -> None:
         tensors[group_key(name, 1, 1)] = latents[:, :, 4::4].contiguous()
         split = "validation" if number < validation else "train"
         rows.append(
-            LatentRow(name, "00000.safetensors", FRAMES, VIEWS, "synthetic", "square", split, f"move {number}", "head")
+            LatentRow(name, FRAMES, VIEWS, "synthetic", "square", split, f"move {number}", "head", "00000.safetensors")
         )
     save_file(tensors, root / "00000.safetensors")
     pq.write_table(

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from worldline_core.model.world_model import WorldModel
 from worldline_core.training import trainer
 from worldline_core.training.flow_matching import FlowMatchingObjective, add_noise, flow_matching_loss
 from worldline_core.training.stage import Stage
@@ -56,9 +55,9 @@ def keep_weights(path: Path) -> None:
     """Every process writes its own weights when the run is done."""
     inner = Stage.save
 
-    def save(self: Stage, model: WorldModel, *arguments: Any, **named: Any) -> Any:
-        save_file({name: value.contiguous() for name, value in model.state_dict().items()}, path)
-        return inner(self, model, *arguments, **named)
+    def save(self: Stage, *arguments: Any, **named: Any) -> Any:
+        save_file({name: value.contiguous() for name, value in self.model.state_dict().items()}, path)
+        return inner(self, *arguments, **named)
 
     Stage.save = save
 

@@ -9,8 +9,9 @@ from einops import rearrange
 from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.training.clip_source import latent_frame_count, longest_clip
 from worldline_core.training.encode_latents import EncodeLatentsConfig, choose_layout, encode_episode
-from worldline_core.training.latent_store import LatentRow, LatentStore, latent_frame_count
+from worldline_core.training.latent_store import LatentRow, LatentStore
 
 
 class Memoryless:
@@ -44,12 +45,12 @@ def test_a_clip_of_the_store_equals_direct_encoding(
     layout = choose_layout(tokenizer, video[0], config)
     assert layout == ("clips" if isinstance(tokenizer, Remembering) else "groups")
     save_file(encode_episode(tokenizer, "e", video, layout, config), tmp_path / "s.safetensors")
-    row = LatentRow("e", "s.safetensors", 30, ("a", "b"), "s", "r", "train", "", "a")
+    row = LatentRow("e", 30, ("a", "b"), "s", "r", "train", "", "a", "s.safetensors")
     description = {"layout": layout, "start_step": start_step, "strides": [stride], "latent_shape": [3, 2, 2]}
     store = LatentStore(tmp_path, description | {"image_size": [2, 2]}, [row])
     checked = 0
     for start in range(0, 30, start_step):
-        for length in range(1, store.max_frames(row, start, stride) + 1, 4):
+        for length in range(1, longest_clip(row.num_frames, start, stride) + 1, 4):
             frames = list(range(start, start + stride * length, stride))
             assert torch.equal(store.clip("e", start, length, stride), tokenizer.encode(video[:, :, frames]))
             checked += 1
@@ -94,5 +95,5 @@ def test_a_damaged_shard_is_named(world: object, tmp_path: Path) -> None:
     shutil.copytree(world.latents, root)  # type: ignore[attr-defined]
     content = (root / "00000.safetensors").read_bytes()
     (root / "00000.safetensors").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ArtifactError, match="shard cannot be opened"):
+    with pytest.raises(ArtifactError, match="shard is damaged or cannot be opened"):
         LatentStore.open(root).clip("episode-000", 0, 17)

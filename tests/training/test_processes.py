@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.digest import digest_folder
-from worldline_core.training.trainer import read_metrics
+from worldline_core.training.training_state import read_metrics
 
 
 def free_port() -> int:

@@ -21,7 +21,7 @@ from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_l
 from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, train_stage1
 from worldline_core.training.stage2 import Stage2Config, train_stage2
-from worldline_core.training.trainer import read_metrics
+from worldline_core.training.training_state import read_metrics
 
 TRAINER = {
     "steps": 4,

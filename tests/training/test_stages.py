@@ -21,7 +21,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
 from worldline_core.training.stage2 import Stage2Config, stage2_groups, train_stage2
-from worldline_core.training.trainer import read_metrics
+from worldline_core.training.training_state import read_metrics
 
 MakeConfig = Callable[..., WorldModelConfig]
 
@@ -242,7 +242,7 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
-    from worldline_core.training.clip_sampler import Clip
+    from worldline_core.training.clip_source import Clip
     from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())

@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import torch
 
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import Clip
 from worldline_core.training.video_teacher import TeacherFeatures
 
 

@@ -13,7 +13,7 @@ from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
 from worldline_core.model.text import ClipFacts, Cosmos3Text, TextConfig, load_text_encoder
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import Clip, ClipBatch
+from worldline_core.training.clip_source import Clip, ClipBatch
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage1 import Stage1Config, train_stage1

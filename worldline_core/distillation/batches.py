@@ -16,7 +16,8 @@ from worldline_core.distillation.teacher_trajectories import TrajectoryStore, te
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import Clip, ClipBatch
 from worldline_core.training.trainer import TrainerConfig, autocast, step_generator
 
 

@@ -25,7 +25,7 @@ from worldline_core.distillation.teacher_trajectories import INDEX, NODES, Traje
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.latent_store import TEMPORAL_COMPRESSION
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.trainer import ParameterGroup, TrainerConfig, wait_for_all
 
 __all__ = ["DistillConfig", "distill"]

@@ -26,8 +26,8 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import named_rows, training_rows
-from worldline_core.training.latent_store import TEMPORAL_COMPRESSION, LatentRow, LatentStore
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, ClipRow, named_rows, training_rows
+from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage import validation_function
 from worldline_core.training.trainer import (
     Objective,
@@ -57,7 +57,7 @@ class DistillationStage:
     stage2_info: CheckpointInfo
     store: LatentStore
     loader: ClipLoader
-    rows: list[LatentRow]
+    rows: list[ClipRow]
     output: Path
     perceptual: PerceptualDistance | None
     rank: int
@@ -145,13 +145,7 @@ class DistillationStage:
             objective=objective,
             load=load,
             validate=validation_function(
-                self.store,
-                self.config.clips,
-                self.config.validation_splits,
-                trainer,
-                self.rows,
-                self.loader,
-                validated,
+                self.loader, self.config.clips, self.config.validation_splits, trainer, self.rows, validated
             ),
             output=work,
             identity={

@@ -40,7 +40,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import CAUSAL_SHIFT, CAUSAL_SIGMAS, VelocityField, integrate
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.digest import digest_file
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import Clip
 
 NODES = CAUSAL_SIGMAS
 """Noise levels of the four-step sampler, at which the trajectories are kept."""

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 
 from worldline_core.errors import TrainingError, WorldLineError
-from worldline_core.training.clip_reader import ClipReader, ReadBatch, SkippedClip
-from worldline_core.training.clip_sampler import ClipBatch
+from worldline_core.training.clip_loader import ClipReader, ReadBatch, SkippedClip
+from worldline_core.training.clip_source import ClipBatch
 
 _PATIENCE_SECONDS = 5.0
 

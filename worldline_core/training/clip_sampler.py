@@ -1,14 +1,10 @@
-"""Deterministic clip sampling: which clips a step trains on is a pure function of (seed, step, rank).
+"""Which clips a step trains on: a pure function of (seed, step, rank), so that a run needs no other state to continue.
 
-The number of the step is therefore all the state there is: a run goes on in the middle of an epoch, on any number of
-loader processes, with the clips that it would have had.
-
-Every clip once an epoch, in an order that is a function of (seed, micro-step) and needs no memory.
-
-Clips are numbered within their kind (length and stride); the numbers of an epoch are passed through a keyed permutation,
-so that a corpus of 10^8 clips costs no table. Batches hold clips of one kind and are always full: what does not fill a
-batch of an epoch (of each kind fewer clips than a batch has) goes into the next one's. Nothing is lost, and no clip comes
-more often than there are epochs.
+Two orders. "weighted" draws clips without end by weights. "epochs" takes every clip once per epoch: clips are numbered
+within their kind (length and stride), and the numbers of an epoch pass through a keyed permutation, so that a corpus of
+10^8 clips needs no table. Batches hold clips of one kind and are always full: what does not fill a batch at the end of
+an epoch (for each kind, fewer clips than a batch has) goes into the next epoch's. Nothing is lost, and no clip comes more
+often than there are epochs.
 """
 
 from __future__ import annotations
@@ -24,7 +20,17 @@ from pydantic import BeforeValidator, Field
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, Clip, ClipRow, ClipSource
+from worldline_core.training.clip_source import (
+    TEMPORAL_COMPRESSION,
+    Clip,
+    ClipBatch,
+    ClipRow,
+    ClipSource,
+    longest_clip,
+)
+
+JOINT = "joint"
+"""In place of a view's name: all views of the model together."""
 
 _ROUNDS = 6
 _MASK = (1 << 64) - 1
@@ -66,11 +72,11 @@ def mixed_key(*parts: int) -> int:
 
 
 class EpochOrder:
-    """Batches of clip numbers.
+    """Batches of clip numbers in which every clip comes once per epoch.
 
     Args:
-        counts: clips of each kind.
-        batch: clips of a batch, all processes together.
+        counts: number of clips of each kind.
+        batch: clips per batch, all processes together.
     """
 
     def __init__(self, counts: Sequence[int], batch: int, seed: int) -> None:
@@ -109,11 +115,6 @@ class EpochOrder:
         return permuted(position, self.counts[kind], mixed_key(self.seed, epoch, kind + 1))
 
 
-PRIMARY = "primary"
-JOINT = "joint"
-_DRAWS_A_CLIP = 2
-
-
 def _lengths(value: Any) -> Any:
     """``{from: 33, to: 129}`` (``step``: 4 unless given) as the lengths that it means."""
     if not isinstance(value, Mapping):
@@ -139,7 +140,7 @@ class ClipSampling(StrictModel):
     Steps on one view cost a fraction of joint ones and teach most of what controls look like: where compute is short,
     a mixture learns faster. ``single_view_factor`` multiplies the batch of such steps.
     ``order``: "weighted" draws without end by the weights; "epochs" takes every clip (each length and stride at every
-    ``hop``-th frame of every episode) once an epoch, and knows no weights of lengths and sources (see clip_order.py).
+    ``hop``-th frame of every episode) once per epoch, and allows no weights of lengths and sources.
     ``hop``: frames between the starts of neighbouring clips of an epoch (default: the smallest that the source has).
     """
 
@@ -154,21 +155,31 @@ class ClipSampling(StrictModel):
     hop: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
 
 
-@dataclass(frozen=True)
-class ClipBatch:
-    """Clips of equal length that share their views. ``views`` is None for all views, else one view or "primary"."""
+@dataclass
+class _Kind:
+    """Clips of one length and stride. ``cumulative``: the rows' weights (in epochs: numbers of clips), added up."""
 
-    clips: tuple[Clip, ...]
-    view: str | None
+    length: int
+    stride: int
+    rows: list[ClipRow]
+    cumulative: np.ndarray
+
+    def starts(self, row: ClipRow, step: int) -> int:
+        """How many frames of an episode, ``step`` apart, a clip may start at."""
+        return (row.num_frames - 1 - (self.length - 1) * self.stride) // step + 1
+
+    def clip(self, row: ClipRow, start: int) -> Clip:
+        """The clip of an episode at a start frame."""
+        return Clip(row.episode_id, start, self.length, self.stride)
 
 
 class ClipSampler:
     """Draws batches of clips. Every rank draws the same global batch and takes its own part.
 
     Args:
-        store: where the clips are read from.
-        batch_size: clips of a micro-step on this rank.
-        rows: the episodes to draw from (default: all of the store).
+        source: where the clips are read from.
+        batch_size: clips per micro-step on this rank.
+        rows: the episodes to draw from (default: all of the source).
 
     Raises:
         ConfigError: weights, order or hop do not fit together.
@@ -177,7 +188,7 @@ class ClipSampler:
 
     def __init__(
         self,
-        store: ClipSource,
+        source: ClipSource,
         config: ClipSampling,
         *,
         splits: Sequence[str],
@@ -187,31 +198,26 @@ class ClipSampler:
         world_size: int = 1,
         rows: Sequence[ClipRow] | None = None,
     ) -> None:
-        _check(config, store)
-        self.store = store
+        _check(config, source)
         self.batch_size = batch_size
         self.single_view_factor = config.single_view_factor
         self.seed = seed
         self.rank = rank
         self.world_size = world_size
-        self.step = store.start_step
+        self.step = source.start_step
         self._view_names = sorted(config.view_weights or {})
         self._view_weights = _normalised([(config.view_weights or {})[name] for name in self._view_names])
-        candidates = [row for row in (store.rows if rows is None else rows) if row.split in splits]
-        self._kinds: list[tuple[int, int]] = []
+        candidates = [row for row in (source.rows if rows is None else rows) if row.split in splits]
+        self._kinds: list[_Kind] = []
         kind_weights: list[float] = []
-        self._rows: list[list[ClipRow]] = []
-        self._cumulative: list[np.ndarray] = []
         weights = config.length_weights or [1.0] * len(config.lengths)
         for length, weight in zip(config.lengths, weights, strict=True):
             for stride in config.strides:
-                fitting = [row for row in candidates if store.max_frames(row, 0, stride) >= length]
+                fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
                 row_weights = [config.source_weights.get(row.source, 1.0) for row in fitting]
                 if weight > 0 and sum(row_weights) > 0:
-                    self._kinds.append((length, stride))
+                    self._kinds.append(_Kind(length, stride, fitting, np.cumsum(_normalised(row_weights))))
                     kind_weights.append(weight)
-                    self._rows.append(fitting)
-                    self._cumulative.append(np.cumsum(_normalised(row_weights)))
         if not self._kinds:
             longest = max((row.num_frames for row in candidates), default=0)
             raise DataError(
@@ -223,26 +229,26 @@ class ClipSampler:
         self._kind_weights = _normalised(kind_weights)
         self._epochs: EpochOrder | None = None
         if config.order == "epochs":
-            self.step = config.hop or store.start_step
-            for kind, (length, stride) in enumerate(self._kinds):
-                self._cumulative[kind] = np.cumsum([self._starts(row, length, stride) for row in self._rows[kind]])
-            counts = [int(cumulative[-1]) for cumulative in self._cumulative]
+            self.step = config.hop or source.start_step
+            for kind in self._kinds:
+                kind.cumulative = np.cumsum([kind.starts(row, self.step) for row in kind.rows])
+            counts = [int(kind.cumulative[-1]) for kind in self._kinds]
             self._epochs = EpochOrder(counts, batch_size * world_size, seed)
 
     def clips(self, index: int) -> ClipBatch:
         """The clips of micro-step ``index`` (of this rank)."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
-        kind = int(random.choice(len(self._kinds), p=self._kind_weights))
+        number = int(random.choice(len(self._kinds), p=self._kind_weights))
         view = None
         if self._view_names:
             name = self._view_names[int(random.choice(len(self._view_names), p=self._view_weights))]
             view = None if name == JOINT else name
         if self._epochs is not None:
-            kind, numbers = self._epochs.locate(index)
-            mine = numbers[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
-            return ClipBatch(tuple(self._numbered(kind, number) for number in mine), view)
+            number, places = self._epochs.locate(index)
+            mine = places[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
+            return ClipBatch(tuple(self._numbered(self._kinds[number], place) for place in mine), view)
         size = self.batch_size * (1 if view is None else self.single_view_factor)
-        return ClipBatch(self._drawn(random, kind, size), view)
+        return ClipBatch(self._drawn(random, self._kinds[number], size), view)
 
     def replacement(self, index: int, place: int, attempt: int) -> Clip:
         """Another clip of the length and stride of micro-step ``index``, for its unreadable clip at ``place``.
@@ -250,13 +256,13 @@ class ClipSampler:
         Drawn at random (by the weights; in epochs by the number of clips), from a stream of its own.
         """
         first = self.clips(index).clips[place]
-        kind = self._kinds.index((first.num_frames, first.stride))
+        number = [(kind.length, kind.stride) for kind in self._kinds].index((first.num_frames, first.stride))
         counter = [0, 0, 1 + attempt, 1 + place]
         random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
         if self._epochs is not None:
-            numbers = random.integers(self._epochs.counts[kind], size=self.world_size)
-            return self._numbered(kind, int(numbers[self.rank]))
-        return self._drawn(random, kind, 1)[0]
+            places = random.integers(self._epochs.counts[number], size=self.world_size)
+            return self._numbered(self._kinds[number], int(places[self.rank]))
+        return self._drawn(random, self._kinds[number], 1)[0]
 
     @property
     def clips_per_epoch(self) -> int | None:
@@ -271,7 +277,7 @@ class ClipSampler:
     @property
     def longest(self) -> int:
         """Frames of the longest clip that is drawn."""
-        return max(length for length, _ in self._kinds)
+        return max(kind.length for kind in self._kinds)
 
     @property
     def batch_kinds(self) -> list[tuple[str | None, int]]:
@@ -282,31 +288,22 @@ class ClipSampler:
         factor = self.single_view_factor
         return [(None, self.batch_size) if name == JOINT else (name, self.batch_size * factor) for name in drawn]
 
-    def _drawn(self, random: np.random.Generator, kind: int, size: int) -> tuple[Clip, ...]:
-        draws = random.random((size * self.world_size, _DRAWS_A_CLIP))
-        mine = draws[self.rank * size : (self.rank + 1) * size]
-        return tuple(self._clip(kind, draw) for draw in mine)
+    def _drawn(self, random: np.random.Generator, kind: _Kind, size: int) -> tuple[Clip, ...]:
+        draws = random.random((size * self.world_size, 2))  # per clip: which episode, which start
+        return tuple(self._clip(kind, *draw) for draw in draws[self.rank * size : (self.rank + 1) * size])
 
-    def _clip(self, kind: int, draw: np.ndarray) -> Clip:
-        rows, cumulative = self._rows[kind], self._cumulative[kind]
-        length, stride = self._kinds[kind]
-        row = rows[min(int(np.searchsorted(cumulative, draw[0], side="right")), len(rows) - 1)]
-        start = int(draw[1] * self._starts(row, length, stride)) * self.step
-        return Clip(row.episode_id, start, length, stride)
+    def _clip(self, kind: _Kind, which: float, where: float) -> Clip:
+        row = kind.rows[min(int(np.searchsorted(kind.cumulative, which, side="right")), len(kind.rows) - 1)]
+        return kind.clip(row, int(where * kind.starts(row, self.step)) * self.step)
 
-    def _numbered(self, kind: int, number: int) -> Clip:
-        cumulative = self._cumulative[kind]
-        place = int(np.searchsorted(cumulative, number, side="right"))
-        before = int(cumulative[place - 1]) if place else 0
-        length, stride = self._kinds[kind]
-        return Clip(self._rows[kind][place].episode_id, (number - before) * self.step, length, stride)
-
-    def _starts(self, row: ClipRow, length: int, stride: int) -> int:
-        """How many frames of an episode a clip may start at."""
-        return (row.num_frames - 1 - (length - 1) * stride) // self.step + 1
+    def _numbered(self, kind: _Kind, number: int) -> Clip:
+        """The clip of this number among all clips of the kind, episode by episode."""
+        place = int(np.searchsorted(kind.cumulative, number, side="right"))
+        before = int(kind.cumulative[place - 1]) if place else 0
+        return kind.clip(kind.rows[place], (number - before) * self.step)
 
 
-def _check(config: ClipSampling, store: ClipSource) -> None:
+def _check(config: ClipSampling, source: ClipSource) -> None:
     odd = [length for length in config.lengths if length < 1 or (length - 1) % TEMPORAL_COMPRESSION]
     if odd:
         raise ConfigError(
@@ -334,11 +331,11 @@ def _check(config: ClipSampling, store: ClipSource) -> None:
             got="epochs with weights",
             next_step="take order: weighted, or leave the weights out",
         )
-    if config.hop is not None and config.hop % store.start_step:
+    if config.hop is not None and config.hop % source.start_step:
         raise ConfigError(
             "Clips cannot start at every hop.",
             where="clips.hop",
-            expected=f"a multiple of {store.start_step}, the frames between possible starts",
+            expected=f"a multiple of {source.start_step}, the frames between possible starts",
             got=config.hop,
         )
 
@@ -347,11 +344,3 @@ def _normalised(weights: Sequence[float]) -> np.ndarray:
     values = np.asarray(weights, dtype=np.float64)
     total = values.sum()
     return values / total if total > 0 else values
-
-
-def source_counts(rows: Sequence[ClipRow]) -> Mapping[str, int]:
-    """Episodes a source, for the checkpoint's metadata."""
-    counts: dict[str, int] = {}
-    for row in rows:
-        counts[row.source] = counts.get(row.source, 0) + 1
-    return dict(sorted(counts.items()))

@@ -1,19 +1,17 @@
-"""What training draws clips from: cached latents, or the frames of an EpisodeSet. Samplers and loaders know only this.
+"""Training clips: what one is, and the two sources they are read from (cached latents, frames of an EpisodeSet).
 
-Reading is split in two, so that it can go on in other processes: `read` touches files and gives an array, `latents`
-makes of it what a model sees, on the model's device.
-
-Where a stage's clips come from and how they are read: configuration.
-
-Which episodes a stage may train on: those in the latent store that the filters let through for this stage.
+Reading is split in two so that it can run in other processes: `ClipSource.read` touches files and fills an array;
+`ClipSource.latents` turns that array into what the model sees, on the model's device.
 """
 
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -22,35 +20,16 @@ from torch import Tensor
 
 from worldline_core.actions.track_store import ActionTracks
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import DecoderChoice
-from worldline_core.errors import DataError
+from worldline_core.errors import ArtifactError, DataError
+
+logger = logging.getLogger(__name__)
 
 TEMPORAL_COMPRESSION = 4
-
-
-class ClipRow(Protocol):
-    """One episode as a sampler sees it. ``num_frames`` counts the frames with images."""
-
-    @property
-    def episode_id(self) -> str: ...
-    @property
-    def num_frames(self) -> int: ...
-    @property
-    def views(self) -> tuple[str, ...]: ...
-    @property
-    def source(self) -> str: ...
-    @property
-    def split(self) -> str: ...
-    @property
-    def instruction(self) -> str: ...
-    @property
-    def primary_view(self) -> str: ...
-
-
-def named_rows(rows: Sequence[ClipRow]) -> list[list[Any]]:
-    """What clips are drawn by, as JSON: two runs whose rows differ here train on other clips."""
-    return [[row.episode_id, row.num_frames, list(row.views), row.source, row.split, row.instruction] for row in rows]
+PRIMARY = "primary"
+"""In place of a view's name: the task-facing view of each episode (Stage I)."""
 
 
 @dataclass(frozen=True)
@@ -73,38 +52,113 @@ class Clip:
         )
 
 
-class ClipSource[RowT: ClipRow](Protocol):
+@dataclass(frozen=True)
+class ClipBatch:
+    """Clips of equal length that share their views. ``view`` is None for all views, else one view or "primary"."""
+
+    clips: tuple[Clip, ...]
+    view: str | None
+
+
+def latent_frame_count(num_frames: int) -> int:
+    """T_l = 1 + (T - 1) / 4 (method.md section 2).
+
+    Raises:
+        DataError: if ``num_frames`` is not one more than a multiple of four.
+    """
+    if num_frames < 1 or (num_frames - 1) % TEMPORAL_COMPRESSION:
+        raise DataError(
+            "A clip has a length that the causal tokenizer cannot encode.", expected="4 k + 1 frames", got=num_frames
+        )
+    return 1 + (num_frames - 1) // TEMPORAL_COMPRESSION
+
+
+def longest_clip(num_frames: int, start: int, stride: int) -> int:
+    """Most frames, 4 k + 1, of a clip at ``start`` with ``stride`` in an episode of ``num_frames``."""
+    steps = (num_frames - 1 - start) // stride
+    return 1 + TEMPORAL_COMPRESSION * (steps // TEMPORAL_COMPRESSION)
+
+
+@dataclass(frozen=True)
+class ClipRow:
+    """One episode (or kept segment) that clips are drawn from. ``num_frames`` counts the frames with images."""
+
+    episode_id: str
+    num_frames: int
+    views: tuple[str, ...]
+    source: str
+    embodiment: str
+    split: str
+    instruction: str
+    primary_view: str
+
+    @classmethod
+    def of(cls, row: EpisodeRow, views: Sequence[str], **more: Any) -> Self:
+        """The row of an EpisodeSet's row, with those of its views that clips have."""
+        return cls(
+            episode_id=row.episode_id,
+            num_frames=row.video_frames,
+            views=tuple(views),
+            source=row.source,
+            embodiment=row.embodiment,
+            split=row.split,
+            instruction=row.instruction,
+            primary_view=row.primary_view,
+            **more,
+        )
+
+
+def named_rows(rows: Sequence[ClipRow]) -> list[list[Any]]:
+    """What clips are drawn by, as JSON: two runs whose rows differ here train on other clips."""
+    return [[row.episode_id, row.num_frames, list(row.views), row.source, row.split, row.instruction] for row in rows]
+
+
+class ClipSource(ABC):
     """Episodes whose clips can be read.
 
     Attributes:
+        root: folder, for error messages.
         start_step: clips start at multiples of it.
         latent_shape: (c, h, w) of one view's latent frame.
         image_size: (H, W) of the frames that the latents are of.
-        description: ``tokenizer`` (its fingerprint) and ``views``, at least.
+        description: at least ``tokenizer`` (its fingerprint) and ``views``.
         dtype: of what `read` gives.
     """
 
+    root: Path
     start_step: int
     latent_shape: tuple[int, int, int]
     image_size: tuple[int, int]
     description: dict[str, Any]
     dtype: np.dtype[Any]
 
-    @property
-    def rows(self) -> Sequence[RowT]: ...
+    def __init__(self, rows: Sequence[ClipRow]) -> None:
+        self.rows = list(rows)
+        self._by_id = {row.episode_id: row for row in self.rows}
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        return len(self.rows)
 
-    def row(self, episode_id: str) -> RowT: ...
+    def row(self, episode_id: str) -> ClipRow:
+        """The row of an episode.
 
-    def max_frames(self, row: ClipRow, start: int, stride: int) -> int:
-        """Longest clip length (4 k + 1 frames) that starts at ``start`` with ``stride``."""
-        ...
+        Raises:
+            ArtifactError: the source does not hold it.
+        """
+        if episode_id not in self._by_id:
+            raise ArtifactError(
+                f"The {type(self).__name__} does not hold this episode (or not all the views that are trained on).",
+                where=self.root,
+                got=episode_id,
+                next_step="encode the latents of the same EpisodeSet that is trained on",
+            )
+        return self._by_id[episode_id]
 
+    @abstractmethod
     def shape(self, num_frames: int) -> tuple[int, ...]:
         """Shape of what `read` gives for one view of a clip."""
-        ...
 
+    @abstractmethod
     def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
         """Fill ``out`` (v, *shape) with the views of a clip. Works in any process.
 
@@ -112,17 +166,10 @@ class ClipSource[RowT: ClipRow](Protocol):
             DataError: the clip is damaged; the message names it.
             ArtifactError: the clip does not belong to this source.
         """
-        ...
 
+    @abstractmethod
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
         """Latents (float32) of clips that were read, on ``device``."""
-        ...
-
-
-def longest_clip(num_frames: int, start: int, stride: int) -> int:
-    """Most frames, 4 k + 1, of a clip at ``start`` with ``stride`` in an episode of ``num_frames``."""
-    steps = (num_frames - 1 - start) // stride
-    return 1 + TEMPORAL_COMPRESSION * (steps // TEMPORAL_COMPRESSION)
 
 
 class ReadingConfig(StrictModel):
@@ -163,21 +210,18 @@ class FrameInput(ReadingConfig):
 ClipInput = Annotated[LatentInput | FrameInput, Field(discriminator="kind")]
 
 
-logger = logging.getLogger(__name__)
-
-
-def training_rows[RowT: ClipRow](
-    store: ClipSource[RowT], episodes: EpisodeSet, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
-) -> list[RowT]:
-    """Rows of the store whose episode is in the set, fit for the stage, and (Stage II) has action tracks.
+def training_rows(
+    source: ClipSource, episodes: EpisodeSet, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
+) -> list[ClipRow]:
+    """Rows of the source whose episode is in the set, fit for the stage, and (Stage II) has action tracks.
 
     Raises:
         DataError: if none is left.
     """
     allowed = {row.episode_id for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)}
     # Episodes encoded by their task-facing view alone are for Stage I, however fit their other views are.
-    every_view = set(store.description.get("views", ())) if stage == 2 else set()
-    rows = [row for row in store.rows if row.episode_id in allowed and every_view <= set(row.views)]
+    every_view = set(source.description.get("views", ())) if stage == 2 else set()
+    rows = [row for row in source.rows if row.episode_id in allowed and every_view <= set(row.views)]
     fitting = [row for row in rows if tracks is None or row.episode_id in tracks]
     if len(fitting) < len(rows):
         logger.warning("%d of %d episodes have no action tracks and are left out.", len(rows) - len(fitting), len(rows))
@@ -185,8 +229,8 @@ def training_rows[RowT: ClipRow](
         raise DataError(
             "No episode is left to train on.",
             where=f"stage {stage}",
-            expected="episodes that are in the EpisodeSet, the clips' store and (Stage II) the action tracks",
-            got=f"{len(allowed)} fit episodes in the set, {len(store)} in the store",
+            expected="episodes that are in the EpisodeSet, the source of clips and (Stage II) the action tracks",
+            got=f"{len(allowed)} fit episodes in the set, {len(source)} in the source",
             next_step="see the quarantine tables of curate, filter and render_actions",
         )
     return fitting

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float
 from pydantic import Field
@@ -18,13 +16,14 @@ from torch import Tensor
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.atomic import atomic_path, write_json_atomic
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.latent_store import (
-    TEMPORAL_COMPRESSION,
     LatentRow,
     Layout,
     clip_key,
     group_key,
     single_key,
+    write_store_index,
 )
 
 if TYPE_CHECKING:
@@ -168,13 +167,14 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
                 save_file(dict(sorted(tensors.items())), temporary)
             shape = next(iter(tensors.values())).shape
             write_json_atomic(marker, {"latent_shape": [shape[1], *shape[3:]]})
-        rows.extend(_row(episodes, index, name, config) for index in members)
+        encoded = [episodes.rows[index] for index in members]
+        rows += [LatentRow.of(row, _views(row, config), shard=name) for row in encoded]
         progress.update(len(members))
     progress.close()
     facts = json.loads((output / "run" / "00000.json").read_text())
-    _write_index(output, rows)
-    write_json_atomic(
-        output / "store.json",
+    write_store_index(
+        output,
+        rows,
         {
             "layout": layout,
             "start_step": config.start_step,
@@ -211,24 +211,3 @@ def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:
             got=f"{len(episodes)} episodes, none of them fitting",
         )
     return selected
-
-
-def _row(episodes: EpisodeSet, index: int, shard: str, config: EncodeLatentsConfig) -> LatentRow:
-    episode = episodes.rows[index]
-    return LatentRow(
-        episode_id=episode.episode_id,
-        shard=shard,
-        num_frames=episode.video_frames,
-        views=_views(episode, config),
-        source=episode.source,
-        embodiment=episode.embodiment,
-        split=episode.split,
-        instruction=episode.instruction,
-        primary_view=episode.primary_view,
-    )
-
-
-def _write_index(output: Path, rows: list[LatentRow]) -> None:
-    table = pa.Table.from_pylist([{**vars(row), "views": list(row.views)} for row in rows])
-    with atomic_path(output / "index.parquet") as temporary:
-        pq.write_table(table, temporary, compression="zstd")

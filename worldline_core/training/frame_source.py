@@ -1,10 +1,9 @@
-"""Clips read straight from an EpisodeSet: frames are decoded when they are needed, latents made of them on the way."""
+"""Clips read straight from an EpisodeSet: frames are decoded when they are needed, then encoded to latents."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +18,13 @@ from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, resize_frame
-from worldline_core.training.clip_source import Clip, ClipRow, FrameInput, longest_clip
+from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, FrameInput
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class FrameRow:
-    """One episode (or kept segment) of the set. ``num_frames`` counts its frames with images."""
-
-    episode_id: str
-    position: int
-    num_frames: int
-    views: tuple[str, ...]
-    source: str
-    embodiment: str
-    split: str
-    instruction: str
-    primary_view: str
-
-
-class FrameSource:
-    """A clip source (see clip_source.py) over an EpisodeSet.
+class FrameSource(ClipSource):
+    """Frames of an EpisodeSet as a source of clips.
 
     Args:
         tokenizer: encodes; None where frames alone are wanted (loader processes, benchmarks).
@@ -52,15 +36,16 @@ class FrameSource:
     def __init__(
         self,
         episodes: EpisodeSet,
-        rows: Sequence[FrameRow],
+        rows: Sequence[ClipRow],
         config: FrameInput,
         *,
         tokenizer: VideoTokenizer | None,
         latent_shape: tuple[int, int, int],
         description: Mapping[str, Any],
     ) -> None:
+        super().__init__(rows)
+        self.root = episodes.root
         self.episodes = episodes
-        self.rows = list(rows)
         self.config = config
         self.image_size = config.image_size
         self.start_step = config.start_step
@@ -68,7 +53,6 @@ class FrameSource:
         self.description = dict(description)
         self._tokenizer = tokenizer
         self._decoder: FrameDecoder | None = None
-        self._by_id = {row.episode_id: row for row in self.rows}
 
     @classmethod
     def open(
@@ -106,17 +90,10 @@ class FrameSource:
             config,
             tokenizer=tokenizer,
             latent_shape=(tokenizer.latent_channels, height // space, width // space),
-            description={
-                "tokenizer": tokenizer_fingerprint(tokenizer, tokenizer_folder),
-                "views": list(views),
-                "decoder": "",
-            },
+            description={"tokenizer": tokenizer_fingerprint(tokenizer, tokenizer_folder), "views": list(views)},
         )
         source.description["decoder"] = source.decoder.name
         return source
-
-    def __len__(self) -> int:
-        return len(self.rows)
 
     def __getstate__(self) -> dict[str, Any]:
         # Loader processes read frames: they open files themselves and have no use for the tokenizer.
@@ -130,24 +107,6 @@ class FrameSource:
             self._decoder = open_decoder(self.config.decoder, open_files=self.config.open_files)
         return self._decoder
 
-    def row(self, episode_id: str) -> FrameRow:
-        """The row of an episode.
-
-        Raises:
-            ArtifactError: it is not in the set, or has too few views.
-        """
-        if episode_id not in self._by_id:
-            raise ArtifactError(
-                "The EpisodeSet does not hold this episode with the views that are trained on.",
-                where=self.episodes.root,
-                got=episode_id,
-            )
-        return self._by_id[episode_id]
-
-    def max_frames(self, row: ClipRow, start: int, stride: int) -> int:
-        """Longest clip length (4 k + 1 frames) that starts at ``start`` with ``stride``."""
-        return longest_clip(row.num_frames, start, stride)
-
     def shape(self, num_frames: int) -> tuple[int, ...]:
         """(n, H, W, 3) of one view of a clip."""
         return num_frames, *self.image_size, 3
@@ -156,14 +115,14 @@ class FrameSource:
         """Fill ``out`` (v, n, H, W, 3), uint8 RGB, with the clip's frames at the training size.
 
         Raises:
-            DataError: a frame cannot be had; the message names the clip, the view and the file.
+            DataError: a frame cannot be read; the message names the clip, the view and the file.
             ArtifactError: the episode is not in the set.
         """
-        row = self.row(clip.episode_id)
+        position = self.episodes.position(self.row(clip.episode_id).episode_id)
         for pictures, view in zip(out, views, strict=True):
             where: object = f"{clip}, view {view}"
             try:
-                video = self.episodes.clip(row.position, view)
+                video = self.episodes.clip(position, view)
                 where = f"{clip}, view {view}, in {video.path}"
                 for target, picture in zip(pictures, self.decoder.frames(video, clip.frames), strict=True):
                     resize_frame(picture, self.image_size, out=target)
@@ -176,23 +135,17 @@ class FrameSource:
                     next_step="repair or drop the episode, or set input.on_unreadable to skip",
                 ) from error
 
-    def frames(self, clip: Clip, views: tuple[str, ...]) -> UInt8[np.ndarray, "v n h w 3"]:
-        """The frames of a clip in an array of their own; raises as `read` does."""
-        out = np.empty((len(views), *self.shape(clip.num_frames)), np.uint8)
-        self.read(clip, views, out)
-        return out
-
     @torch.no_grad()
     def latents(self, read: UInt8[Tensor, "b v n h w 3"], device: str) -> Float[Tensor, "b v c t h_l w_l"]:
         """Latents of frames, rounded to half precision as cached ones are.
 
-        Clips and views are encoded one by one, as encode_latents does: another batch might round differently.
+        Clips and views are encoded one by one, as encode_latents does: another batch size might round differently.
 
         Raises:
             ArtifactError: this source has no tokenizer.
         """
         if self._tokenizer is None:
-            raise ArtifactError("A source without a tokenizer has no latents.", where=self.episodes.root)
+            raise ArtifactError("A source without a tokenizer has no latents.", where=self.root)
         encoded: list[Tensor] = []
         for frames in rearrange(read, "b v n h w c -> (b v) n h w c"):
             video = rearrange(frames.to(device, non_blocking=True), "n h w c -> 1 c n h w").contiguous()
@@ -205,29 +158,17 @@ class FrameSource:
             self._decoder.close()
 
 
-def frame_rows(episodes: EpisodeSet, views: Sequence[str], *, primary_alone: bool) -> list[FrameRow]:
+def frame_rows(episodes: EpisodeSet, views: Sequence[str], *, primary_alone: bool) -> list[ClipRow]:
     """Rows of the episodes that have all ``views``, or (``primary_alone``) at least their task-facing one.
 
     Raises:
         DataError: there is none.
     """
-    rows: list[FrameRow] = []
-    for position, row in enumerate(episodes.rows):
-        needed = (row.primary_view,) if primary_alone else tuple(views)
-        if all(view in row.views for view in needed):
-            rows.append(
-                FrameRow(
-                    episode_id=row.episode_id,
-                    position=position,
-                    num_frames=row.video_frames,
-                    views=row.views,
-                    source=row.source,
-                    embodiment=row.embodiment,
-                    split=row.split,
-                    instruction=row.instruction,
-                    primary_view=row.primary_view,
-                )
-            )
+    rows = [
+        ClipRow.of(row, row.views)
+        for row in episodes.rows
+        if set((row.primary_view,) if primary_alone else views) <= set(row.views)
+    ]
     if not rows:
         raise DataError(
             "No episode has the views that are trained on.",

@@ -11,11 +11,13 @@ layouts keep every clip exact:
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float
@@ -23,50 +25,25 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, Clip, ClipRow, longest_clip
-
-__all__ = [
-    "TEMPORAL_COMPRESSION",
-    "LatentRow",
-    "LatentStore",
-    "Layout",
-    "clip_key",
-    "group_key",
-    "latent_frame_count",
-    "single_key",
-]
+from worldline_core.store.atomic import atomic_path, write_json_atomic
+from worldline_core.training.clip_source import (
+    TEMPORAL_COMPRESSION,
+    Clip,
+    ClipRow,
+    ClipSource,
+    latent_frame_count,
+    longest_clip,
+)
 
 Layout = Literal["groups", "clips"]
+_INDEX, _DESCRIPTION = "index.parquet", "store.json"
 
 
 @dataclass(frozen=True)
-class LatentRow:
-    """One episode of the store. ``num_frames`` counts video frames; a start frame is a multiple of ``start_step``."""
+class LatentRow(ClipRow):
+    """One episode of the store. A start frame is a multiple of the store's ``start_step``."""
 
-    episode_id: str
     shard: str
-    num_frames: int
-    views: tuple[str, ...]
-    source: str
-    embodiment: str
-    split: str
-    instruction: str
-    primary_view: str
-
-
-def latent_frame_count(num_frames: int) -> int:
-    """T_l = 1 + (T - 1) / 4 (method.md section 2).
-
-    Raises:
-        DataError: if ``num_frames`` is not one more than a multiple of four.
-    """
-    if num_frames < 1 or (num_frames - 1) % TEMPORAL_COMPRESSION:
-        raise DataError(
-            "A clip has a length that the causal tokenizer cannot encode.",
-            expected="4 k + 1 frames",
-            got=num_frames,
-        )
-    return 1 + (num_frames - 1) // TEMPORAL_COMPRESSION
 
 
 def group_key(episode_id: str, stride: int, phase: int) -> str:
@@ -84,21 +61,29 @@ def single_key(episode_id: str) -> str:
     return f"{episode_id}/single"
 
 
-class LatentStore:
-    """Read access to a Latents artifact; a clip source (see clip_source.py)."""
+def write_store_index(root: Path, rows: Sequence[LatentRow], description: Mapping[str, Any]) -> None:
+    """Write which episodes a store holds, and what it is; the shards are there already."""
+    columns = [{"episode_id": row.episode_id, "shard": row.shard, **vars(row)} for row in rows]
+    with atomic_path(root / _INDEX) as temporary:
+        pq.write_table(pa.Table.from_pylist(columns), temporary, compression="zstd")
+    write_json_atomic(root / _DESCRIPTION, dict(description))
+
+
+class LatentStore(ClipSource):
+    """Read access to a Latents artifact."""
 
     dtype: np.dtype[Any] = np.dtype(np.float32)
 
-    def __init__(self, root: Path, description: dict[str, Any], rows: list[LatentRow]) -> None:
+    def __init__(self, root: Path, description: dict[str, Any], rows: Sequence[LatentRow]) -> None:
+        super().__init__(rows)
         self.root = root
         self.description = description
         self.layout: Layout = description["layout"]
-        self.start_step: int = description["start_step"]
+        self.start_step = description["start_step"]
         self.strides: tuple[int, ...] = tuple(description["strides"])
-        self.latent_shape: tuple[int, int, int] = tuple(description["latent_shape"])
-        self.image_size: tuple[int, int] = tuple(description["image_size"])
-        self.rows = rows
-        self._by_id = {row.episode_id: row for row in rows}
+        self.latent_shape = tuple(description["latent_shape"])
+        self.image_size = tuple(description["image_size"])
+        self._shard_of = {row.episode_id: row.shard for row in rows}
         self._shards: dict[str, Any] = {}
 
     @classmethod
@@ -109,43 +94,18 @@ class LatentStore:
             ArtifactError: if the folder is not a Latents artifact.
         """
         root = Path(root)
-        for name in ("store.json", "index.parquet"):
+        for name in (_DESCRIPTION, _INDEX):
             if not (root / name).is_file():
                 raise ArtifactError(
                     "This folder is not a Latents artifact.",
                     where=root / name,
-                    expected="store.json and index.parquet",
+                    expected=f"{_DESCRIPTION} and {_INDEX}",
                     got="no such file",
                     next_step="run the encode_latents step first",
                 )
-        description = json.loads((root / "store.json").read_text())
-        rows = [
-            LatentRow(**{**row, "views": tuple(row["views"])})
-            for row in pq.read_table(root / "index.parquet").to_pylist()
-        ]
-        return cls(root, description, rows)
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def row(self, episode_id: str) -> LatentRow:
-        """The index row of an episode.
-
-        Raises:
-            ArtifactError: if the store does not hold it.
-        """
-        if episode_id not in self._by_id:
-            raise ArtifactError(
-                "The latent store does not hold this episode.",
-                where=self.root,
-                got=episode_id,
-                next_step="encode the latents of the same EpisodeSet that is trained on",
-            )
-        return self._by_id[episode_id]
-
-    def max_frames(self, row: ClipRow, start: int, stride: int) -> int:
-        """Longest clip length (4 k + 1 frames) that starts at ``start`` with ``stride``."""
-        return longest_clip(row.num_frames, start, stride)
+        table = pq.read_table(root / _INDEX).to_pylist()
+        rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in table]
+        return cls(root, json.loads((root / _DESCRIPTION).read_text()), rows)
 
     def __getstate__(self) -> dict[str, Any]:
         # Open shards stay in the process that opened them.
@@ -161,7 +121,7 @@ class LatentStore:
         torch.from_numpy(out).copy_(self.clip(clip.episode_id, clip.start, clip.num_frames, clip.stride, views))
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
-        """A copy of what was read, on ``device``: buffers that were read into are used again."""
+        """A copy of what was read, on ``device``: the buffers that clips are read into are used again."""
         return read.to(device, copy=True)
 
     def clip(
@@ -182,66 +142,52 @@ class LatentStore:
         frames = latent_frame_count(num_frames)
         if stride not in self.strides:
             raise ArtifactError(
-                "The latent store was not encoded at this stride.",
-                where=self.root,
-                expected=self.strides,
-                got=stride,
+                "The latent store was not encoded at this stride.", where=self.root, expected=self.strides, got=stride
             )
-        if start_frame % self.start_step or start_frame < 0 or num_frames > self.max_frames(row, start_frame, stride):
+        longest = longest_clip(row.num_frames, start_frame, stride)
+        if start_frame % self.start_step or start_frame < 0 or num_frames > longest:
             raise DataError(
                 "A clip does not fit the stored latents of its episode.",
                 where=episode_id,
                 expected=f"a start frame divisible by {self.start_step}, within {row.num_frames} frames",
                 got=f"start {start_frame}, {num_frames} frames, stride {stride}",
             )
-        selected = self._view_indices(row, views)
-        clip = self._read(row, start_frame, frames, stride)[selected].to(torch.float32)
+        missing = [view for view in views or () if view not in row.views]
+        if missing:
+            raise ArtifactError(
+                "The latent store does not hold this view.", where=episode_id, expected=row.views, got=missing
+            )
+        selected = [row.views.index(view) for view in views or row.views]
+        clip = self._stored(episode_id, start_frame, frames, stride)[selected].to(torch.float32)
         if not bool(torch.isfinite(clip).all()):
             raise DataError(
                 "Cached latents hold values that are not finite.",
-                where=f"{row.shard}, episode {episode_id}",
+                where=f"{self._shard_of[episode_id]}, episode {episode_id}",
                 next_step="delete this Latents artifact and encode it again; check the tokenizer",
             )
         return clip
 
-    def _view_indices(self, row: LatentRow, views: tuple[str, ...] | None) -> list[int]:
-        missing = [view for view in views or () if view not in row.views]
-        if missing:
-            raise ArtifactError(
-                "The latent store does not hold this view.",
-                where=row.episode_id,
-                expected=row.views,
-                got=missing,
-            )
-        return [row.views.index(view) for view in views or row.views]
-
-    def _read(self, row: LatentRow, start: int, frames: int, stride: int) -> Float[Tensor, "v c t h w"]:
-        shard = self._shard(row.shard)
+    def _stored(self, episode_id: str, start: int, frames: int, stride: int) -> Float[Tensor, "v c t h w"]:
+        """``frames`` latent frames of all stored views, in half precision."""
+        path = self.root / self._shard_of[episode_id]
         try:
+            if path.name not in self._shards:
+                self._shards[path.name] = safe_open(path, framework="pt")
+            shard = self._shards[path.name]
             if self.layout == "clips":
-                return shard.get_slice(clip_key(row.episode_id, stride, start))[:, :, :frames]
+                return shard.get_slice(clip_key(episode_id, stride, start))[:, :, :frames]
             index = start // self.start_step
-            first = shard.get_slice(single_key(row.episode_id))[:, :, index : index + 1]
+            first = shard.get_slice(single_key(episode_id))[:, :, index : index + 1]
             if frames == 1:
                 return first
             period = TEMPORAL_COMPRESSION * stride
-            group_start = start + stride
-            offset = group_start // period
-            groups = shard.get_slice(group_key(row.episode_id, stride, group_start % period))
+            offset, phase = divmod(start + stride, period)
+            groups = shard.get_slice(group_key(episode_id, stride, phase))
             return torch.cat([first, groups[:, :, offset : offset + frames - 1]], dim=2)
-        except SafetensorError as error:
+        except (OSError, SafetensorError) as error:
             raise ArtifactError(
-                "A latent shard is damaged.",
-                where=self.root / row.shard,
+                "A latent shard is damaged or cannot be opened.",
+                where=path,
                 got=error,
                 next_step="encode the latents again",
             ) from error
-
-    def _shard(self, name: str) -> Any:
-        if name not in self._shards:
-            path = self.root / name
-            try:
-                self._shards[name] = safe_open(path, framework="pt")
-            except (OSError, SafetensorError) as error:
-                raise ArtifactError("A latent shard cannot be opened.", where=path, got=error) from error
-        return self._shards[name]

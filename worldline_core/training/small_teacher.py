@@ -30,8 +30,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.trainer import (
+    Objective,
     OptimizerConfig,
     ParameterGroup,
     TrainerConfig,
@@ -196,13 +196,13 @@ class TeacherConfig(StrictModel):
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Clips of single views, RGB in [0, 1]."""
+    """Clips of single views (episode/view), RGB in [0, 1]."""
 
-    clips: tuple[Clip, ...]
+    names: tuple[str, ...]
     frames: Float[Tensor, "b 3 t h w"]
 
 
-class MaskedVideoObjective:
+class MaskedVideoObjective(Objective[FrameBatch]):
     """Predict hidden tubelets."""
 
     def __init__(self, teacher: SmallVideoTeacher, hidden: float) -> None:
@@ -214,18 +214,10 @@ class MaskedVideoObjective:
         del step
         groups = 1 + (batch.frames.shape[2] - 1) // TUBELET
         tokens = self.teacher.grid[0] * self.teacher.grid[1]
-        draws = torch.rand(len(batch.clips), groups, tokens, generator=generator, device=batch.frames.device)
+        draws = torch.rand(len(batch.names), groups, tokens, generator=generator, device=batch.frames.device)
         hidden = draws < self.hidden
         hidden[:, 0] = False
         return self.teacher.masked_loss(batch.frames, hidden), {}
-
-    def state(self) -> dict[str, Any]:
-        """Nothing changes from step to step."""
-        return {}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Nothing to load."""
-        del state
 
 
 class FrameClips:
@@ -246,14 +238,14 @@ class FrameClips:
     def load(self, index: int) -> FrameBatch:
         """Batch ``index``: a pure function of the seed and the index."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
-        clips, frames = [], []
+        names, frames = [], []
         for _ in range(self.config.trainer.batch_size):
             number = int(random.integers(len(self.videos)))
             start = int(random.integers(self.videos[number].shape[1] - self.config.clip_frames + 1))
-            clips.append(Clip(self.names[number], start, self.config.clip_frames, 1))
+            names.append(self.names[number])
             frames.append(self.videos[number][:, start : start + self.config.clip_frames])
         stacked = torch.from_numpy(np.stack(frames)).to(self.config.trainer.device)
-        return FrameBatch(tuple(clips), stacked.float() / 255.0)
+        return FrameBatch(tuple(names), stacked.float() / 255.0)
 
 
 def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

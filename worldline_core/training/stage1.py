@@ -9,14 +9,13 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
-from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.model.text import TextConfig, load_text_encoder
 from worldline_core.model.world_model import WorldModel, WorldModelConfig, is_text_parameter
-from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipSampling
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage import Stage, StageConfig
-from worldline_core.training.trainer import ParameterGroup, join_processes
+from worldline_core.training.trainer import ParameterGroup
 
 
 class Stage1Config(StageConfig):
@@ -45,31 +44,26 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
         ConfigError: if the text does not fit the model's vocabulary.
         DataError: if no clip is long enough, or one cannot be read.
     """
-    device = config.trainer.device
-    processes = join_processes(device)
-    torch.manual_seed(config.trainer.seed)
-    if "base" in inputs:
-        model, info = load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both")
-        start = info.weights_sha256
-    else:
+
+    def load_model() -> tuple[WorldModel, CheckpointInfo | None]:
+        if "base" in inputs:
+            return load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both")
         model = WorldModel(config.model)
         model.initialise(torch.Generator().manual_seed(config.trainer.seed))
-        start = "scratch"
-    model.to(device).train()
+        return model, None
+
     title = "stage I" if config.kind == "stage1" else "base"
-    stage = Stage.open(config, inputs, output, number=1, title=title, views=model.config.views, processes=processes)
-    loader = ClipLoader(
-        stage.store,
-        views=model.config.views,
+    stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model)
+    model = stage.model
+    loader = stage.loader(
         text=load_text_encoder(config.text, model.config.vocab_size),
         frame_rates={row.episode_id: row.fps for row in stage.episodes.rows},
-        device=device,
     )
     objective = FlowMatchingObjective(
         model, sigma=config.sigma, weighting=config.weighting, text_dropout=config.text_dropout
     )
-    result = stage.train(objective, stage1_groups(model), loader, start=start)
-    facts = {"start": start, "text": config.text.model_dump(mode="json")}
-    counts = stage.save(model, result, kind=config.kind, action_contract={}, facts=facts)
+    result = stage.train(objective, stage1_groups(model), loader)
+    facts = {"start": stage.start, "text": config.text.model_dump(mode="json")}
+    counts = stage.save(result, kind=config.kind, action_contract={}, facts=facts)
     parameters = sum(value.numel() for value in model.parameters())
     return {**counts, "parameters": parameters, **result.metrics}

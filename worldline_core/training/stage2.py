@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from pydantic import Field
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
@@ -17,12 +16,11 @@ from worldline_core.actions.track_store import ActionTracks
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_source import ClipSource
 from worldline_core.training.flow_matching import FlowMatchingObjective, RelationalTerm
 from worldline_core.training.relational import RelationalConfig
 from worldline_core.training.stage import Stage, StageConfig
-from worldline_core.training.trainer import OptimizerConfig, ParameterGroup, join_processes
+from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
 from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
 
 FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)
@@ -52,7 +50,7 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
     ]
 
 
-def action_contract(config: Stage2Config, store: ClipSource, fps: float, controls: str) -> dict[str, Any]:
+def action_contract(config: Stage2Config, source: ClipSource, fps: float, controls: str) -> dict[str, Any]:
     """What the maps mean; rollouts refuse controls rendered under another contract."""
     return {
         "controls": controls,
@@ -65,8 +63,8 @@ def action_contract(config: Stage2Config, store: ClipSource, fps: float, control
         "sigma_px_ref": config.sigma_px_ref,
         "reference_canvas": list(REFERENCE_CANVAS),
         "wrist_projection": config.wrist_projection,
-        "grid_size": list(store.latent_shape[1:]),
-        "tokenizer": store.description["tokenizer"],
+        "grid_size": list(source.latent_shape[1:]),
+        "tokenizer": source.description["tokenizer"],
     }
 
 
@@ -80,12 +78,8 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         ConfigError: if relational terms are asked for without a teacher.
         DataError: if no clip fits, or one cannot be read.
     """
-    device = config.trainer.device
-    processes = join_processes(device)
-    torch.manual_seed(config.trainer.seed)
     kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
-    model, info = load_checkpoint(Path(inputs["stage1"]), expect_kind=kinds, towers="generation")
-    model.to(device).train()
+    parent = Path(inputs["stage1"])
     tracks = ActionTracks.open(Path(inputs["tracks"]))
     stage = Stage.open(
         config,
@@ -93,18 +87,11 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         output,
         number=2,
         title="stage II",
-        views=model.config.views,
-        processes=processes,
+        load_model=lambda: load_checkpoint(parent, expect_kind=kinds, towers="generation"),
         tracks=tracks,
     )
-    loader = ClipLoader(
-        stage.store,
-        views=model.config.views,
-        tracks=tracks,
-        sigma_px_ref=config.sigma_px_ref,
-        wrist_projection=config.wrist_projection,
-        device=device,
-    )
+    model = stage.model
+    loader = stage.loader(tracks=tracks, sigma_px_ref=config.sigma_px_ref, wrist_projection=config.wrist_projection)
     objective = FlowMatchingObjective(
         model,
         sigma=config.sigma,
@@ -113,11 +100,11 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         relational=_relational(config, inputs, model),
     )
     groups = stage2_groups(model, config.action_multiplier)
-    result = stage.train(objective, groups, loader, start=info.weights_sha256)
-    controls = tracks.tracks(stage.used[0].episode_id).controls
-    contract = action_contract(config, stage.store, stage.episodes.rows[0].fps, controls)
-    facts = {"start": {"kind": info.kind, "weights_sha256": info.weights_sha256}}
-    counts = stage.save(model, result, kind="stage2", action_contract=contract, facts=facts)
+    result = stage.train(objective, groups, loader)
+    controls = tracks.tracks(stage.training_rows[0].episode_id).controls
+    contract = action_contract(config, stage.source, stage.episodes.rows[0].fps, controls)
+    facts = {"start": {"kind": stage.parent_kind, "weights_sha256": stage.start}}
+    counts = stage.save(result, kind="stage2", action_contract=contract, facts=facts)
     trained = sum(value.numel() for group in groups for value in group.parameters.values())
     return {**counts, "trained_parameters": trained, **result.metrics}
 

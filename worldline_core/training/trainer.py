@@ -1,14 +1,12 @@
-"""The training loop of every stage: optimiser, averages, metrics, and a state from which a killed run continues.
+"""The training loop of every model that is trained here: optimiser, averages, metrics, and a state to continue from.
 
-Metrics of a run as JSON lines that a resumed run continues without a seam.
-
-Training on several processes: torchrun starts them, each takes its part of every global batch, weights stay equal.
+A model states its parameters, its objective and its batches; see `train`. With torchrun, several processes share every
+global batch; weights stay equal on all of them.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 import time
@@ -25,44 +23,14 @@ from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, TrainingError
-from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.training_state import (
     STATE_FILE,
     ExponentialAverage,
+    MetricsLog,
     identity_digests,
     load_training_state,
     save_training_state,
 )
-
-
-class MetricsLog:
-    """Appends rows with a ``step``; rows later than the resumed step are dropped, so they are written again once."""
-
-    def __init__(self, path: Path, resume_step: int) -> None:
-        self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        kept = [line for line in _complete_lines(path) if json.loads(line)["step"] <= resume_step]
-        write_bytes_atomic(path, "".join(f"{line}\n" for line in kept).encode())
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Append one row."""
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row, allow_nan=False) + "\n")
-
-
-def _complete_lines(path: Path) -> list[str]:
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8")
-    # A kill may have cut the last line short.
-    return text[: text.rfind("\n") + 1].splitlines()
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """All rows of a log, for the report's loss curves."""
-    return [json.loads(line) for line in _complete_lines(path)]
-
 
 # The first process makes the offline trajectories alone: at full size that takes hours while the others wait.
 _PATIENCE = timedelta(hours=24)
@@ -134,7 +102,7 @@ class OptimizerConfig(StrictModel):
 
 
 class TrainerConfig(StrictModel):
-    """Length, batch and bookkeeping of a run. ``batch_size`` counts clips a device and micro-step."""
+    """Length, batch and bookkeeping of a run. ``batch_size`` counts examples per device and micro-step."""
 
     steps: int = Field(ge=1)
     batch_size: int = Field(default=8, ge=1)
@@ -160,21 +128,27 @@ class ParameterGroup:
     multiplier: float = 1.0
 
 
-class NamedClips(Protocol):
-    """A batch says which clips it holds, so that an error can name them."""
+class NamedBatch(Protocol):
+    """A batch names its examples, so that they can be counted and an error can say which they were."""
 
     @property
-    def clips(self) -> tuple[Clip, ...]: ...
+    def names(self) -> Sequence[str]: ...
 
 
-class Objective[BatchT: NamedClips](Protocol):
-    """What a stage minimises. State that changes from step to step (loss scales) is saved with the run."""
+class Objective[BatchT: NamedBatch](Protocol):
+    """What a training minimises. Objectives without a state of their own inherit `state` and `load_state`."""
 
-    def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]: ...
+    def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss of one micro-batch, and values to log beside it."""
+        ...
 
-    def state(self) -> dict[str, Any]: ...
+    def state(self) -> dict[str, Any]:
+        """JSON values that change from step to step (loss scales): saved with the run."""
+        return {}
 
-    def load_state(self, state: dict[str, Any]) -> None: ...
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from saved values."""
+        del state
 
 
 @dataclass(frozen=True)
@@ -205,16 +179,17 @@ def autocast(config: TrainerConfig) -> AbstractContextManager[object]:
     return torch.autocast(torch.device(config.device).type, dtype=torch.bfloat16)
 
 
-def train[BatchT: NamedClips](
+def train[BatchT: NamedBatch](
     config: TrainerConfig,
     *,
     groups: Sequence[ParameterGroup],
     objective: Objective[BatchT],
     load: Callable[[int], BatchT],
-    validate: Callable[[], dict[str, float]] | None,
+    validate: Callable[[], dict[str, float]] | None = None,
     output: Path,
     identity: Mapping[str, Any],
     title: str,
+    schedule: Callable[[int], float] | None = None,
     rank: int = 0,
     world_size: int = 1,
 ) -> TrainingResult:
@@ -224,9 +199,11 @@ def train[BatchT: NamedClips](
 
     Args:
         load: micro-step index to batch (a pure function).
-        validate: called with the averaged weights in the model.
+        validate: measures held-out losses; called with the averaged weights in the model.
+        output: ``metrics.jsonl`` is written here, the state to continue from and timings under ``run/``.
         identity: JSON values that name this run (config, weights it starts from, clips); a state of another run is
             refused.
+        schedule: factor on the base learning rate per step (0-based); by default `learning_rate_factor`.
 
     Raises:
         TrainingError: if the loss or the gradient is not finite.
@@ -253,7 +230,7 @@ def train[BatchT: NamedClips](
     seen = 0
     progress = tqdm(total=config.steps, initial=first, desc=title, unit="step", disable=None if rank == 0 else True)
     for step in range(first, config.steps):
-        factor = learning_rate_factor(config.optimizer, step, config.steps)
+        factor = schedule(step) if schedule else learning_rate_factor(config.optimizer, step, config.steps)
         for slot, group in zip(optimizer.param_groups, groups, strict=True):
             slot["lr"] = config.optimizer.learning_rate * group.multiplier * factor
         values, norm, size = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
@@ -309,7 +286,7 @@ def _optimizer(config: OptimizerConfig, groups: Sequence[ParameterGroup]) -> tor
     )
 
 
-def _step[BatchT: NamedClips](
+def _step[BatchT: NamedBatch](
     config: TrainerConfig,
     objective: Objective[BatchT],
     load: Callable[[int], BatchT],
@@ -320,21 +297,21 @@ def _step[BatchT: NamedClips](
     rank: int,
     world_size: int,
 ) -> tuple[dict[str, float], float, int]:
-    """One optimiser step: mean metrics of its micro-steps, the gradient norm before clipping, clips of this rank."""
+    """One optimiser step: mean metrics of its micro-steps, the gradient norm before clipping, examples of this rank."""
     optimizer.zero_grad(set_to_none=True)
     totals: dict[str, float] = {}
     size = 0
     for part in range(config.accumulation):
         index = step * config.accumulation + part
         batch = load(index)
-        size += len(batch.clips)
+        size += len(batch.names)
         generator = step_generator(config.seed, index * world_size + rank, config.device)
         with autocast(config):
             loss, values = objective.loss(batch, generator, step)
         if not math.isfinite(loss.item()):
             raise TrainingError(
                 "The loss is not finite.",
-                where=f"{title}, step {step}, clips {', '.join(clip.episode_id for clip in batch.clips)}",
+                where=f"{title}, step {step}, clips {', '.join(batch.names)}",
                 expected="a finite loss",
                 got=loss.item(),
                 next_step="lower the learning rate, or look at these clips; the last saved state is from before",

@@ -1,6 +1,6 @@
-"""Everything that a killed training run needs to go on bit by bit: one safetensors file, replaced atomically.
+"""What a killed training run needs to continue bit by bit: weights, their average, optimizer moments, random state, log.
 
-Exponential moving average of the trained weights; shipped checkpoints hold the average.
+One safetensors file, replaced atomically, holds all but the log of metrics.
 """
 
 from __future__ import annotations
@@ -18,11 +18,37 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from worldline_core.errors import ArtifactError
-from worldline_core.store.atomic import atomic_path
+from worldline_core.store.atomic import atomic_path, write_bytes_atomic
+
+
+class MetricsLog:
+    """JSON lines, each with a ``step``; lines later than the resumed step are dropped: they will be written again."""
+
+    def __init__(self, path: Path, resume_step: int) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kept = [line for line in _complete_lines(path) if json.loads(line)["step"] <= resume_step]
+        write_bytes_atomic(path, "".join(f"{line}\n" for line in kept).encode())
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Append one row."""
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(row, allow_nan=False) + "\n")
+
+
+def _complete_lines(path: Path) -> list[str]:
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    # A kill may have cut the last line short.
+    return text[: text.rfind("\n") + 1].splitlines()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """All rows of a log, for loss curves."""
+    return [json.loads(line) for line in _complete_lines(path)]
 
 
 class ExponentialAverage:
-    """Average of named parameters.
+    """Exponential moving average of named parameters; shipped checkpoints hold it.
 
     The decay rises with the number of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
     forgotten also in short runs.
@@ -148,16 +174,12 @@ def load_training_state(
             raise ArtifactError("The training state lacks weights.", where=path, got=missing[:5])
         for name, parameter in parameters.items():
             parameter.copy_(stored.get_tensor(f"weight/{name}"))
-            slots = {
-                key: stored.get_tensor(f"{key}/{name}")
-                for key in ("step", "exp_avg", "exp_avg_sq")
-                if f"{key}/{name}" in names
-            }
-            if slots:
-                optimizer.state[parameter] = {
-                    key: value if key == "step" and parameter.device.type == "cpu" else value.to(parameter.device)
-                    for key, value in slots.items()
-                }
+            for key in ("step", "exp_avg", "exp_avg_sq"):
+                if f"{key}/{name}" in names:
+                    value = stored.get_tensor(f"{key}/{name}")
+                    # Moments have the memory layout of their parameter.
+                    target = torch.empty((), device=parameter.device) if key == "step" else torch.empty_like(parameter)
+                    optimizer.state[parameter][key] = target.copy_(value)
         average.load({name: stored.get_tensor(f"average/{name}") for name in parameters})
         torch.set_rng_state(stored.get_tensor("random_state"))
     return facts

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import Clip
 from worldline_core.training.small_teacher import DESCRIPTION, load_small_teacher
 
 JEPA_BLOCKS = 4
