@@ -1,14 +1,14 @@
-# `make demo` runs the whole pipeline with the tiny preset, `make test` the tests. Both install what they need.
+# `make demo` runs the whole pipeline with the demo preset, `make test` the tests. Both install what they need.
 # Needs: Python 3.12 within reach (or the network, where uv can fetch one) and git.
 SHELL := /bin/bash
 # A uv on the path counts only where it runs: version managers leave shims that answer "not found".
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
 
-.PHONY: demo test test-slow lint install install-scale record clean
+.PHONY: demo wheels test test-slow lint install install-scale record clean
 
 demo: install
-	$(RUN) worldline pipeline --preset tiny
+	$(RUN) worldline pipeline --preset demo
 
 # One process a core, one thread each.
 test: install-scale
@@ -37,6 +37,11 @@ install-scale: install
 # The recordings that the demo uses, made again from their seeds (needs software GL, see README).
 record: install
 	$(RUN) worldline record --config configs/recording/sample.yaml --output artifacts/recorded
+
+# The package, and the shipped recordings and models as a second one: pip install worldline[assets] --find-links dist
+wheels: install
+	$(UV) build --wheel --out-dir dist .
+	$(UV) build --wheel --out-dir dist packaging/assets
 
 clean:
 	rm -rf .bootstrap .venv

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 
 from flows.exchange_commands import add_exchange_commands
@@ -16,6 +17,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="worldline", description="From robot recordings to an action-driven visual simulator."
     )
+    parser.add_argument("--version", action="version", version=f"worldline {metadata.version('worldline')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     pipeline = commands.add_parser("pipeline", help="run every step, from recordings to the report")
     pipeline.set_defaults(run=_pipeline)
@@ -146,7 +148,8 @@ def _pipeline(arguments: argparse.Namespace) -> None:
     _use_local_prefect_storage(arguments.artifacts)
     from flows.pipeline import pipeline
 
-    preset = arguments.preset or (None if arguments.config else "tiny")
+    preset = arguments.preset or (None if arguments.config else "demo")
+    print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
     report = pipeline(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
     print(f"report: {report.path / 'index.html'}")
 
@@ -155,7 +158,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
     _use_local_prefect_storage(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
 
-    preset = arguments.preset or (None if arguments.config else "tiny")
+    preset = arguments.preset or (None if arguments.config else "demo")
     print(f"nightly: {nightly_evaluation(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)}")
 
 

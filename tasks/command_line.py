@@ -18,7 +18,7 @@ from worldline_core.store.store import Artifact, ArtifactStore
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments that say which configuration and which store a command works on."""
     choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("--preset", help="a preset in configs/ (default: tiny)")
+    choice.add_argument("--preset", help="a preset in configs/ (default: demo)")
     choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
@@ -48,7 +48,7 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
     """Run one step with parsed arguments."""
     step = get_step(step_name)
     store = ArtifactStore(arguments.artifacts)
-    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "tiny"
+    preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
     from tasks.shard_mapper import shard_mapper
     from worldline_core.pipeline.pipeline_config import source_inputs
     from worldline_core.scale.mapping import RunnerConfig

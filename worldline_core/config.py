@@ -16,7 +16,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.errors import ConfigError
 
-CONFIG_ROOT = Path(__file__).resolve().parents[1] / "configs"
+_PACKAGE = Path(__file__).resolve().parent
+# An installed package carries the presets and embodiments inside of it.
+CONFIG_ROOT = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -49,6 +51,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file is missing, is not YAML, repeats a key, or does not hold a mapping.
     """
+    if not path.is_file() and path.parts[:1] == ("configs",):
+        # The documents name the project's own files so; an installed package has them elsewhere.
+        path = CONFIG_ROOT.joinpath(*path.parts[1:])
     if not path.is_file():
         raise ConfigError("No such configuration file", where=path, next_step="check the path, or use --preset NAME")
     try:

@@ -12,6 +12,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from worldline_core.shipped import SHIPPED, project_path
+
 
 def examine_machine(project: Path) -> list[dict[str, Any]]:
     """One finding a line: name, status ("ok", "missing", "optional"), what was found, and what to do."""
@@ -136,13 +138,14 @@ def _software_gl() -> dict[str, Any]:
 def _weights(project: Path) -> list[dict[str, Any]]:
     findings = []
     for name in ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter"):
-        folder = project / "artifacts" / "shipped" / "models" / name
+        folder = project_path(project, SHIPPED / "models" / name)
         present = any(folder.glob("*.safetensors"))
         findings.append(
             _finding(
                 f"weights {name}",
                 "ok" if present else "missing",
-                str(folder.relative_to(project)) if present else "absent",
+                str(folder.relative_to(project) if folder.is_relative_to(project) else folder) if present else "absent",
+                "" if present else "they come with a checkout, and with pip install 'worldline[assets]'",
             )
         )
     hub = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")) / "hub"

@@ -19,7 +19,7 @@ def nodes(project_root: Path) -> list[Node]:
     return plan(load_config(PipelineConfig, preset="tiny"), project_root)
 
 
-@pytest.mark.parametrize("preset", ["tiny", "smoke", "cosmos3-nano"])
+@pytest.mark.parametrize("preset", ["demo", "tiny", "smoke", "cosmos3-nano"])
 def test_every_preset_is_valid_and_every_input_comes_before_its_use(preset: str, project_root: Path) -> None:
     seen: set[str] = set()
     for node in plan(load_config(PipelineConfig, preset=preset), project_root):

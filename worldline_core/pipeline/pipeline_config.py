@@ -22,6 +22,7 @@ from worldline_core.model.cosmos3 import ImportBackboneConfig
 from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
 from worldline_core.training.encode_latents import EncodeLatentsConfig
 from worldline_core.training.stage1 import Stage1Config
@@ -90,6 +91,6 @@ def source_inputs(config: StrictModel, project: Path) -> dict[str, Path]:
     taken from ``project``."""
     sources = getattr(config, "sources", ())
     return {
-        f"source.{number}": source.path if is_remote(source.path) else project / source.path
+        f"source.{number}": source.path if is_remote(source.path) else project_path(project, source.path)
         for number, source in enumerate(sources)
     }

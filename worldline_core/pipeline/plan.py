@@ -14,6 +14,7 @@ from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun, source_inputs
 from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.scale.mapping import ShardMapper
+from worldline_core.shipped import project_path
 from worldline_core.store.store import Artifact, ArtifactStore
 from worldline_core.training.clip_source import FrameInput
 from worldline_core.training.stage import StageConfig
@@ -35,7 +36,9 @@ def plan(config: PipelineConfig, project: Path) -> list[Node]:
 
 
 def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
-    models = {name: project / path for name, path in config.models.model_dump().items() if path is not None}
+    models = {
+        name: project_path(project, path) for name, path in config.models.model_dump().items() if path is not None
+    }
     yield Node("curate", "curate", config.curate, source_inputs(config.curate, project))
     yield Node("filter", "filter", config.filter, {"episodes": "curate"})
     yield Node("render_actions", "render_actions", config.render_actions, {"episodes": "filter"})

@@ -7,9 +7,10 @@ y left, z up; metres and radians. A tool pose that points straight down has tool
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-ROBOTS_FOLDER = Path(__file__).resolve().parents[2] / "artifacts" / "shipped" / "robots"
+from worldline_core.shipped import shipped_folder
+
+ROBOTS_FOLDER = shipped_folder() / "robots"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,64 @@
+"""The wheels alone, in an empty folder: presets, embodiments and shipped files are found without a checkout."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+
+def _uv(project_root: Path) -> str:
+    for candidate in (shutil.which("uv"), str(project_root / ".bootstrap" / "bin" / "uv")):
+        # A version manager may leave a uv that only says that it is not there.
+        if (
+            candidate
+            and Path(candidate).is_file()
+            and subprocess.run([candidate, "--version"], capture_output=True, check=False).returncode == 0
+        ):
+            return candidate
+    pytest.skip("uv builds the wheels and is not here")
+
+
+@pytest.fixture(scope="module")
+def installed(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with both wheels unpacked, as an installation would have them."""
+    built = tmp_path_factory.mktemp("wheels")
+    for source in (".", "packaging/assets"):
+        subprocess.run([_uv(project_root), "build", "-q", "--wheel", "-o", built, source], cwd=project_root, check=True)
+    wheels = sorted(built.glob("*.whl"))
+    assert [wheel.name.split("-")[0] for wheel in wheels] == ["worldline", "worldline_assets"]
+    site = tmp_path_factory.mktemp("site")
+    for wheel in wheels:
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(site)  # built just now
+    return site
+
+
+def _worldline(installed: Path, folder: Path, *arguments: str) -> str:
+    # -P and the order of PYTHONPATH keep the checkout out of sight.
+    code = "import sys; from flows.command_line import main; main(sys.argv[1:])"
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", code, *arguments],
+        cwd=folder, env={**os.environ, "PYTHONPATH": str(installed)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.mark.slow
+def test_an_empty_folder_is_enough(installed: Path, tmp_path: Path) -> None:
+    assert (installed / "worldline_core" / "py.typed").is_file()
+    findings = {row["name"]: row for row in json.loads(_worldline(installed, tmp_path, "doctor", "--json"))}
+    assert findings["weights causal"]["found"] == str(installed / "worldline_assets/shipped/models/causal")
+    assert "aloha_viperx" in _worldline(installed, tmp_path, "embodiment", "list")
+    for step in ("curate", "filter", "render_actions"):
+        assert "built" in _worldline(installed, tmp_path, "task", step, "--preset", "smoke")
+    made = _worldline(installed, tmp_path, "task", "rollout", "--preset", "smoke", "--node", "rollout.copy_first_frame")
+    assert Path(made.split()[0], "manifest.json").is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["artifacts"]
