@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import collate_tracks, project_tools
+from worldline_core.actions.episode_tracks import collate_tracks
+from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import CalibrationError, DataError
 

@@ -11,8 +11,8 @@ import torch
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import CAUSES, TrackBatch, collate_tracks, project_tools
-from worldline_core.actions.tool_projection import add_counts
+from worldline_core.actions.episode_tracks import TrackBatch, collate_tracks
+from worldline_core.actions.tool_projection import CAUSES, add_counts, project_tools
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import MIN_DEPTH_M
 

@@ -15,7 +15,8 @@ import torch
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import TrackBatch, collate_tracks, project_tools
+from worldline_core.actions.episode_tracks import TrackBatch, collate_tracks
+from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.episode import VIEWS
 
 NEAREST_M = 0.01

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
-from worldline_core.actions.track_store import ActionTracks
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter

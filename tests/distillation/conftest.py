@@ -14,8 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.track_store import write_index, write_shard
+from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes import episode_index
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.training.latent_store import clip_key

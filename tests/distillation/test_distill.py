@@ -10,7 +10,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.distillation import objectives, teacher_trajectories
 from worldline_core.distillation.batches import robot_masks
 from worldline_core.distillation.distill import distill

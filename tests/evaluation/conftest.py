@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from worldline_core.actions.track_store import write_index, write_shard
+from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.rollout.rollout_set import RolloutSetWriter

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.track_store import write_index, write_shard
+from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.evaluation.policy.evaluate_policy import summarise_decisions

@@ -12,8 +12,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.track_store import write_index, write_shard
+from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError

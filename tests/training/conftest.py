@@ -14,8 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
-from worldline_core.actions.track_store import write_index, write_shard
+from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.world_model import WorldModelConfig

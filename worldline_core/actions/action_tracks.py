@@ -1,4 +1,4 @@
-"""From an episode to its action tracks: controls, kinematics and calibration in, projected end-effectors out.
+"""Action rendering: from an episode's controls to its action tracks, the projected end-effectors (paper, "Action rendering").
 
 Nothing here looks at a future observation. Tool poses are forward kinematics of the *controls*. The head camera keeps
 the pose of the first frame. A wrist camera follows from the controls and its mount (`wrist_camera` of the embodiment);
@@ -8,36 +8,20 @@ are used, and the tracks say so (`camera_motion`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from worldline_core.actions.episode_tracks import (
-    HEAD_VIEW,
-    EpisodeTracks,
-    TrackBatch,
-    WristProjection,
-    collate_tracks,
-)
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
-from worldline_core.actions.tool_projection import TrackCounts, count_samples, project_tools
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.tool_projection import Projection, TrackCounts, count_samples, project_tools
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import invert, is_rigid
-
-__all__ = [
-    "ActionTracks",
-    "EpisodeTracks",
-    "TrackBatch",
-    "TrackCounts",
-    "WristProjection",
-    "collate_tracks",
-    "compute_tracks",
-]
 
 Controls = Literal["action", "state"]
 Fallback = Literal["recorded", "first_frame_mount"]
@@ -95,38 +79,60 @@ def compute_tracks(
     cameras, motion = _camera_poses(episode, T_base_tool, arms, wrist_cameras, without_mount)
     K = torch.stack([_intrinsics(episode, view) for view in VIEWS])
     seen = project_tools(T_base_tool, gripper, K, cameras, image_size)
+    tracks = tracks_of_projection(
+        episode, seen, T_base_tool, cameras, K, capsules, radii,
+        views=VIEWS, arms=arms, image_size=image_size, controls=kind, camera_motion=motion,
+    )  # fmt: skip
     present = [number for number, view in enumerate(VIEWS) if view in episode.cameras]
-    counts = count_samples(seen.cause[:, present], gripper, arms, outside_limits)
-    tracks = EpisodeTracks(
+    return tracks, count_samples(seen.cause[:, present], gripper, arms, outside_limits)
+
+
+def tracks_of_projection(
+    episode: Episode,
+    seen: Projection,
+    T_base_tool: Tensor,
+    T_base_camera: Tensor,
+    K: Tensor,
+    capsules: Tensor,
+    capsule_radii: Tensor,
+    *,
+    views: Sequence[str],
+    arms: Sequence[str],
+    image_size: tuple[int, int],
+    controls: str,
+    camera_motion: Sequence[str],
+) -> EpisodeTracks:
+    """What was projected, in the types that tracks are stored in (float32, uv float64); unknown poses become zeros."""
+    return EpisodeTracks(
         episode_id=episode.episode_id,
         embodiment=episode.embodiment,
-        views=VIEWS,
-        arms=arms,
+        views=tuple(views),
+        arms=tuple(arms),
         image_size=image_size,
-        controls=kind,
-        camera_motion=motion,
+        controls=controls,
+        camera_motion=tuple(camera_motion),
         uv=seen.uv.numpy(),
         valid=seen.valid.numpy(),
-        **{name: getattr(seen, name).float().numpy() for name in ("depth", "rot6d", "gripper")},
-        **{
-            name: torch.nan_to_num(value).float().numpy()
-            for name, value in (
-                ("T_base_tool", T_base_tool),
-                ("T_base_camera", cameras),
-                ("K", K),
-                ("capsules", capsules),
-                ("capsule_radii", radii),
-            )
-        },
+        depth=seen.depth.float().numpy(),
+        rot6d=seen.rot6d.float().numpy(),
+        gripper=seen.gripper.float().numpy(),
+        T_base_tool=_stored(T_base_tool),
+        T_base_camera=_stored(T_base_camera),
+        K=_stored(K),
+        capsules=_stored(capsules),
+        capsule_radii=_stored(capsule_radii),
     )
-    return tracks, counts
+
+
+def _stored(value: Tensor) -> np.ndarray:
+    return torch.nan_to_num(value).float().numpy()
 
 
 def _image_size(episode: Episode, where: str) -> tuple[int, int]:
     sizes = {(camera.height, camera.width) for camera in episode.cameras.values()}
     if not sizes:
         raise CalibrationError(
-            "Episode has no calibrated camera", where=where, expected="K and T_base_camera a view", got="none"
+            "Episode has no calibrated camera", where=where, expected="K and T_base_camera per view", got="none"
         )
     if len(sizes) > 1:
         raise DataError(

@@ -1,37 +1,54 @@
-"""Tracks of one episode: where every end-effector is in every view, frame by frame, before any map is drawn.
+"""Tracks: where every end-effector is in every view, frame by frame, before any map is drawn; in memory and on disk.
 
 Axis legend: n frames, v views, a arms, s capsules. Frames of reference: base, tool (between the fingertips, +z out
 of the gripper), camera (OpenCV axes). Units: metres, pixels of the recorded frame size (centre of the first pixel
 is 0), gripper opening 0 closed .. 1 open. Which samples are valid is decided in `tool_projection`.
+
+On disk: shards `tracks-00000.safetensors` ... with entries `<episode_id>/<array>`, and `index.parquet` with one row per
+episode. Bytes depend on the tracks alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 from jaxtyping import Bool, Float
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 from torch import Tensor
 
-from worldline_core.actions.tool_projection import CAUSES, Projection, project_tools
-from worldline_core.errors import DataError
-
-__all__ = [
-    "CAUSES",
-    "HEAD_VIEW",
-    "EpisodeTracks",
-    "Projection",
-    "TrackBatch",
-    "WristProjection",
-    "collate_tracks",
-    "project_tools",
-]
+from worldline_core.actions.tool_projection import project_tools
+from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
 HEAD_VIEW = "head"
+INDEX_FILE = "index.parquet"
+SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")
+"""Arrays with one entry per frame, view and arm: what action maps are rendered from."""
+ARRAYS = (*SAMPLES, "T_base_tool", "T_base_camera", "K", "capsules", "capsule_radii")
+_DTYPES = {"valid": np.bool_, "uv": np.float64}  # of the arrays that are not float32
+_SCHEMA = pa.schema(
+    [
+        ("episode_id", pa.string()),
+        ("shard", pa.string()),
+        ("embodiment", pa.string()),
+        ("num_frames", pa.int64()),
+        ("views", pa.list_(pa.string())),
+        ("arms", pa.list_(pa.string())),
+        ("height", pa.int64()),
+        ("width", pa.int64()),
+        ("controls", pa.string()),
+        ("camera_motion", pa.list_(pa.string())),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -100,10 +117,7 @@ class EpisodeTracks:
             )
         cut = replace(
             self,
-            **{
-                name: getattr(self, name)[index]
-                for name in ("uv", "depth", "rot6d", "gripper", "valid", "T_base_tool", "T_base_camera", "capsules")
-            },
+            **{name: getattr(self, name)[index] for name in (*SAMPLES, "T_base_tool", "T_base_camera", "capsules")},
         )
         wrists = [i for i, view in enumerate(self.views) if view != HEAD_VIEW]
         if wrist_projection == "current_camera" or not wrists:
@@ -133,7 +147,7 @@ class TrackBatch:
 
     def to(self, device: torch.device | str) -> TrackBatch:
         """The same batch on another device."""
-        return TrackBatch(*(getattr(self, name).to(device) for name in ("uv", "depth", "rot6d", "gripper", "valid")))
+        return TrackBatch(*(getattr(self, name).to(device) for name in SAMPLES))
 
 
 def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None = None) -> TrackBatch:
@@ -145,7 +159,7 @@ def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None =
         raise DataError("No action tracks to collate", expected="at least one clip", got="none")
     order = tuple(views or clips[0].views)
     num_arms = max(len(clip.arms) for clip in clips)
-    columns: dict[str, list[np.ndarray]] = {name: [] for name in ("uv", "depth", "rot6d", "gripper", "valid")}
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLES}
     for clip in clips:
         missing = [view for view in order if view not in clip.views]
         if missing or clip.num_frames != clips[0].num_frames or clip.image_size != clips[0].image_size:
@@ -162,3 +176,115 @@ def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None =
             padding[2] = (0, num_arms - len(clip.arms))
             column.append(np.pad(values, padding))
     return TrackBatch(**{name: torch.from_numpy(np.stack(column)) for name, column in columns.items()})
+
+
+def shard_name(number: int) -> str:
+    """File name of a shard."""
+    return f"tracks-{number:05d}.safetensors"
+
+
+def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> list[dict[str, Any]]:
+    """Write one shard atomically; returns its index rows."""
+    arrays: dict[str, np.ndarray] = {}
+    rows: list[dict[str, Any]] = []
+    for episode in tracks:
+        for name in ARRAYS:
+            value = getattr(episode, name)
+            arrays[f"{episode.episode_id}/{name}"] = np.ascontiguousarray(value, dtype=_DTYPES.get(name, np.float32))
+        rows.append(
+            {
+                "episode_id": episode.episode_id,
+                "shard": shard_name(number),
+                "embodiment": episode.embodiment,
+                "num_frames": episode.num_frames,
+                "views": list(episode.views),
+                "arms": list(episode.arms),
+                "height": episode.image_size[0],
+                "width": episode.image_size[1],
+                "controls": episode.controls,
+                "camera_motion": list(episode.camera_motion),
+            }
+        )
+    write_bytes_atomic(root / shard_name(number), save(arrays))
+    return rows
+
+
+def write_index(root: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the index, ordered by episode id."""
+    ordered = sorted(rows, key=lambda row: row["episode_id"])
+    with atomic_path(root / INDEX_FILE) as temporary:
+        pq.write_table(pa.Table.from_pylist(ordered, schema=_SCHEMA), temporary)
+
+
+class ActionTracks:
+    """Read access to a finished ActionTracks artifact; only the episodes asked for are read."""
+
+    def __init__(self, root: Path, rows: Sequence[dict[str, Any]]) -> None:
+        self.root = root
+        self._rows = {row["episode_id"]: row for row in rows}
+
+    @classmethod
+    def open(cls, root: Path) -> ActionTracks:
+        """Open an artifact.
+
+        Raises: ArtifactError when the index is missing or lacks a column.
+        """
+        path = Path(root) / INDEX_FILE
+        if not path.is_file():
+            raise ArtifactError(
+                "Not an ActionTracks artifact", where=root, expected=INDEX_FILE, next_step="run render_actions"
+            )
+        table = pq.read_table(path)
+        missing = [name for name in _SCHEMA.names if name not in table.column_names]
+        if missing:
+            raise ArtifactError(
+                "ActionTracks index lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
+            )
+        return cls(Path(root), table.to_pylist())
+
+    @property
+    def episode_ids(self) -> list[str]:
+        """Ids of the episodes with tracks, in order."""
+        return list(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __contains__(self, episode_id: str) -> bool:
+        return episode_id in self._rows
+
+    def __iter__(self) -> Iterator[EpisodeTracks]:
+        return (self.tracks(episode_id) for episode_id in self._rows)
+
+    def tracks(self, episode_id: str) -> EpisodeTracks:
+        """Tracks of one episode.
+
+        Raises:
+            DataError: there are no tracks of this episode.
+            ArtifactError: the shard is missing or damaged.
+        """
+        if episode_id not in self._rows:
+            raise DataError(
+                "No action tracks of this episode",
+                where=self.root,
+                expected=f"one of {len(self)} episodes, such as {', '.join(self.episode_ids[:3])}",
+                got=episode_id,
+                next_step="see quarantine.parquet of the same artifact for the reason",
+            )
+        row = self._rows[episode_id]
+        path = self.root / row["shard"]
+        try:
+            with safe_open(path, framework="numpy") as shard:
+                arrays = {name: shard.get_tensor(f"{episode_id}/{name}") for name in ARRAYS}
+        except (OSError, SafetensorError) as error:
+            raise ArtifactError("Shard of action tracks cannot be read", where=path, got=str(error)) from error
+        return EpisodeTracks(
+            episode_id=episode_id,
+            embodiment=row["embodiment"],
+            views=tuple(row["views"]),
+            arms=tuple(row["arms"]),
+            image_size=(row["height"], row["width"]),
+            controls=row["controls"],
+            camera_motion=tuple(row["camera_motion"]),
+            **arrays,
+        )

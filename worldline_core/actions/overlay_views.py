@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.overlays import (
     AXIS_COLOURS,
     AXIS_NAMES,
@@ -18,24 +18,20 @@ from worldline_core.actions.overlays import (
     OUTLINE_COLOUR,
     SHADE,
     TILE_HEIGHT,
+    Colour,
     OverlayStyle,
     arm_colour,
     draw_overlay,
-)
+)  # fmt: skip
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
 from worldline_core.pictures.labels import INK, PAPER, Picture, font, text_strip, text_width_px
+from worldline_core.pictures.side_by_side import GAP_PX, STRIP_INK, STRIP_PAPER
 from worldline_core.store.atomic import atomic_path
 
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import EpisodeTracks
-
-STRIP_PAPER = (24, 26, 31)
-STRIP_INK = (240, 240, 238)
 HEADING_HEIGHT_PX = 28
 LEGEND_HEIGHT_PX = 26
-GAP_PX = 6
 
 
 def view_name(view: str) -> str:
@@ -49,8 +45,8 @@ def legend_strip(
     *,
     note: str = "",
     outline: bool = False,
-    ink: tuple[int, int, int] = INK,
-    paper: tuple[int, int, int] = PAPER,
+    ink: Colour = INK,
+    paper: Colour = PAPER,
     size_px: int = 13,
 ) -> Picture:
     """A strip that says what is drawn: arms, axes, ring, outline; and a note (a frame number) at its right end.
@@ -63,7 +59,7 @@ def legend_strip(
     end = width - 8 - (text_width_px(note, size_px) if note else 0)
     if note:
         draw.text((end, middle), note, font=font(size_px), fill=ink, anchor="lm")
-    marks: list[tuple[str, int, tuple[int, int, int]]] = []
+    marks: list[tuple[str, int, Colour]] = []
     items = [(f"{arm} tool", arm_colour(arms, index), "dot") for index, arm in enumerate(arms)]
     items += [(name, colour, "line") for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)]
     items += [("wide ring: gripper open", ink, "ring")]
@@ -117,26 +113,25 @@ def overlay_clip(
         )
     count = min(tracks.num_frames, *(len(frames[view]) for view in views))
     shown: list[Picture] = []
-    headings: list[Picture] = []
+    headings: dict[str, Picture] = {}
     for n in range(count):
         tiles = [draw_overlay(frames[view][n], tracks, n, view, tile_height=tile_height, style=style) for view in views]
-        height = max(tile.shape[0] for tile in tiles)
-        if not headings:
-            names = [view_name(view) for view in views]
-            names[0] = f"{names[0]}  ·  {title}" if title else names[0]
-            headings = [
-                text_strip(name, tile.shape[1], HEADING_HEIGHT_PX, ink=STRIP_INK, paper=STRIP_PAPER)
-                for name, tile in zip(names, tiles, strict=True)
-            ]
-        columns = [
-            np.concatenate([heading, tile, _blank(height - tile.shape[0], tile.shape[1])], axis=0)
-            for heading, tile in zip(headings, tiles, strict=True)
-        ]
-        gap = _blank(height + HEADING_HEIGHT_PX, GAP_PX)
-        row = np.concatenate([piece for column in columns for piece in (column, gap)][:-1], axis=1)
-        note = f"frame {n}  ·  {n / fps:.2f} s"
+        height = HEADING_HEIGHT_PX + max(tile.shape[0] for tile in tiles)
+        columns: list[Picture] = []
+        for view, tile in zip(views, tiles, strict=True):
+            if view not in headings:
+                name = view_name(view) + (f"  ·  {title}" if title and view == views[0] else "")
+                headings[view] = text_strip(name, tile.shape[1], HEADING_HEIGHT_PX, ink=STRIP_INK, paper=STRIP_PAPER)
+            below = _blank(height - HEADING_HEIGHT_PX - tile.shape[0], tile.shape[1])
+            columns += [np.concatenate([headings[view], tile, below], axis=0), _blank(height, GAP_PX)]
+        row = np.concatenate(columns[:-1], axis=1)
         legend = legend_strip(
-            tracks.arms, row.shape[1], note=note, outline=style.outline, ink=STRIP_INK, paper=STRIP_PAPER
+            tracks.arms,
+            row.shape[1],
+            note=f"frame {n}  ·  {n / fps:.2f} s",
+            outline=style.outline,
+            ink=STRIP_INK,
+            paper=STRIP_PAPER,
         )
         shown.append(np.concatenate([row, legend], axis=0))
     clip = np.stack(shown)
@@ -172,7 +167,7 @@ def overlay_sheet(
     style: OverlayStyle = DEFAULT_STYLE,
     title: str | None = None,
 ) -> Picture:
-    """A sheet with a row a view and a column a moment, and a legend.
+    """A sheet with a row per view, a column per moment, and a legend.
 
     Args:
         frames: by view, `m h w 3` RGB, the frames at the moments.

@@ -1,11 +1,11 @@
-"""The one drawer of action tracks over frames: heat, tool axes, gripper ring and, where wanted, the arms' outline.
+"""Overlays: action tracks drawn over one frame of one view (`overlay_views` puts views together).
 
 Every picture of the project in which controls lie over a frame is drawn here: previews of `render_actions`, the report,
 `worldline inspect`, Rerun layers and the pictures of `worldline calibrate check`.
 
 What is drawn of an end-effector that is valid in a view (nothing is drawn of the others):
 
-- heat, the first channel `h` of the action maps (method, section 2), in the arm's colour;
+- heat, the first channel `h` of the action maps (paper, "Action rendering"), in the arm's colour;
 - the tool's axes, 6 cm long, x red, y green, z blue, in perspective;
 - a ring around the tool's centre, the wider the further the gripper is open.
 
@@ -17,29 +17,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, grid_sigma
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
 from worldline_core.geometry.rotations import rotation_from_rot6d
 from worldline_core.pictures.labels import Picture, scale_frames, scaled_size
 
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import EpisodeTracks
-
-ARM_COLOURS: dict[str, tuple[int, int, int]] = {"left": (255, 150, 20), "right": (40, 150, 255)}
+Colour = tuple[int, int, int]
+ARM_COLOURS: dict[str, Colour] = {"left": (255, 150, 20), "right": (40, 150, 255)}
 """RGB. Orange and blue differ for every kind of colour vision."""
-OTHER_ARM_COLOUR = (60, 200, 120)
-AXIS_COLOURS: tuple[tuple[int, int, int], ...] = ((235, 50, 50), (50, 200, 70), (60, 100, 255))
+OTHER_ARM_COLOUR: Colour = (60, 200, 120)
+AXIS_COLOURS: tuple[Colour, ...] = ((235, 50, 50), (50, 200, 70), (60, 100, 255))
 AXIS_NAMES = ("x", "y", "z")
 AXIS_LENGTH_M = 0.06
-OUTLINE_COLOUR = (255, 255, 255)
-SHADE = (20, 22, 26)
+OUTLINE_COLOUR: Colour = (255, 255, 255)
+SHADE: Colour = (20, 22, 26)
 """Under every line, so that it is seen on light and dark ground."""
 TILE_HEIGHT = 256
 _FRACTION_BITS = 4
@@ -63,7 +63,7 @@ class OverlayStyle:
 DEFAULT_STYLE = OverlayStyle()
 
 
-def arm_colour(arms: Sequence[str], index: int) -> tuple[int, int, int]:
+def arm_colour(arms: Sequence[str], index: int) -> Colour:
     """Colour of an arm by its name: left orange, right blue, any other green."""
     return ARM_COLOURS.get(arms[index] if index < len(arms) else "", OTHER_ARM_COLOUR)
 
@@ -71,7 +71,7 @@ def arm_colour(arms: Sequence[str], index: int) -> tuple[int, int, int]:
 def gaussian(
     uv: NDArray[np.floating], height: int, width: int, sigma_px_ref: float = SIGMA_PX_REFERENCE
 ) -> NDArray[np.float32]:
-    """`h(u) = exp(-|u - u_t|^2 / (2 sigma^2))` on an `h w` grid of pixel centres; sigma is given on the reference canvas.
+    """`h(u) = exp(-|u - u_t|^2 / (2 sigma^2))` at `h w` pixel centres; sigma is given on the reference canvas.
 
     What `render_action_maps` puts into channel 0 on a grid of this size, for one arm and without torch.
     """
@@ -152,14 +152,11 @@ def _fixed_point(point: NDArray[np.float64]) -> tuple[int, int]:
     return round(float(u)), round(float(v))
 
 
-def line_width(height: int) -> int:
-    """Width of a line that is readable in a picture of this height, pixels."""
-    return max(1, round(height / 150))
-
-
-def shade_width(height: int) -> int:
-    """Width of the dark line under a line: in a small picture it would otherwise be all that is seen."""
-    return line_width(height) + (2 if height >= 200 else 1)
+def _line_widths(height: int) -> tuple[int, int]:
+    """Widths [px] of a line that is readable in a picture of this height, and of the dark line under it."""
+    width = max(1, round(height / 150))
+    # In a small picture a wide shade would be all that is seen.
+    return width, width + (2 if height >= 200 else 1)
 
 
 def _draw_axes(
@@ -168,32 +165,32 @@ def _draw_axes(
     tips: Sequence[NDArray[np.float64] | None],
     image_size: tuple[int, int],
 ) -> None:
-    size, width = (picture.shape[0], picture.shape[1]), line_width(picture.shape[0])
-    ends = [None if tip is None else picture_pixel(tip, image_size, size) for tip in tips]
-    for colours, thickness in (((SHADE,) * 3, shade_width(size[0])), (AXIS_COLOURS, width)):
+    size = (picture.shape[0], picture.shape[1])
+    width, shade = _line_widths(size[0])
+    start = _fixed_point(centre)
+    ends = [None if tip is None else _fixed_point(picture_pixel(tip, image_size, size)) for tip in tips]
+    for colours, thickness in (((SHADE,) * 3, shade), (AXIS_COLOURS, width)):
         for end, colour in zip(ends, colours, strict=True):
             if end is not None:
-                cv2.line(
-                    picture, _fixed_point(centre), _fixed_point(end), colour, thickness, cv2.LINE_AA, _FRACTION_BITS
-                )
+                cv2.line(picture, start, end, colour, thickness, cv2.LINE_AA, _FRACTION_BITS)
 
 
-def _draw_ring(picture: Picture, centre: NDArray[np.float64], opening: float, colour: tuple[int, int, int]) -> None:
-    height, width = picture.shape[0], line_width(picture.shape[0])
+def _draw_ring(picture: Picture, centre: NDArray[np.float64], opening: float, colour: Colour) -> None:
+    height = picture.shape[0]
+    width, shade = _line_widths(height)
     radius = round(height * (0.018 + 0.032 * float(np.clip(opening, 0.0, 1.0))) * (1 << _FRACTION_BITS))
-    at = _fixed_point(centre)
-    cv2.circle(picture, at, radius, SHADE, shade_width(height), cv2.LINE_AA, _FRACTION_BITS)
-    cv2.circle(picture, at, radius, colour, width, cv2.LINE_AA, _FRACTION_BITS)
-    cv2.circle(picture, at, (width + 1) << _FRACTION_BITS, SHADE, -1, cv2.LINE_AA, _FRACTION_BITS)
-    cv2.circle(picture, at, width << _FRACTION_BITS, (255, 255, 255), -1, cv2.LINE_AA, _FRACTION_BITS)
+    dot = width << _FRACTION_BITS
+    for size, drawn, thickness in (
+        (radius, SHADE, shade),
+        (radius, colour, width),
+        (dot + (1 << _FRACTION_BITS), SHADE, -1),
+        (dot, (255, 255, 255), -1),
+    ):
+        cv2.circle(picture, _fixed_point(centre), size, drawn, thickness, cv2.LINE_AA, _FRACTION_BITS)
 
 
 def arm_mask(tracks: EpisodeTracks, n: int, view: str, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Where the robot's capsules fall in a view: bool `h w` of `size`."""
-    import torch
-
-    from worldline_core.actions.robot_masks import project_capsules
-
     v = _view_index(tracks, n, view)
     covered = project_capsules(
         torch.from_numpy(tracks.capsules[None, [n]]),
@@ -208,8 +205,8 @@ def arm_mask(tracks: EpisodeTracks, n: int, view: str, size: tuple[int, int]) ->
 
 def _draw_outline(picture: Picture, mask: NDArray[np.bool_]) -> None:
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    width = line_width(picture.shape[0])
-    cv2.drawContours(picture, contours, -1, SHADE, shade_width(picture.shape[0]), cv2.LINE_AA)
+    width, shade = _line_widths(picture.shape[0])
+    cv2.drawContours(picture, contours, -1, SHADE, shade, cv2.LINE_AA)
     cv2.drawContours(picture, contours, -1, OUTLINE_COLOUR, width, cv2.LINE_AA)
 
 
@@ -222,9 +219,8 @@ def heat_layer(
     alpha = np.zeros((*size, 1), dtype=np.float32)
     for arm in range(len(tracks.arms)):
         if tracks.valid[n, v, arm]:
-            heat = gaussian(picture_pixel(tracks.uv[n, v, arm], tracks.image_size, size), *size, sigma_px_ref)[
-                ..., None
-            ]
+            centre = picture_pixel(tracks.uv[n, v, arm], tracks.image_size, size)
+            heat = gaussian(centre, *size, sigma_px_ref)[..., None]
             colour += heat * np.asarray(arm_colour(tracks.arms, arm), dtype=np.float32)
             alpha += heat
     shown = np.concatenate([colour / np.maximum(alpha, 1e-6), 200.0 * np.minimum(alpha, 1.0)], axis=-1)

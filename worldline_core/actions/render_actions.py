@@ -21,11 +21,10 @@ from tqdm import tqdm
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, shard_name, write_index, write_shard
 from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
-from worldline_core.actions.track_store import ActionTracks, shard_name, write_index, write_shard
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_quarantine

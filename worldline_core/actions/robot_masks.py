@@ -1,4 +1,4 @@
-"""Kinematic robot masks for the robot-focused losses (paper, Stage III; method, section 4).
+"""Kinematic robot masks for the robot-focused losses (paper, Stage III).
 
 Robot parts (links, gripper branches, end-effectors) are capsules between the origins of consecutive links, from
 forward kinematics. A capsule is drawn into a view as the hull of the discs that its two end spheres project to. The

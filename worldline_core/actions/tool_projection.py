@@ -4,16 +4,14 @@ Axis legend: n frames (any number of leading axes), v views, a arms; a sample is
 reference: base, tool (between the fingertips, +z out of the gripper), camera (OpenCV axes). Units: metres, pixels
 (centre of the first pixel is 0), gripper opening 0 closed .. 1 open.
 
-A sample that is not valid has exactly one cause, the first in this order that applies (method, section 2):
+A sample that is not valid has exactly one cause, the first in this order that applies:
 
 1. `invalid_calibration`: K is no pinhole matrix, T_base_camera is not rigid, or the control itself is unknown (a tool
    pose or an opening that is not finite);
 2. `behind_camera`: depth <= MIN_DEPTH_M, so a depth of 0 and of exactly MIN_DEPTH_M too;
 3. `outside_image`: not on a pixel, that is not -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5.
 
-The counts of the four causes add up to the number of samples.
-
-What was masked, clipped or out of range while tracks were computed: counts that add up over episodes.
+The counts of the four causes add up to the number of samples; `TrackCounts` add up over episodes.
 """
 
 from __future__ import annotations
@@ -158,7 +156,7 @@ def count_samples(
         cause: of the views that the episode has.
         opening: gripper opening before it is clipped.
     """
-    by_cause = torch.bincount(cause.flatten(), minlength=len(CAUSES)).tolist()
+    valid, behind, outside, invalid = torch.bincount(cause.flatten(), minlength=len(CAUSES)).tolist()
     beyond = torch.maximum(-opening, opening - 1).clamp_min(0)
     overshoot: dict[str, GripperOvershoot] = {
         arm: {"clipped": int((beyond[:, a] > 0).sum()), "largest": float(beyond[:, a].max())}
@@ -167,10 +165,10 @@ def count_samples(
     return {
         "episodes": 1,
         "samples": cause.numel(),
-        "valid": by_cause[0],
-        "behind_camera": by_cause[1],
-        "outside_image": by_cause[2],
-        "invalid_calibration": by_cause[3],
+        "valid": valid,
+        "behind_camera": behind,
+        "outside_image": outside,
+        "invalid_calibration": invalid,
         "outside_joint_limits": outside_joint_limits,
         "gripper_clipped": sum(arm["clipped"] for arm in overshoot.values()),
         "gripper_overshoot": overshoot,
@@ -183,10 +181,8 @@ def add_counts(parts: Sequence[TrackCounts]) -> TrackCounts:
     for part in parts:
         for arm, one in part["gripper_overshoot"].items():
             before = overshoot.get(arm, {"clipped": 0, "largest": 0.0})
-            overshoot[arm] = {
-                "clipped": before["clipped"] + one["clipped"],
-                "largest": max(before["largest"], one["largest"]),
-            }
+            clipped, largest = before["clipped"] + one["clipped"], max(before["largest"], one["largest"])
+            overshoot[arm] = {"clipped": clipped, "largest": largest}
     return {
         "episodes": sum(part["episodes"] for part in parts),
         "samples": sum(part["samples"] for part in parts),

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, project_tools
+from worldline_core.actions.action_tracks import tracks_of_projection
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.overlay_views import legend_strip, view_name
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
+from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, pad
@@ -63,27 +65,17 @@ def recorded_tracks(
     else:
         raise DataError("No tools to draw", where=where, expected="recorded tool poses, or joints and kinematics")
     tools = torch.from_numpy(along_tool_z(tools.numpy(), tool_offset_z_m))
-    poses = np.asarray(camera.poses(np.arange(episode.num_frames)), dtype=np.float64)[:, None]
-    K = np.asarray(camera.K, dtype=np.float64)[None]
-    size = (camera.height, camera.width)
-    seen = project_tools(tools, gripper, torch.from_numpy(K), torch.from_numpy(poses), size)
-    count = tools.shape[1]
-    return EpisodeTracks(
-        episode_id=episode.episode_id,
-        embodiment=episode.embodiment,
+    poses = torch.from_numpy(np.asarray(camera.poses(np.arange(episode.num_frames)), dtype=np.float64))[:, None]
+    K = torch.from_numpy(np.asarray(camera.K, dtype=np.float64))[None]
+    size, count = (camera.height, camera.width), tools.shape[1]
+    return tracks_of_projection(
+        episode, project_tools(tools, gripper, K, poses, size), tools, poses, K, capsules, radii,
         views=(view,),
         arms=("left", "right") if count == 2 else ("right",) if count == 1 else tuple(f"arm{i}" for i in range(count)),
         image_size=size,
         controls="state",
         camera_motion=("recorded",),
-        valid=seen.valid.numpy(),
-        **{name: getattr(seen, name).float().numpy() for name in ("uv", "depth", "rot6d", "gripper")},
-        T_base_tool=tools.float().numpy(),
-        T_base_camera=poses.astype(np.float32),
-        K=K.astype(np.float32),
-        capsules=capsules.float().numpy(),
-        capsule_radii=radii.float().numpy(),
-    )
+    )  # fmt: skip
 
 
 def telling_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, count: int, wanted: int) -> list[int]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
 from worldline_core.distillation.distill_config import DistillConfig

@@ -13,7 +13,7 @@ from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import ArtifactError, DataError
 
 if TYPE_CHECKING:
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -77,7 +77,7 @@ def _leading(values: np.ndarray, count: int | None, where: str) -> np.ndarray:
 
 def open_tracks(root: Path | None) -> ActionTracks | None:
     """The ActionTracks of an optional input."""
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
 
     return None if root is None else ActionTracks.open(root)
 

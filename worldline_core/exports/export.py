@@ -140,7 +140,7 @@ def _copy_sources(episodes: EpisodeSet, output: Path, positions: Sequence[int]) 
 def _export_rollouts(
     artifact: Path, output: Path, formats: Sequence[str], episode_ids: Sequence[str], episodes: Path | None
 ) -> list[Path]:
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
     from worldline_core.rollout.rollout_set import RolloutSet
 
     folder = episodes or linked_folder(artifact, "episodes")

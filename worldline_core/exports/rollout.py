@@ -15,8 +15,7 @@ from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.exports.rerun_recording import RecordingContent
     from worldline_core.rollout.rollout_set import RolloutSet

@@ -177,7 +177,7 @@ class Subject:
             DataError, ConfigError, UnavailableError: they cannot be computed.
         """
         from worldline_core.actions.action_tracks import compute_tracks
-        from worldline_core.actions.track_store import ActionTracks
+        from worldline_core.actions.episode_tracks import ActionTracks
         from worldline_core.geometry.embodiment import load_embodiment
         from worldline_core.geometry.kinematics import ArmKinematics
 

@@ -13,8 +13,7 @@ from einops import rearrange
 from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, collate_tracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, check_action_contract, load_checkpoint

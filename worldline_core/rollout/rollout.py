@@ -9,7 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.rollout.predictor import Predictor

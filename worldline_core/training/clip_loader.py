@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.training.clip_sampler import ClipSampler

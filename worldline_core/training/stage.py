@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError

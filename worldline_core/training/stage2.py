@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
-from worldline_core.actions.track_store import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel

@@ -15,7 +15,7 @@ from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.model.lpips import LPIPS
 
 if TYPE_CHECKING:
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
     from worldline_core.rollout.rollout_set import RolloutSet
 
 HEAD = "head"

@@ -62,7 +62,7 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     """
     from tqdm import tqdm
 
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
     from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
     from worldline_core.evaluation.segmenters.segmenter import open_segmenter
     from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement

@@ -17,8 +17,7 @@ from worldline_core.report.markup import Column, Html, element, figure, join, no
 from worldline_core.store.artifact_files import read_json
 
 if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
     from worldline_core.data.episodes.episode_set import EpisodeSet
 
 TITLE = "Action maps"
@@ -29,7 +28,7 @@ CHANNEL_LABELS = ("heat", "depth", "rot 1", "rot 2", "rot 3", "rot 4", "rot 5", 
 
 def actions_section(context: ReportContext) -> Section:
     """Overlays of a few episodes in three views."""
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
 
     folder = context.inputs.get("render_actions")
     if folder is None:

@@ -153,7 +153,7 @@ def with_tools(
     context: ReportContext, episode_id: str, view: str, frames: np.ndarray, chosen: Sequence[int]
 ) -> np.ndarray:
     """The frames with projected tools, enlarged; unchanged where there are no tracks of the episode."""
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
 
     folder = context.inputs.get("render_actions")
     tracks = ActionTracks.open(folder) if folder is not None else None

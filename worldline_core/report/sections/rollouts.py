@@ -181,7 +181,7 @@ def downloads(context: ReportContext, item: ChosenEpisode, number: int) -> Html:
 
 def recordings(context: ReportContext, item: ChosenEpisode, number: int, formats: list[str]) -> list[str]:
     """Names of the files written below run/recordings (a Rerun recording's bytes are not reproducible)."""
-    from worldline_core.actions.track_store import ActionTracks
+    from worldline_core.actions.episode_tracks import ActionTracks
     from worldline_core.exports.rollout import export_rollout
 
     episodes = context.episodes
