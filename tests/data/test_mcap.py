@@ -10,8 +10,9 @@ from mcap.reader import make_reader
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.mcap.io import write_episode_mcap, write_rollout_mcap
-from worldline_core.data.mcap.reader import read_episode_mcap
+from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.mcap.writer import write_episode_mcap, write_rollout_mcap
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]
@@ -36,10 +37,10 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make) -> None:
     for name in ("a.mcap", "b.mcap"):
         write_episode_mcap(tmp_path / name, episode, frames, robot_masks=masks)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    read = read_episode_mcap(tmp_path / "a.mcap")
+    read = read_exported_episode(McapFile(tmp_path / "a.mcap"))
     for view, images in frames.items():
-        assert np.array_equal(read.frames[view], images)  # png is exact
-        assert np.array_equal(read.robot_masks[view], masks[view])
+        assert np.array_equal(read.frames(view), images)  # png is exact
+        assert np.array_equal(read.robot_masks(view), masks[view])
         assert np.abs(read.episode.cameras[view].K - episode.cameras[view].K).max() < 1e-9
         assert read.episode.cameras[view].moving == episode.cameras[view].moving
         assert np.abs(read.episode.cameras[view].T_base_camera - episode.cameras[view].T_base_camera).max() < 1e-9
@@ -56,8 +57,8 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make) -> None:
 def test_jpeg_stays_within_its_stated_tolerance(tmp_path: Path, sample: Make) -> None:
     episode, frames, _ = sample(0)
     write_episode_mcap(tmp_path / "a.mcap", episode, frames, image_format="jpeg")
-    read = read_episode_mcap(tmp_path / "a.mcap").frames
-    smooth = np.abs(read["head"].astype(int) - frames["head"]).mean()
+    read = read_exported_episode(McapFile(tmp_path / "a.mcap")).frames
+    smooth = np.abs(read("head").astype(int) - frames["head"]).mean()
     assert 0 < smooth < 4
 
 
@@ -117,9 +118,9 @@ def test_damaged_files_are_quarantined(tmp_path: Path, sample: Make) -> None:
     counts = curate(CurateConfig.model_validate({"sources": [source]}), {}, tmp_path / "out")
     assert (counts["found"], counts["kept"], counts["reasons"]) == (4, 1, {"unreadable": 3})
     with pytest.raises(DataError, match=r"(?s)damaged.*1\.mcap"):
-        read_episode_mcap(tmp_path / "mcap" / "1.mcap")
+        read_exported_episode(McapFile(tmp_path / "mcap" / "1.mcap"))
     with pytest.raises(DataError, match="no episode of a known layout"):
-        read_episode_mcap(tmp_path / "mcap" / "3.mcap")
+        read_exported_episode(McapFile(tmp_path / "mcap" / "3.mcap"))
 
 
 def test_a_rollout_is_exported(tmp_path: Path, sample: Make) -> None:

@@ -20,8 +20,9 @@ from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.io import write_episode_mcap
-from worldline_core.data.mcap.reader import read_episode_mcap
+from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
 from worldline_core.data.sources.repaired import undistorted
 from worldline_core.geometry.distortion import Distortion
@@ -94,7 +95,7 @@ def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sa
     with path.open("rb") as stream:
         (message,) = [json.loads(m.data) for _, c, m in make_reader(stream).iter_messages(["/head/calibration"])]
     assert message["distortion_model"] == model
-    assert read_episode_mcap(path).distortions == {"head": lens}
+    assert read_exported_episode(McapFile(path)).distortions == {"head": lens}
     curated = curated_mcap(tmp_path)
     read = curated.episode(0)
     assert off_from_scene(curated) < 1.5
@@ -152,11 +153,11 @@ def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, samp
     path = tmp_path / "mcap" / "2.mcap"
     write_episode_mcap(path, third, frames)
     with pytest.MonkeyPatch.context() as patch:
-        from worldline_core.data.mcap import io as mcap_io
+        from worldline_core.data.mcap import writer as mcap_writer
 
-        original = mcap_io._calibration
+        original = mcap_writer._calibration
         changed = lambda *a, **k: {**original(*a, **k), "distortion_model": "double_sphere", "D": [0.1]}  # noqa: E731
-        patch.setattr(mcap_io, "_calibration", changed)
+        patch.setattr(mcap_writer, "_calibration", changed)
         write_episode_mcap(path, third, frames)
     curated = curated_mcap(tmp_path)
     assert [row.episode_id for row in curated.rows] == [episode.episode_id]

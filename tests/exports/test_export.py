@@ -12,7 +12,8 @@ import pytest
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.mcap.reader import read_episode_mcap
+from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap.file import McapFile
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.export import export
 from worldline_core.publishing.content import set_files
@@ -97,10 +98,10 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
 def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
     written = export(linked, tmp_path, ["mcap", "rrd"], episode_ids=["e1#5-15"])
     assert [path.name for path in written] == ["e1_5-15.mcap", "e1_5-15.rrd"]
-    read = read_episode_mcap(tmp_path / "e1_5-15.mcap")
+    read = read_exported_episode(McapFile(tmp_path / "e1_5-15.mcap"))
     episodes = EpisodeSet.open(linked)
-    assert np.array_equal(read.frames["head"], episodes.frames(1, "head"))
-    assert np.array_equal(read.robot_masks["head"], episodes.robot_masks(1, "head"))
+    assert np.array_equal(read.frames("head"), episodes.frames(1, "head"))
+    assert np.array_equal(read.robot_masks("head"), episodes.robot_masks(1, "head"))
     assert np.array_equal(read.episode.state, episodes.episode(1).state)
     from rerun.chunk import RrdReader
 

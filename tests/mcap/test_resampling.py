@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import resampling
+from worldline_core.data.mcap import timing as resampling
 from worldline_core.data.mcap.images import spoiled_frames
-from worldline_core.data.mcap.resampling import Clock, in_order
+from worldline_core.data.mcap.timing import Clock, in_order
 
 MS = 1_000_000
 

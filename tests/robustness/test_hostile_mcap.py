@@ -13,9 +13,9 @@ from mcap.writer import CompressionType, Writer
 
 from tools.corrupted import mcap
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import chunks as mcap_chunks
-from worldline_core.data.mcap.chunks import check_chunks
-from worldline_core.data.mcap.reader import read_episode_id, read_episode_mcap
+from worldline_core.data.mcap import file as mcap_file
+from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
+from worldline_core.data.mcap.file import McapFile, check_chunks
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -57,7 +57,7 @@ def test_chunks_that_claim_terabytes(tmp_path: Path) -> None:
 
 
 def test_an_lz4_chunk_is_unpacked_no_further_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_chunks, "MAX_CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr(mcap_file, "MAX_CHUNK_BYTES", 1 << 20)
     bomb = lz4.frame.compress(b"\0" * (8 << 20))
     assert len(bomb) < 100_000
     with pytest.raises(RejectedInputError, match="chunk is too large"):
@@ -69,9 +69,9 @@ def test_an_lz4_chunk_is_unpacked_no_further_than_allowed(tmp_path: Path, monkey
 def test_what_is_no_mcap_file_is_unreadable(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
-    for read in (read_episode_id, read_episode_mcap):
+    for read in (exported_episode_id, read_exported_episode):
         with pytest.raises(RejectedInputError, match="MCAP") as caught:
-            read(path)
+            read(McapFile(path))
         assert caught.value.reason == "unreadable"
 
 
@@ -90,7 +90,9 @@ def test_lengths_of_records_that_no_number_can_hold(tmp_path: Path) -> None:
         for claimed in (2**63, 2**64 - 1, 2**40, 0):
             path.write_bytes(sound[:place] + struct.pack("<Q", claimed) + sound[place + 8 :])
             try:
-                read_episode_mcap(path)
+                loaded = read_exported_episode(McapFile(path))
+                for view in loaded.views:
+                    loaded.frames(view)
             except RejectedInputError:
                 failed += 1
     assert failed > len(places)

@@ -15,7 +15,7 @@ from worldline_core.data.episodes.recorded_poses import with_rigid_poses
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
-from worldline_core.data.mcap.io import write_episode_mcap
+from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording

@@ -111,7 +111,7 @@ def write_mcap_recordings(content: RecordingContent, output: Path, stem: str) ->
 
     Calibration follows the frames' size; poses are cut to the prediction's length.
     """
-    from worldline_core.data.mcap.io import write_rollout_mcap
+    from worldline_core.data.mcap.writer import write_rollout_mcap
 
     episode = content.episode
     written: list[Path] = []

@@ -1,37 +1,58 @@
-"""One MCAP file: its topics, and the messages of some of them in the order in which they lie in it."""
+"""One MCAP file: checked before it is unpacked, its topics, and the messages of some of them in the order of the file.
+
+The library believes a chunk: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, 255 bytes for one.
+So every chunk is looked at first. Records (https://mcap.dev/spec): an opcode, a length of 8 bytes, then the record.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import struct
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import Any, BinaryIO
 
+import lz4.frame
+import zstandard
+from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 from mcap.records import Channel, Schema
 from mcap.records import Message as Record
 from mcap.summary import Summary
 
-from worldline_core.data.guards.limits import MAX_CHUNK_BYTES, regular_file
+from worldline_core.data.guards.limits import MAX_CHUNK_BYTES, regular_file, too_large
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath
-from worldline_core.data.mcap.chunks import DAMAGE, check_chunks
-from worldline_core.data.mcap.messages import Kind, Message, MessageDecoder
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, MessageDecoder
 
+# What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
+_DAMAGE = (
+    McapError, zstandard.ZstdError, EOFError, ValueError, RuntimeError, LookupError, struct.error, OverflowError, MemoryError,
+)  # fmt: skip
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK = 0x06
+_DATA_END = 0x0F
+_LZ4_RATIO = 255
+
+
+READING_MARGIN_NS = 10**9
+"""Messages from so long before and after an episode are read too: they may be of its time, and instants lie between two."""
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * 8 + 29
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A decoded message with what its record says: log and publish time [ns] and sequence number (0: none)."""
+    """A decoded message: when it was logged, published, and by its own header made [ns] (None: it has none)."""
 
     topic: str
     kind: Kind
     log_ns: int
     publish_ns: int
-    sequence: int
-    message: Message
+    stamp_ns: int | None
+    value: Any
 
 
 class McapFile:
@@ -51,6 +72,16 @@ class McapFile:
         check_chunks(regular_file(self.path, "MCAP file"), self.shown)
         with self._opened(indexed=True) as reader:
             return reader.get_summary()
+
+    @property
+    def _indexed(self) -> bool:
+        return self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
+
+    @cached_property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records by name; of several of one name the last."""
+        with self._opened(indexed=self._indexed) as reader:
+            return {record.name: record.metadata for record in reader.iter_metadata()}
 
     @cached_property
     def topics(self) -> dict[str, str]:
@@ -101,15 +132,13 @@ class McapFile:
         Raises: RejectedInputError: unknown_schema, unreadable.
         """
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
-            kind = self._decoder.kind(channel, schema)
-            message = self._decoder.decode(channel, schema, record.data)
-            yield Received(channel.topic, kind, record.log_time, record.publish_time, record.sequence, message)
+            kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
+            yield Received(channel.topic, kind, record.log_time, record.publish_time, stamp_ns, value)
 
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Schema | None, Channel, Record]]:
-        indexed = self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
-        with self._opened(indexed=indexed) as reader:
+        with self._opened(indexed=self._indexed) as reader:
             # Not in order of log time: the reader would hold all chunks that overlap in time.
             yield from reader.iter_messages(
                 None if topics is None else list(topics),
@@ -127,7 +156,7 @@ class McapFile:
                     raise EOFError(f"{path.stat().st_size} bytes")
                 kind = SeekingReader if indexed else NonSeekingReader
                 yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
-        except DAMAGE as error:
+        except _DAMAGE as error:
             raise RejectedInputError(
                 "unreadable",
                 "MCAP file is damaged or was not finished",
@@ -135,3 +164,147 @@ class McapFile:
                 got=repr(error)[:200],
                 next_step="copy the file again, or repair it with `mcap recover`",
             ) from error
+
+
+@dataclass
+class Stream:
+    """Messages of one topic in the order of the file.
+
+    Attributes:
+        stamps_ns: times that the messages state; None where the schema has none.
+        values: what they say; empty for images.
+        key_frames: of a video, whether decoding can begin with a message.
+        frame: the frame that the first message names, of images.
+    """
+
+    topic: str
+    kind: Kind
+    stamps_ns: list[int | None] = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    publish_ns: list[int] = field(default_factory=list)
+    values: list[Any] = field(default_factory=list)
+    key_frames: list[bool] = field(default_factory=list)
+    frame: str = ""
+
+    def add(self, received: Received) -> None:
+        if received.kind != self.kind:
+            raise RejectedInputError(
+                "unknown_schema",
+                "Messages of a topic are of several schemas",
+                where=f"topic {self.topic}",
+                expected=self.kind,
+                got=received.kind,
+            )
+        self.stamps_ns.append(received.stamp_ns)
+        self.log_ns.append(received.log_ns)
+        self.publish_ns.append(received.publish_ns)
+        if self.kind in IMAGE_KINDS:
+            self.frame = self.frame or received.value.frame
+            if self.kind == "video":
+                self.key_frames.append(received.value.is_key_frame)
+        else:
+            self.values.append(received.value)
+
+    @property
+    def headed(self) -> bool:
+        """Whether the messages state their own time."""
+        return bool(self.stamps_ns) and self.stamps_ns[0] is not None
+
+    @property
+    def stamped(self) -> bool:
+        """Whether these times are set: a simulated clock begins at 0 once, a driver that sets none writes it always."""
+        return None not in self.stamps_ns and self.stamps_ns.count(0) <= 1
+
+
+def read_streams(
+    file: McapFile, roles: Mapping[str, tuple[Kind, ...]], start_ns: int | None, stop_ns: int | None
+) -> dict[str, Stream]:
+    """All messages of the topics of `roles` (topic -> kinds that it may be of) around an episode, by topic.
+
+    Args:
+        start_ns, stop_ns: log times of the episode; None: the whole file.
+
+    Raises: RejectedInputError: unknown_schema for a topic that is of none of the kinds its role needs; unreadable.
+    """
+    streams: dict[str, Stream] = {}
+    first = None if start_ns is None else max(start_ns - READING_MARGIN_NS, 0)
+    last = None if stop_ns is None else stop_ns + READING_MARGIN_NS
+    for received in file.messages(roles, first, last):
+        if received.topic not in streams:
+            if received.kind not in roles[received.topic]:
+                raise RejectedInputError(
+                    "unknown_schema",
+                    "Topic has messages of another kind than its role needs",
+                    where=f"{file.shown}, topic {received.topic}",
+                    expected=" or ".join(roles[received.topic]),
+                    got=f"{received.kind} ({file.topics.get(received.topic, '')})",
+                    next_step="correct the topics in curate.sources[]",
+                    evidence={"topic": received.topic, "kind": received.kind},
+                )
+            streams[received.topic] = Stream(received.topic, received.kind)
+        streams[received.topic].add(received)
+    return streams
+
+
+def check_chunks(path: Path, where: object) -> None:
+    """Every chunk up to the end of the data section.
+
+    Raises: RejectedInputError: too_large, or unreadable for what is no MCAP file or breaks off.
+    """
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as stream:
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise _damaged(where, "another beginning than that of an MCAP file")
+            position = len(_MAGIC)
+            while position < size:
+                stream.seek(position)
+                opcode, length = struct.unpack("<BQ", stream.read(9))
+                position += 9 + length
+                if opcode == _DATA_END:
+                    return
+                if position > size:
+                    raise _damaged(where, f"a record of {length} bytes where {size - position + length} are left")
+                if opcode == _CHUNK:
+                    _check_chunk(stream, length, where)
+    except (struct.error, OSError) as error:
+        raise _damaged(where, str(error)) from error
+
+
+def _check_chunk(stream: BinaryIO, length: int, where: object) -> None:
+    *_, declared, _, name_length = struct.unpack("<QQQII", stream.read(32))
+    if declared > MAX_CHUNK_BYTES:
+        raise too_large("MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=declared, unit="bytes")
+    if name_length > 32:
+        raise _damaged(where, f"a name of a compression of {name_length} bytes")
+    compression = stream.read(name_length)
+    packed_length = struct.unpack("<Q", stream.read(8))[0]
+    if packed_length > length:
+        raise _damaged(where, f"a chunk of {packed_length} bytes in a record of {length}")
+    head = stream.read(min(packed_length, 32))
+    unpacked = declared
+    if compression == b"zstd":
+        try:
+            unpacked = max(0, zstandard.frame_content_size(head))  # -1: not stated, `declared` is then the bound
+        except zstandard.ZstdError as error:
+            raise _damaged(where, str(error)) from error
+    elif compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES:
+        # Its stated size binds nobody; only when it is this long can it unpack to too much.
+        stream.seek(-len(head), 1)
+        unpacked = _lz4_size(stream.read(packed_length), where)
+    if unpacked > MAX_CHUNK_BYTES:
+        raise too_large("MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes")
+
+
+def _lz4_size(packed: bytes, where: object) -> int:
+    """Bytes that a frame unpacks to, at most one more than allowed."""
+    try:
+        return len(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=MAX_CHUNK_BYTES + 1))
+    except RuntimeError as error:
+        raise _damaged(where, str(error)) from error
+
+
+def _damaged(where: object, got: str) -> RejectedInputError:
+    return RejectedInputError(
+        "unreadable", "MCAP file is damaged", where=where, expected="a complete MCAP file", got=got
+    )

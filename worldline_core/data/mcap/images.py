@@ -5,7 +5,7 @@ Memory holds the images that lie out of order in the file, and one decoded image
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
 
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.guards.images import decode_image
 from worldline_core.data.guards.limits import check_image_size
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -110,7 +111,7 @@ class ImageTrack:
         for message, received in enumerate(counted):
             number = place.get(message, -1)
             if number in needed:
-                waiting[number] = received.message.value
+                waiting[number] = received.value
             while done < len(wanted) and wanted[done] in waiting:
                 yield wanted[done], waiting.pop(wanted[done])
                 done += 1
@@ -125,24 +126,41 @@ class ImageTrack:
         )
 
 
-def is_key_frame(image: EncodedImage) -> bool:
-    """Whether decoding can begin with this video message: an IDR picture (H.264), or any random access point (H.265).
+@dataclass(frozen=True)
+class EpisodeImages:
+    """View -> the frames of an episode, one after the other.
 
-    Looks at the first picture's NAL unit only; parameter sets before it do not count (ITU-T H.264 and H.265, 7.4).
+    Attributes:
+        calibrations: topics of the calibrated views, for messages.
     """
-    data, position = image.data, 0
-    while (position := data.find(b"\x00\x00\x01", position)) >= 0 and position + 3 < len(data):
-        header = data[position + 3]
-        if image.format == "h265":
-            kind = (header >> 1) & 0x3F
-            if kind < 32:
-                return 16 <= kind <= 23
-        else:
-            kind = header & 0x1F
-            if 1 <= kind <= 5:
-                return kind == 5
-        position += 3
-    return False
+
+    file: McapFile
+    tracks: Mapping[str, ImageTrack]
+    cameras: Mapping[str, CameraTrack]
+    calibrations: Mapping[str, str | None]
+
+    def __call__(self, view: str) -> Iterator[np.ndarray]:
+        """uint8 (H, W, 3) RGB.
+
+        Raises: RejectedInputError: as `ImageTrack.frames`; missing_calibration when the images are not of the size that is
+            calibrated.
+        """
+        camera = self.cameras.get(view)
+        for image in self.tracks[view].frames(self.file):
+            if camera is not None and image.shape[:2] != (camera.height, camera.width):
+                raise RejectedInputError(
+                    "missing_calibration",
+                    "Calibration is of another image size",
+                    where=f"{self.file.shown}, topic {self.calibrations[view]}",
+                    expected=f"{image.shape[1]}x{image.shape[0]}",
+                    got=f"{camera.width}x{camera.height}",
+                    evidence={
+                        "view": view,
+                        "calibrated": [camera.height, camera.width],
+                        "images": list(image.shape[:2]),
+                    },
+                )
+            yield image
 
 
 def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:

@@ -1,14 +1,12 @@
 """What messages of ROS 2 and Foxglove schemas say, whatever they are encoded in (CDR, protobuf, JSON).
 
-Messages decoded by the schemas that the file itself holds.
-
-Fields of decoded messages, be they objects (ROS 2, protobuf) or mappings (JSON), as this project's messages.
+A message is decoded by the schema that the file itself holds; its fields, be it an object (ROS 2, protobuf) or a mapping
+(JSON), are then read into the classes of this module.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -61,6 +59,26 @@ class EncodedImage:
     frame: str
     data: bytes
     format: str
+
+    @property
+    def is_key_frame(self) -> bool:
+        """Whether decoding can begin with this frame: an IDR picture (H.264), or any random access point (H.265).
+
+        Looks at the first picture's NAL unit only; parameter sets before it do not count (ITU-T H.264 and H.265, 7.4).
+        """
+        position = 0
+        while (position := self.data.find(b"\x00\x00\x01", position)) >= 0 and position + 3 < len(self.data):
+            header = self.data[position + 3]
+            if self.format == "h265":
+                kind = (header >> 1) & 0x3F
+                if kind < 32:
+                    return 16 <= kind <= 23
+            else:
+                kind = header & 0x1F
+                if 1 <= kind <= 5:
+                    return kind == 5
+            position += 3
+        return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,20 +137,6 @@ class Pose:
     values: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message: the time that it states itself (None: its schema has no place for one) and what it says."""
-
-    stamp_ns: int | None
-    value: Any
-
-
-def schema_name(name: str) -> str:
-    """`sensor_msgs/msg/Image` and `foxglove_msgs/msg/RawImage` as `SCHEMA_KINDS` lists them."""
-    short = name.replace("/msg/", "/")
-    return short.replace("foxglove_msgs/", "foxglove.")
-
-
 def _get(raw: Any, *names: str) -> Any:
     """The first of these fields that the message has, be it an object or a JSON mapping."""
     for name in names:
@@ -157,7 +161,7 @@ def _nanoseconds(time: Any) -> int:
     return int(_get(time, "sec", "seconds")) * 10**9 + int(_get(time, "nanosec", "nsec", "nanos"))
 
 
-def stated_time(raw: Any) -> int | None:
+def _stated_time(raw: Any) -> int | None:
     """Header time [ns]; None where the schema has none."""
     if _has(raw, "header"):
         return _nanoseconds(_get(_get(raw, "header"), "stamp"))
@@ -230,7 +234,7 @@ def _pose_values(position: Any, orientation: Any) -> tuple[float, ...]:
 
 def _transform(raw: Any) -> Transform:
     if _has(raw, "header"):  # geometry_msgs/TransformStamped
-        inner, stamp = _get(raw, "transform"), stated_time(raw)
+        inner, stamp = _get(raw, "transform"), _stated_time(raw)
         parent = _frame(raw)
     else:
         inner, stamp, parent = raw, _nanoseconds(_get(raw, "timestamp")), str(_get(raw, "parent_frame_id"))
@@ -252,7 +256,7 @@ def _marker(raw: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-READERS: dict[Kind, Callable[[Any], Any]] = {
+_READERS: dict[Kind, Callable[[Any], Any]] = {
     "image": _encoded,
     "video": _encoded,
     "raw_image": _raw_image,
@@ -267,19 +271,8 @@ READERS: dict[Kind, Callable[[Any], Any]] = {
 
 # What the decoders raise for bytes that are not of their schema; the ROS 2 parser raises plain subclasses of these.
 _FAULTS = (
-    McapError,
-    DecodeError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    EOFError,
-    RuntimeError,
-    NotImplementedError,
-    struct.error,
-    binascii.Error,
-)
+    McapError, DecodeError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, struct.error,
+)  # fmt: skip
 
 
 class MessageDecoder:
@@ -290,22 +283,17 @@ class MessageDecoder:
         self._factories = (Ros2DecoderFactory(), ProtobufDecoderFactory())
         self._channels: dict[int, tuple[Kind, Callable[[bytes], Any]]] = {}
 
-    def kind(self, channel: Channel, schema: Schema | None) -> Kind:
-        """What a channel's messages say.
-
-        Raises: RejectedInputError (unknown_schema).
-        """
-        return self._channel(channel, schema)[0]
-
-    def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> Message:
-        """One message.
+    def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
+        """Kind of a message, the time that it states itself [ns] (None: its schema has no place for one), what it says.
 
         Raises: RejectedInputError: unknown_schema; unreadable where the bytes are not of the schema.
         """
-        kind, decode = self._channel(channel, schema)
+        if channel.id not in self._channels:
+            self._channels[channel.id] = self._channel(channel, schema)
+        kind, decode = self._channels[channel.id]
         try:
             raw = decode(data)
-            return Message(stated_time(raw), READERS[kind](raw))
+            return kind, _stated_time(raw), _READERS[kind](raw)
         except _FAULTS as error:
             raise RejectedInputError(
                 "unreadable",
@@ -316,23 +304,22 @@ class MessageDecoder:
             ) from error
 
     def _channel(self, channel: Channel, schema: Schema | None) -> tuple[Kind, Callable[[bytes], Any]]:
-        if channel.id not in self._channels:
-            name = schema.name if schema is not None else ""
-            kind = SCHEMA_KINDS.get(schema_name(name))
-            decoder = self._decoder(channel, schema) if kind is not None else None
-            if kind is None or decoder is None:
-                encoding = schema.encoding if schema is not None else "no schema"
-                raise RejectedInputError(
-                    "unknown_schema",
-                    "Messages of this schema are not understood",
-                    where=f"{self._where}, topic {channel.topic}",
-                    expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
-                    got=f"{name or 'no schema'} ({channel.message_encoding or 'no encoding'}, {encoding})",
-                    next_step="name another topic, or convert the recording",
-                    evidence={"topic": channel.topic, "schema": name, "encoding": channel.message_encoding},
-                )
-            self._channels[channel.id] = kind, decoder
-        return self._channels[channel.id]
+        name = schema.name if schema is not None else ""
+        # `sensor_msgs/msg/Image` and `foxglove_msgs/msg/RawImage` as `SCHEMA_KINDS` lists them.
+        kind = SCHEMA_KINDS.get(name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove."))
+        decoder = self._decoder(channel, schema) if kind is not None else None
+        if kind is None or decoder is None:
+            encoding = schema.encoding if schema is not None else "no schema"
+            raise RejectedInputError(
+                "unknown_schema",
+                "Messages of this schema are not understood",
+                where=f"{self._where}, topic {channel.topic}",
+                expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
+                got=f"{name or 'no schema'} ({channel.message_encoding or 'no encoding'}, {encoding})",
+                next_step="name another topic, or convert the recording",
+                evidence={"topic": channel.topic, "schema": name, "encoding": channel.message_encoding},
+            )
+        return kind, decoder
 
     def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
         if channel.message_encoding == "json":

@@ -1,7 +1,4 @@
-"""State, commands and tool poses of a recording's arms.
-
-Joints, grippers and tool poses of topics, at the instants of an episode.
-"""
+"""State, commands and tool poses of a recording's arms: the declared numbers of topics, brought to an episode's instants."""
 
 from __future__ import annotations
 
@@ -11,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import resampling
+from worldline_core.data.mcap import timing as resampling
+from worldline_core.data.mcap.cameras import TransformTree
+from worldline_core.data.mcap.file import Stream
 from worldline_core.data.mcap.messages import Joints, Pose
-from worldline_core.data.mcap.resampling import Arrivals, TimeError, in_order
-from worldline_core.data.mcap.streams import Stream, Timing
+from worldline_core.data.mcap.timing import Arrivals, TimeError, Timing, in_order
 from worldline_core.data.mcap.topics_config import ArmReadings, ArmTopics, McapTopicsSourceConfig, TopicReadings
-from worldline_core.data.mcap.transforms import TransformTree
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
 
@@ -37,11 +34,130 @@ class Signal:
         fill = resampling.hold if how == "hold" else resampling.linear
         return fill(self.times_ns, self.values, grid_ns)
 
-    def time_error(self, grid_ns: np.ndarray) -> TimeError:
-        return TimeError.of(self.times_ns, grid_ns)
+
+@dataclass(frozen=True)
+class _ArmSignals:
+    """One arm: (joints, gripper) measured and commanded, and the tool's poses with the frame that they are given in."""
+
+    topics: ArmTopics
+    state: tuple[Signal, Signal]
+    command: tuple[Signal, Signal] | None
+    tool: tuple[Signal, str] | None
 
 
-def read_signal(
+@dataclass(frozen=True)
+class RobotSignals:
+    """All arms, before resampling."""
+
+    arms: tuple[_ArmSignals, ...]
+
+    @property
+    def commanded(self) -> bool:
+        return self.arms[0].command is not None
+
+    @property
+    def frames(self) -> list[str]:
+        """Frames that must be reached from the base: of tools, and those that tool poses are given in."""
+        found = [arm.topics.tool_frame for arm in self.arms if arm.topics.tool_frame is not None]
+        return [frame.lstrip("/") for frame in found] + [arm.tool[1] for arm in self.arms if arm.tool is not None]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        names: list[str] = []
+        for arm in self.arms:
+            joints = arm.topics.state.joints
+            given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
+            names += [f"{arm.topics.name}/{name}" for name in (*given, "gripper")]
+        return tuple(names)
+
+    @property
+    def gripper_columns(self) -> list[int]:
+        return [column for column, name in enumerate(self.state_names) if name.endswith("/gripper")]
+
+    def signals(self) -> list[Signal]:
+        """Every signal once."""
+        found: list[Signal] = []
+        for arm in self.arms:
+            found += [*arm.state, *(arm.command or ()), *(arm.tool[:1] if arm.tool is not None else ())]
+        return found
+
+    def arrivals(self) -> list[Arrivals]:
+        """Messages of the signals, those that two signals share counted once."""
+        return list({(signal.topic, len(signal.times_ns)): signal.arrivals for signal in self.signals()}.values())
+
+    def vectors(self, grid_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """State and action (t, J) float64, and how many gripper readings were clipped."""
+        states, actions, clipped = [], [], 0
+        for arm in self.arms:
+            state, outside = _vector(arm.topics.state, arm.state, grid_ns)
+            action, outside_too = state, 0
+            if arm.command is not None and arm.topics.command is not None:
+                action, outside_too = _vector(arm.topics.command, arm.command, grid_ns)
+            states.append(state)
+            actions.append(action)
+            clipped += outside + outside_too
+        return np.concatenate(states, axis=1), np.concatenate(actions, axis=1), clipped
+
+    def tools(self, tree: TransformTree, base: str, grid_ns: np.ndarray) -> np.ndarray | None:
+        """(t, A, 4, 4) T_base_tool where it is recorded, else None."""
+        poses: list[np.ndarray] = []
+        for arm in self.arms:
+            if arm.tool is not None:
+                signal, frame = arm.tool
+                values = resampling.poses(signal.times_ns, signal.values, grid_ns)
+                T_frame_tool = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])
+                poses.append(T_frame_tool if frame == base else tree.poses(base, frame, grid_ns) @ T_frame_tool)
+            elif arm.topics.tool_frame is not None:
+                poses.append(tree.poses(base, arm.topics.tool_frame.lstrip("/"), grid_ns))
+        return np.stack(poses, axis=1) if poses else None
+
+    def time_errors(self, grid_ns: np.ndarray) -> dict[str, TimeError]:
+        return {f"topic {signal.topic}": TimeError.of(signal.times_ns, grid_ns) for signal in self.signals()}
+
+    def prediction_error_rad(self) -> float:
+        """Largest distance of a measured joint from the line through its neighbours in time."""
+        errors = []
+        for arm in self.arms:
+            error = resampling.largest_prediction_error(arm.state[0].times_ns, arm.state[0].values)
+            errors.append(float(np.deg2rad(error)) if arm.topics.state.joints.unit == "deg" else error)
+        return max(errors)
+
+
+def _vector(readings: ArmReadings, signals: tuple[Signal, Signal], grid_ns: np.ndarray) -> tuple[np.ndarray, int]:
+    """(t, joints + 1) joints [rad] and opening, and how many openings lay outside of 0..1."""
+    joints = signals[0].at(grid_ns, readings.joints.resample)
+    if readings.joints.unit == "deg":
+        joints = np.deg2rad(joints)
+    raw = signals[1].at(grid_ns, readings.gripper.resample).mean(axis=1)
+    opening, outside = readings.gripper.range.opening(raw)
+    return np.concatenate([joints, opening[:, None]], axis=1), outside
+
+
+def read_robot(
+    config: McapTopicsSourceConfig, streams: Mapping[str, Stream], timing: Timing, where: object
+) -> RobotSignals:
+    """The declared joints, grippers and tool poses.
+
+    Raises: RejectedInputError: missing_column, invalid_tool_pose, clock_jump.
+    """
+
+    def read(readings: ArmReadings) -> tuple[Signal, Signal]:
+        joints, gripper = (
+            _read_signal(streams[each.topic], each, timing, config.max_disorder_s, where)
+            for each in (readings.joints, readings.gripper)
+        )
+        return joints, gripper
+
+    arms: list[_ArmSignals] = []
+    for arm in config.arms:
+        tool = None
+        if arm.tool_pose is not None:
+            tool = _read_poses(streams[arm.tool_pose], timing, config.max_disorder_s, where)
+        arms.append(_ArmSignals(arm, read(arm.state), None if arm.command is None else read(arm.command), tool))
+    return RobotSignals(tuple(arms))
+
+
+def _read_signal(
     stream: Stream, readings: TopicReadings, timing: Timing, max_disorder_s: float, where: object
 ) -> Signal:
     """The declared numbers of a topic.
@@ -53,15 +169,11 @@ def read_signal(
     at = f"{where}, topic {stream.topic}"
     taken: list[int] = []
     rows: list[list[float]] = []
-    columns_of: dict[tuple[str, ...], list[int] | None] = {}
     for number, value in enumerate(stream.values):
-        if isinstance(value, Joints) and readings.names is not None:
-            if value.names not in columns_of:
-                known = set(readings.names) <= set(value.names)
-                columns_of[value.names] = [value.names.index(name) for name in readings.names] if known else None
-            columns, numbers = columns_of[value.names], getattr(value, readings.field)
-        elif not isinstance(value, Joints) and readings.columns is not None:
-            columns, numbers = list(readings.columns), value
+        if not isinstance(value, Joints):
+            columns, numbers = readings.columns, value
+        elif readings.names is not None and set(readings.names) <= set(value.names):
+            columns, numbers = [value.names.index(name) for name in readings.names], getattr(value, readings.field)
         else:
             columns, numbers = None, ()
         if columns is not None and max(columns) < len(numbers):
@@ -73,7 +185,7 @@ def read_signal(
     return Signal(stream.topic, arrivals, np.array(rows, np.float64)[arrivals.order])
 
 
-def read_poses(stream: Stream, timing: Timing, max_disorder_s: float, where: object) -> tuple[Signal, str]:
+def _read_poses(stream: Stream, timing: Timing, max_disorder_s: float, where: object) -> tuple[Signal, str]:
     """Poses (n, 7) of a topic, quaternions of unit length, and the frame that they are given in.
 
     Raises: RejectedInputError: invalid_tool_pose, clock_jump.
@@ -114,144 +226,4 @@ def _missing(stream: Stream, readings: TopicReadings, where: str) -> RejectedInp
         expected=f"{readings.field} of {', '.join(wanted)}",
         got=got,
         evidence={"topic": stream.topic, "expected": list(wanted)},
-    )
-
-
-@dataclass(frozen=True)
-class ArmSignals:
-    """Joints and gripper of one arm before resampling."""
-
-    readings: ArmReadings
-    joints: Signal
-    gripper: Signal
-
-    @property
-    def signals(self) -> tuple[Signal, Signal]:
-        return self.joints, self.gripper
-
-    def at(self, grid_ns: np.ndarray) -> tuple[np.ndarray, int]:
-        """(t, joints + 1) joints [rad] and opening, and how many openings lay outside of 0..1."""
-        joints = self.joints.at(grid_ns, self.readings.joints.resample)
-        if self.readings.joints.unit == "deg":
-            joints = np.deg2rad(joints)
-        raw = self.gripper.at(grid_ns, self.readings.gripper.resample).mean(axis=1)
-        opening, outside = self.readings.gripper.range.opening(raw)
-        return np.concatenate([joints, opening[:, None]], axis=1), outside
-
-    def prediction_error_rad(self) -> float:
-        """Largest distance of a joint reading from the line through its neighbours."""
-        error = resampling.largest_prediction_error(self.joints.times_ns, self.joints.values)
-        return float(np.deg2rad(error)) if self.readings.joints.unit == "deg" else error
-
-
-@dataclass(frozen=True)
-class _Arm:
-    topics: ArmTopics
-    state: ArmSignals
-    command: ArmSignals | None
-    tool: tuple[Signal, str] | None
-
-
-@dataclass(frozen=True)
-class RobotSignals:
-    """All arms, before resampling."""
-
-    arms: tuple[_Arm, ...]
-
-    @property
-    def commanded(self) -> bool:
-        return self.arms[0].command is not None
-
-    @property
-    def frames(self) -> list[str]:
-        """Frames that must be reached from the base: of tools, and those that tool poses are given in."""
-        found = [arm.topics.tool_frame for arm in self.arms if arm.topics.tool_frame is not None]
-        return [frame.lstrip("/") for frame in found] + [arm.tool[1] for arm in self.arms if arm.tool is not None]
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        names: list[str] = []
-        for arm in self.arms:
-            joints = arm.topics.state.joints
-            given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
-            names += [f"{arm.topics.name}/{name}" for name in (*given, "gripper")]
-        return tuple(names)
-
-    @property
-    def gripper_columns(self) -> list[int]:
-        widths = np.cumsum([arm.topics.state.joints.width + 1 for arm in self.arms])
-        return [int(width) - 1 for width in widths]
-
-    def signals(self) -> list[Signal]:
-        """Every signal once."""
-        found: list[Signal] = []
-        for arm in self.arms:
-            found += arm.state.signals
-            found += arm.command.signals if arm.command is not None else ()
-            found += [arm.tool[0]] if arm.tool is not None else []
-        return found
-
-    def arrivals(self) -> list[Arrivals]:
-        """Messages of the signals, those that two signals share counted once."""
-        return list({(signal.topic, len(signal.times_ns)): signal.arrivals for signal in self.signals()}.values())
-
-    def vectors(self, grid_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """State and action (t, J) float64, and how many gripper readings were clipped."""
-        states, actions, outside = [], [], 0
-        for arm in self.arms:
-            state, clipped = arm.state.at(grid_ns)
-            action, clipped_too = (state, 0) if arm.command is None else arm.command.at(grid_ns)
-            states.append(state)
-            actions.append(action)
-            outside += clipped + clipped_too
-        return np.concatenate(states, axis=1), np.concatenate(actions, axis=1), outside
-
-    def tools(self, tree: TransformTree, base: str, grid_ns: np.ndarray) -> np.ndarray | None:
-        """(t, A, 4, 4) T_base_tool where it is recorded, else None."""
-        poses: list[np.ndarray] = []
-        for arm in self.arms:
-            if arm.tool is not None:
-                signal, frame = arm.tool
-                values = resampling.poses(signal.times_ns, signal.values, grid_ns)
-                T_frame_tool = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])
-                poses.append(T_frame_tool if frame == base else tree.poses(base, frame, grid_ns) @ T_frame_tool)
-            elif arm.topics.tool_frame is not None:
-                poses.append(tree.poses(base, arm.topics.tool_frame.lstrip("/"), grid_ns))
-        return np.stack(poses, axis=1) if poses else None
-
-    def time_errors(self, grid_ns: np.ndarray) -> dict[str, TimeError]:
-        return {f"topic {signal.topic}": signal.time_error(grid_ns) for signal in self.signals()}
-
-    def prediction_error_rad(self) -> float:
-        """Of the measured joints."""
-        return max(arm.state.prediction_error_rad() for arm in self.arms)
-
-
-def read_robot(
-    config: McapTopicsSourceConfig, streams: Mapping[str, Stream], timing: Timing, where: object
-) -> RobotSignals:
-    """The declared joints, grippers and tool poses.
-
-    Raises: RejectedInputError: missing_column, invalid_tool_pose, clock_jump.
-    """
-
-    def signals(readings: ArmReadings) -> ArmSignals:
-        joints, gripper = (
-            read_signal(streams[each.topic], each, timing, config.max_disorder_s, where)
-            for each in (readings.joints, readings.gripper)
-        )
-        return ArmSignals(readings, joints, gripper)
-
-    return RobotSignals(
-        tuple(
-            _Arm(
-                topics=arm,
-                state=signals(arm.state),
-                command=None if arm.command is None else signals(arm.command),
-                tool=None
-                if arm.tool_pose is None
-                else read_poses(streams[arm.tool_pose], timing, config.max_disorder_s, where),
-            )
-            for arm in config.arms
-        )
     )

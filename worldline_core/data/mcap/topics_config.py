@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange
-from worldline_core.data.mcap.resampling import TimeSource
+from worldline_core.data.mcap.timing import TimeSource
 
 Resampling = Literal["linear", "hold"]
 

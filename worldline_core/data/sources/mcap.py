@@ -8,17 +8,19 @@ conventions. See docs/mcap.md.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from typing import Literal
 
 from worldline_core.data.episodes.source import LoadedEpisode, SourceConfigBase
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.mcap.episode import read_episode
-from worldline_core.data.mcap.episodes import Segment, segments
+from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.reader import read_episode_id, read_episode_mcap
-from worldline_core.data.mcap.topics_config import Markers, McapTopicsSourceConfig
+from worldline_core.data.mcap.topics import Segment, read_topics_episode
+from worldline_core.data.mcap.topics_config import Markers, McapTopicsSourceConfig, TimeRanges, WholeFiles
 from worldline_core.errors import DataError
 
 
@@ -28,43 +30,48 @@ class McapSourceConfig(SourceConfigBase):
     kind: Literal["mcap"] = "mcap"
 
 
+def _files(root: AnyPath) -> dict[str, AnyPath]:
+    """Path below the source's folder -> file; a source that is one file has that alone."""
+    return {root.name: root} if is_file(root) else {str(relative_name(p, root)): p for p in find_files(root, "*.mcap")}
+
+
+def _checked(path: AnyPath, name: str, root: AnyPath) -> AnyPath:
+    """The file, or the refusal of a name that leads out of the source's folder."""
+    return path if path == root else inside(root, name)
+
+
 class McapSource:
     """Reads a folder of MCAP files; a damaged file is known by its name."""
 
     def __init__(self, config: McapSourceConfig, root: AnyPath) -> None:
         self._name = config.name
         self._root = root
-        self._files: dict[str, AnyPath] = {}
-        for path in [root] if is_file(root) else find_files(root, "*.mcap"):
+        self._episodes: dict[str, tuple[AnyPath, str]] = {}
+        for name, path in _files(root).items():
             try:
-                if path != root:
-                    inside(root, str(relative_name(path, root)))
-                identity = read_episode_id(path)
+                identity = exported_episode_id(McapFile(_checked(path, name, root)))
             except DataError:
-                identity = str(relative_name(path, root)) if path != root else path.name  # `load` says what is wrong
-            if identity in self._files:
+                identity = name  # `load` says what is wrong
+            if identity in self._episodes:
                 identity = f"{identity}@{path.name}"
-            self._files[identity] = path
+            self._episodes[identity] = path, name
 
     def episode_ids(self) -> list[str]:
-        return list(self._files)
+        return list(self._episodes)
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        path = self._files[episode_id]
-        if path != self._root:
-            inside(self._root, str(relative_name(path, self._root)))
-        read = read_episode_mcap(path)
-        if read.episode.episode_id != episode_id:
+        path, name = self._episodes[episode_id]
+        loaded = read_exported_episode(McapFile(_checked(path, name, self._root)))
+        if loaded.episode.episode_id != episode_id:
             raise RejectedInputError(
                 "duplicate_id",
                 "Two files hold an episode of this id",
-                where=self._files[episode_id],
-                got=read.episode.episode_id,
+                where=path,
+                got=loaded.episode.episode_id,
             )
-        episode = read.episode if self._name is None else replace(read.episode, source=self._name)
-        return LoadedEpisode(
-            episode, tuple(read.frames), read.frames.__getitem__, read.robot_masks.get, read.distortions
-        )
+        if self._name is None:
+            return loaded
+        return replace(loaded, episode=replace(loaded.episode, source=self._name))
 
 
 class McapTopicsSource:
@@ -76,14 +83,12 @@ class McapTopicsSource:
     def __init__(self, config: McapTopicsSourceConfig, root: AnyPath) -> None:
         self._config = config
         self._episodes: dict[str, tuple[AnyPath, str, Segment]] = {}
-        alone = is_file(root)
-        for path in [root] if alone else find_files(root, "*.mcap"):
-            name = path.name if alone else str(relative_name(path, root))
+        for name, path in _files(root).items():
             stem = f"{config.label}-{name.removesuffix('.mcap')}"
             try:
-                checked = path if alone else inside(root, name)
+                checked = _checked(path, name, root)
                 file = McapFile(checked) if isinstance(config.episodes, Markers) else None
-                found = list(segments(config.episodes, file, name))
+                found = list(_segments(config.episodes, file, name))
             except RejectedInputError as error:
                 found = [Segment(fault=error)]
             for segment in found:
@@ -96,4 +101,68 @@ class McapTopicsSource:
         path, stem, segment = self._episodes[episode_id]
         if segment.fault is not None:
             raise segment.fault
-        return read_episode(self._config, McapFile(path), segment, episode_id, self._config.scene or stem)
+        return read_topics_episode(self._config, McapFile(path), segment, episode_id, self._config.scene or stem)
+
+
+def _segments(rule: WholeFiles | TimeRanges | Markers, file: McapFile | None, relative_path: str) -> Iterator[Segment]:
+    """Episodes of one file.
+
+    Args:
+        file: opened where there are markers: only they look into it.
+
+    Raises: RejectedInputError: missing_topic, unknown_schema, unreadable while looking for markers.
+    """
+    if isinstance(rule, WholeFiles):
+        yield Segment()
+    elif isinstance(rule, TimeRanges):
+        for part in rule.ranges:
+            if fnmatchcase(relative_path, part.file):
+                yield Segment(
+                    part.name,
+                    round(part.start_s * 1e9),
+                    round(part.stop_s * 1e9),
+                    relative=True,
+                    instruction=part.instruction,
+                )
+    elif file is not None:
+        yield from _between_markers(rule, file)
+
+
+def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
+    """Start to stop; a start without a stop, or the reverse, is an episode that cannot be read."""
+    file.check_topics([rule.topic])
+    found = [message for message in file.messages([rule.topic]) if message.kind == "marker"]
+    found.sort(key=lambda message: message.log_ns)
+    begun: tuple[int, re.Match[str]] | None = None
+    count = 0
+    for message in found:
+        text = str(message.value)
+        start, stop = re.fullmatch(rule.start, text), re.fullmatch(rule.stop, text)
+        if start is None and stop is None:
+            continue
+        if (start is not None) == (begun is not None):
+            yield _unpaired(rule, file, count, text)
+            count += 1
+            begun = None
+        if start is not None:
+            begun = message.log_ns, start
+        elif stop is not None and begun is not None:
+            instruction = begun[1].groupdict().get("instruction")
+            outcome = stop.groupdict().get("outcome")
+            known = outcome if outcome in ("success", "failure") else None
+            yield Segment(f"{count:04d}", begun[0], message.log_ns, instruction=instruction, outcome=known)
+            count, begun = count + 1, None
+    if begun is not None:
+        yield _unpaired(rule, file, count, "the end of the file")
+
+
+def _unpaired(rule: Markers, file: McapFile, count: int, text: str) -> Segment:
+    fault = RejectedInputError(
+        "missing_marker",
+        "Markers of an episode are not a start and a stop",
+        where=f"{file.shown}, topic {rule.topic}, episode {count}",
+        expected=f"{rule.start!r}, then {rule.stop!r}",
+        got=repr(text),
+        evidence={"episode": count, "marker": text},
+    )
+    return Segment(f"{count:04d}", fault=fault)

@@ -1,28 +1,25 @@
-"""One episode of an MCAP recording: its topics read, checked, and brought to the instants of a fixed rate."""
+"""One episode of another tool's MCAP recording: declared topics read, checked, and brought to instants of a fixed rate."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import Episode, Outcome
 from worldline_core.data.episodes.recorded_poses import repair_notes
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import resampling
-from worldline_core.data.mcap.cameras import camera_tracks, read_calibration
-from worldline_core.data.mcap.episodes import Segment
-from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.images import ImageTrack, spoiled_frames
+from worldline_core.data.mcap import timing as resampling
+from worldline_core.data.mcap.cameras import TransformTree, camera_tracks, read_calibration, read_tree
+from worldline_core.data.mcap.file import READING_MARGIN_NS, McapFile, Stream, read_streams
+from worldline_core.data.mcap.images import EpisodeImages, ImageTrack, spoiled_frames
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind
-from worldline_core.data.mcap.resampling import Arrivals, TimeError, check_gaps, in_order
 from worldline_core.data.mcap.robot import RobotSignals, read_robot
-from worldline_core.data.mcap.streams import READING_MARGIN_NS, Stream, Timing, read_streams
-from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig, ViewTopics
-from worldline_core.data.mcap.transforms import TransformTree, read_tree
+from worldline_core.data.mcap.timing import Arrivals, TimeError, Timing, check_gaps, in_order
+from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig
 
 LAYOUT = "mcap topics"
 _KINDS: dict[str, tuple[Kind, ...]] = {
@@ -36,7 +33,34 @@ _TOGETHER_NS = 1_000_000
 """Topics that begin within a millisecond begin together: no image is left out for that."""
 
 
-def read_episode(
+@dataclass(frozen=True)
+class Segment:
+    """An episode inside of a file.
+
+    Attributes:
+        name: what tells it from others of the file; empty for a whole file.
+        start_ns, stop_ns: log times; None: from the beginning, to the end.
+        relative: the times are counted from the file's first message.
+        fault: why it cannot be read, where that is known already.
+    """
+
+    name: str = ""
+    start_ns: int | None = None
+    stop_ns: int | None = None
+    relative: bool = False
+    instruction: str | None = None
+    outcome: Outcome | None = None
+    fault: RejectedInputError | None = None
+
+    def log_times(self, file: McapFile) -> tuple[int | None, int | None]:
+        """First and last log time [ns]."""
+        if not self.relative:
+            return self.start_ns, self.stop_ns
+        first = file.first_log_ns
+        return first + (self.start_ns or 0), None if self.stop_ns is None else first + self.stop_ns
+
+
+def read_topics_episode(
     config: McapTopicsSourceConfig, file: McapFile, segment: Segment, episode_id: str, scene: str
 ) -> LoadedEpisode:
     """The episode; its images stay in the file until they are asked for.
@@ -116,7 +140,7 @@ def read_episode(
         view: _track(streams[topics.image], images[view], chosen[view], around, file)
         for view, topics in config.views.items()
     }
-    reader = _ImageReader(file, tracks, cameras, config.views)
+    reader = EpisodeImages(file, tracks, cameras, {v: topics.calibration for v, topics in config.views.items()})
     return LoadedEpisode(episode, tuple(config.views), reader, distortions=lenses)
 
 
@@ -246,38 +270,6 @@ def _track(
                 evidence={"first_frame": first, "frames": int(spoiled.sum())},
             )
     return ImageTrack(stream.topic, stream.kind, *around, arrivals.order, chosen, keys)
-
-
-@dataclass(frozen=True)
-class _ImageReader:
-    """view -> its frames, one after the other."""
-
-    file: McapFile
-    tracks: Mapping[str, ImageTrack]
-    cameras: Mapping[str, CameraTrack]
-    views: Mapping[str, ViewTopics]
-
-    def __call__(self, view: str) -> Iterator[np.ndarray]:
-        """uint8 (H, W, 3) RGB.
-
-        Raises: RejectedInputError (missing_calibration) when the images are not of the size that is calibrated.
-        """
-        camera = self.cameras.get(view)
-        for image in self.tracks[view].frames(self.file):
-            if camera is not None and image.shape[:2] != (camera.height, camera.width):
-                raise RejectedInputError(
-                    "missing_calibration",
-                    "Calibration is of another image size",
-                    where=f"{self.file.shown}, topic {self.views[view].calibration}",
-                    expected=f"{image.shape[1]}x{image.shape[0]}",
-                    got=f"{camera.width}x{camera.height}",
-                    evidence={
-                        "view": view,
-                        "calibrated": [camera.height, camera.width],
-                        "images": list(image.shape[:2]),
-                    },
-                )
-            yield image
 
 
 def _resampling_notes(errors: Mapping[str, TimeError]) -> dict[str, str | float | int]:

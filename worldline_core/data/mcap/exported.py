@@ -1,0 +1,160 @@
+"""Files that `writer` wrote, one episode each: a layout of the general reader that needs no declaration.
+
+Which topics there are, and all that is said about the episode in words, stands in the metadata. What differs from the
+recordings of others: a frame's messages are all of one time, so the instants are those of the states and nothing is
+resampled; states and gripper openings are taken as they are; robot masks are images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode, EpisodeDescription
+from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as
+from worldline_core.data.episodes.source import LoadedEpisode
+from worldline_core.data.guards.plain_files import parse_json, well_formed
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.cameras import intrinsics, lens
+from worldline_core.data.mcap.file import McapFile, Stream, read_streams
+from worldline_core.data.mcap.images import EpisodeImages, ImageTrack
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
+from worldline_core.data.mcap.writer import EPISODE_METADATA, FORMAT_VERSION
+from worldline_core.geometry.distortion import Distortion
+from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
+
+READABLE_VERSIONS = (1, FORMAT_VERSION)
+"""1 wrote joints as names and positions, in a schema of its own."""
+
+
+def exported_episode_id(file: McapFile) -> str:
+    """The episode id that a file states.
+
+    Raises: RejectedInputError (unreadable) when the file is damaged or holds no episode of this project.
+    """
+    with well_formed(file.shown, f"metadata {EPISODE_METADATA}"):
+        return str(_metadata(file)["episode_id"])
+
+
+def read_exported_episode(file: McapFile) -> LoadedEpisode:
+    """One episode: png images exactly, times to 1 ns, K exactly, poses to 1e-12. Images stay in the file until asked for.
+
+    Raises: RejectedInputError: unreadable, length_mismatch or missing_calibration where messages are missing.
+    """
+    about = _metadata(file)
+    with well_formed(file.shown, "an episode as this project writes it"):
+        return _assembled(file, about)
+
+
+def _metadata(file: McapFile) -> dict[str, Any]:
+    if EPISODE_METADATA not in file.metadata:
+        raise RejectedInputError(
+            "unreadable",
+            "MCAP file holds no episode of a known layout",
+            where=file.shown,
+            expected=f"a metadata record {EPISODE_METADATA}",
+            got=", ".join(file.metadata) or "none",
+        )
+    where = f"{file.shown}, {EPISODE_METADATA}"
+    about = {key: parse_json(value, where) for key, value in file.metadata[EPISODE_METADATA].items()}
+    if about.get("format_version") not in READABLE_VERSIONS:
+        raise RejectedInputError(
+            "unreadable",
+            "MCAP episode has another version",
+            where=file.shown,
+            expected=" or ".join(map(str, READABLE_VERSIONS)),
+            got=about.get("format_version"),
+        )
+    return about
+
+
+def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
+    views, moving = tuple(about["views"]), dict(about["cameras"])
+    num_frames = int(about["num_frames"])
+    video_frames = num_frames if about["video_frames"] is None else int(about["video_frames"])
+    roles: dict[str, tuple[Kind, ...]] = {
+        "/joint_states": ("joints",),
+        "/joint_commands": ("joints",),
+        "/tf": ("transforms",),
+        **dict.fromkeys((f"/{view}/calibration" for view in moving), ("calibration",)),
+        **dict.fromkeys((f"/{view}/{kind}" for view in views for kind in ("image", "robot_mask")), IMAGE_KINDS),
+    }
+    streams = read_streams(file, roles, None, None)
+    joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
+    images = {view: _track(_all_of(streams, f"/{view}/image", video_frames, file)) for view in views}
+    masks = {view: _track(streams[f"/{view}/robot_mask"]) for view in views if f"/{view}/robot_mask" in streams}
+    poses: dict[str, list[Transform]] = {}
+    for message in streams["/tf"].values if "/tf" in streams else ():
+        for transform in message:
+            poses.setdefault(transform.child, []).append(transform)
+
+    cameras: dict[str, CameraTrack] = {}
+    lenses: dict[str, Distortion] = {}
+    for view in moving:
+        topic = f"/{view}/calibration"
+        (calibration,) = _all_of(streams, topic, 1, file).values
+        where = f"{file.shown}, topic {topic}"
+        K, (height, width) = intrinsics(calibration, rectified=False, where=where)
+        pose = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
+        cameras[view] = CameraTrack.from_pose(view, K, camera_pose(view, pose, where=where), width=width, height=height)
+        distortion = lens(calibration, view, rectified=False, where=where)
+        if distortion is not None:
+            lenses[view] = distortion
+    tools = [_poses(poses, f"tool_{arm}", num_frames, file) for arm in range(int(about["num_arms"]))]
+    state, action = (
+        np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
+        for name in ("state", "command")
+    )
+    episode = Episode(
+        **EpisodeDescription.arguments(about),
+        state=state,
+        action=action,
+        timestamps=np.array(joints["state"].log_ns, dtype=np.float64) / 1e9,
+        cameras=cameras,
+        T_base_ee=np.stack(tools, axis=1) if tools else None,
+        gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
+        video_frames=about["video_frames"],
+    )
+    reader = EpisodeImages(file, images, cameras, {view: f"/{view}/calibration" for view in moving})
+
+    def robot_masks(view: str) -> np.ndarray | None:
+        return np.stack([image[..., 0] > 127 for image in masks[view].frames(file)]) if view in masks else None
+
+    return LoadedEpisode(episode, views, reader, robot_masks, lenses)
+
+
+def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:
+    found = len(streams[topic].log_ns) if topic in streams else 0
+    if found != count or count == 0:
+        raise RejectedInputError(
+            "length_mismatch",
+            "Messages are missing",
+            where=f"{file.shown}, topic {topic}",
+            expected=f"{max(count, 1)} messages",
+            got=f"{found} messages",
+            evidence={"topic": topic, "expected": count, "found": found},
+        )
+    return streams[topic]
+
+
+def _track(stream: Stream) -> ImageTrack:
+    every = np.arange(len(stream.log_ns))
+    return ImageTrack(stream.topic, stream.kind, None, None, order=every, chosen=every)
+
+
+def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: McapFile) -> np.ndarray:
+    transforms = found.get(child, [])
+    if len(transforms) != count:
+        raise RejectedInputError(
+            "missing_calibration",
+            "Transforms are missing",
+            where=f"{file.shown}, frame {child}",
+            expected=count,
+            got=len(transforms),
+            evidence={"frame": child, "expected": count, "found": len(transforms)},
+        )
+    values = np.array([transform.values for transform in transforms], dtype=np.float64)
+    with rejected_as("invalid_extrinsics", f"{file.shown}, frame {child}", {"frame": child}):
+        return pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])

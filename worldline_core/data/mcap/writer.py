@@ -1,0 +1,278 @@
+"""Episodes and rollouts as MCAP files that Foxglove opens.
+
+Messages are JSON in Foxglove's schemas, all of a frame stamped with the frame's time in nanoseconds:
+`/<view>/image` CompressedImage (png is exact, jpeg is not), `/<view>/calibration` CameraCalibration, `/tf` FrameTransform
+(cameras, tools), `/joint_states` and `/joint_commands` JointStates. Everything else about an episode is one
+metadata record. The same input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.errors import DataError
+from worldline_core.geometry.distortion import Distortion
+from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
+from worldline_core.store.atomic import atomic_path
+
+ImageFormat = Literal["png", "jpeg"]
+EPISODE_METADATA = "worldline.episode"
+FORMAT_VERSION = 2
+_JPEG_QUALITY = 95
+_LENS_NAMES = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
+
+
+def write_episode_mcap(
+    path: Path,
+    episode: Episode,
+    frames: Mapping[str, np.ndarray],
+    *,
+    image_format: ImageFormat = "png",
+    robot_masks: Mapping[str, np.ndarray] | None = None,
+    distortions: Mapping[str, Distortion] | None = None,
+) -> None:
+    """Write one episode.
+
+    Args:
+        frames: by view, uint8 (episode.num_video_frames, H, W, 3) RGB.
+        image_format: png keeps pixels exactly; jpeg (quality 95) is smaller and keeps them on average within 4 of 255.
+        robot_masks: by view, bool (N, H, W), always exact.
+        distortions: lenses by view, where frames and K are those of a distorting lens.
+
+    Raises: DataError when frames and states differ in number.
+    """
+    for view, images in frames.items():
+        if len(images) != episode.num_video_frames:
+            raise DataError(
+                "Images and states differ in number",
+                where=f"{path}, view {view}",
+                expected=episode.num_video_frames,
+                got=len(images),
+            )
+    names = list(episode.state_names or (f"state_{i}" for i in range(episode.state.shape[1])))
+    with _new_file(path, EPISODE_METADATA, _metadata(episode, list(frames), image_format)) as messages:
+        for index, time in enumerate(episode.timestamps):
+            messages.time_ns = round(float(time) * 1e9)
+            for topic, values in (("/joint_states", episode.state), ("/joint_commands", episode.action)):
+                joints = [{"name": n, "position": v} for n, v in zip(names, values[index].tolist(), strict=True)]
+                messages.add(topic, "foxglove.JointStates", {"joints": joints})
+            messages.add_poses(index, episode.cameras, episode.T_base_ee, distortions or {})
+            if index < episode.num_video_frames:
+                messages.add_images("image", index, frames, image_format)
+                messages.add_images("robot_mask", index, robot_masks or {}, image_format)
+
+
+def write_rollout_mcap(
+    path: Path,
+    frames_by_view: Mapping[str, np.ndarray],
+    fps: float,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    cameras: Mapping[str, CameraTrack] | None = None,
+    T_base_ee: np.ndarray | None = None,
+    image_format: ImageFormat = "jpeg",
+) -> None:
+    """Write predicted videos.
+
+    Args:
+        frames_by_view: uint8 (N, H, W, 3) RGB by view.
+        metadata: what to remember about the rollout (method, seed, checkpoint).
+        cameras: calibration to show along with the images; their size must be that of the images.
+        T_base_ee: (N, A, 4, 4) commanded tool poses.
+
+    Raises: DataError when the views differ in length or there are none.
+    """
+    lengths = {view: len(images) for view, images in frames_by_view.items()}
+    if len(set(lengths.values())) != 1:
+        raise DataError("Views of a rollout differ in length", where=str(path), expected="one length", got=lengths)
+    record = {"fps": json.dumps(fps), "views": json.dumps(list(frames_by_view)), **(metadata or {})}
+    with _new_file(path, "worldline.rollout", record) as messages:
+        for index in range(next(iter(lengths.values()))):
+            messages.time_ns = round(float(index / fps) * 1e9)
+            messages.add_poses(index, cameras or {}, T_base_ee, {})
+            messages.add_images("image", index, frames_by_view, image_format)
+
+
+@contextmanager
+def _new_file(path: Path, name: str, metadata: Mapping[str, str]) -> Iterator[_Messages]:
+    """A file with a metadata record, which appears when its messages are complete."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="worldline")
+        writer.add_metadata(name, dict(metadata))
+        yield _Messages(writer)
+        writer.finish()
+
+
+class _Messages:
+    """Writes messages of the time `time_ns`; a channel is registered when it is first used."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.time_ns = 0
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+
+    def add(self, topic: str, schema: str, message: Mapping[str, Any]) -> None:
+        if schema not in self._schemas:
+            text = json.dumps(_SCHEMAS[schema], sort_keys=True).encode()
+            self._schemas[schema] = self._writer.register_schema(schema, "jsonschema", text)
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[schema])
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        stamp = {"sec": self.time_ns // 10**9, "nsec": self.time_ns % 10**9}
+        data = json.dumps({"timestamp": stamp, **message}, separators=(",", ":"), allow_nan=False).encode()
+        self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence)
+
+    def add_poses(
+        self,
+        index: int,
+        cameras: Mapping[str, CameraTrack],
+        T_base_ee: np.ndarray | None,
+        distortions: Mapping[str, Distortion],
+    ) -> None:
+        """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
+        for view, camera in cameras.items():
+            if index == 0:
+                message = _calibration(camera, distortions.get(view))
+                self.add(f"/{view}/calibration", "foxglove.CameraCalibration", message)
+            if index == 0 or camera.moving:
+                pose = camera.T_base_camera[index if camera.moving else 0]
+                self.add("/tf", "foxglove.FrameTransform", _transform(f"{view}_camera", pose))
+        for arm, pose in enumerate(T_base_ee[index] if T_base_ee is not None else ()):
+            self.add("/tf", "foxglove.FrameTransform", _transform(f"tool_{arm}", pose))
+
+    def add_images(self, kind: str, index: int, stacks: Mapping[str, np.ndarray], image_format: ImageFormat) -> None:
+        for view, stack in stacks.items():
+            message = _image(stack[index], f"{view}_camera", image_format)
+            self.add(f"/{view}/{kind}", "foxglove.CompressedImage", message)
+
+
+def _metadata(episode: Episode, views: list[str], image_format: str) -> dict[str, str]:
+    values = {
+        "format_version": FORMAT_VERSION,
+        **episode.described(),
+        "views": views,
+        "cameras": {view: bool(camera.moving) for view, camera in episode.cameras.items()},
+        "num_frames": episode.num_frames,
+        "video_frames": episode.video_frames,
+        "num_arms": 0 if episode.T_base_ee is None else int(episode.T_base_ee.shape[1]),
+        "gripper": None if episode.gripper is None else np.asarray(episode.gripper, np.float64).tolist(),
+        "image_format": image_format,
+    }
+    return {key: json.dumps(value, sort_keys=True) for key, value in values.items()}
+
+
+def _image(frame: np.ndarray, frame_id: str, image_format: ImageFormat) -> dict[str, Any]:
+    if frame.dtype == bool:
+        pixels, image_format = frame.astype(np.uint8) * 255, "png"
+    else:
+        pixels = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    done, encoded = cv2.imencode(".jpg" if image_format == "jpeg" else ".png", pixels, settings)
+    if not done:
+        raise DataError("Image cannot be compressed", where=frame_id, expected=image_format, got=str(frame.shape))
+    return {"frame_id": frame_id, "data": base64.b64encode(encoded.tobytes()).decode(), "format": image_format}
+
+
+def _calibration(camera: CameraTrack, distortion: Distortion | None) -> dict[str, Any]:
+    """Foxglove's CameraCalibration; a lens with more than five radtan coefficients is a rational_polynomial."""
+    model, coefficients = "plumb_bob", (0.0,) * 5
+    if distortion is not None:
+        coefficients = distortion.coefficients
+        model = "rational_polynomial" if len(coefficients) > 5 else _LENS_NAMES[distortion.model]
+    K = camera.K.reshape(-1).tolist()
+    return {
+        "frame_id": f"{camera.view}_camera",
+        "width": camera.width,
+        "height": camera.height,
+        "distortion_model": model,
+        "D": list(coefficients),
+        "K": K,
+        "R": np.eye(3).reshape(-1).tolist(),
+        "P": [*K[0:3], 0.0, *K[3:6], 0.0, *K[6:9], 0.0],
+    }
+
+
+def _transform(child: str, pose: np.ndarray) -> dict[str, Any]:
+    w, x, y, z = (float(value) for value in quaternion_wxyz_from_rotation(pose[:3, :3]))
+    return {
+        "parent_frame_id": "base",
+        "child_frame_id": child,
+        "translation": dict(zip("xyz", (float(v) for v in pose[:3, 3]), strict=True)),
+        "rotation": {"x": x, "y": y, "z": z, "w": w},
+    }
+
+
+# Foxglove's published schemas, cut to the fields that are written.
+_TIME: dict[str, Any] = {
+    "type": "object",
+    "title": "time",
+    "properties": {
+        "sec": {"type": "integer", "minimum": 0},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
+}
+_NUMBER: dict[str, Any] = {"type": "number"}
+_NUMBERS: dict[str, Any] = {"type": "array", "items": _NUMBER}
+_STRING: dict[str, Any] = {"type": "string"}
+
+
+def _object(title: str, **properties: dict[str, Any]) -> dict[str, Any]:
+    return {"title": title, "type": "object", "properties": properties, "required": list(properties)}
+
+
+def _record(title: str, *names: str) -> dict[str, Any]:
+    return _object(title, **dict.fromkeys(names, _NUMBER))
+
+
+def _matrix(count: int) -> dict[str, Any]:
+    return {**_NUMBERS, "minItems": count, "maxItems": count}
+
+
+_SCHEMAS: dict[str, dict[str, Any]] = {
+    "foxglove.CompressedImage": _object(
+        "foxglove.CompressedImage",
+        timestamp=_TIME,
+        frame_id=_STRING,
+        data={"type": "string", "contentEncoding": "base64"},
+        format=_STRING,
+    ),
+    "foxglove.CameraCalibration": _object(
+        "foxglove.CameraCalibration",
+        timestamp=_TIME,
+        frame_id=_STRING,
+        width={"type": "integer", "minimum": 0},
+        height={"type": "integer", "minimum": 0},
+        distortion_model=_STRING,
+        D=_NUMBERS,
+        K=_matrix(9),
+        R=_matrix(9),
+        P=_matrix(12),
+    ),
+    "foxglove.FrameTransform": _object(
+        "foxglove.FrameTransform",
+        timestamp=_TIME,
+        parent_frame_id=_STRING,
+        child_frame_id=_STRING,
+        translation=_record("foxglove.Vector3", "x", "y", "z"),
+        rotation=_record("foxglove.Quaternion", "x", "y", "z", "w"),
+    ),
+    "foxglove.JointStates": _object(
+        "foxglove.JointStates",
+        timestamp=_TIME,
+        joints={"type": "array", "items": _object("foxglove.JointState", name=_STRING, position=_NUMBER)},
+    ),
+}
