@@ -5,7 +5,7 @@ SHELL := /bin/bash
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
 
-.PHONY: demo wheels test test-slow lint install install-scale record clean
+.PHONY: demo docs wheels test test-slow lint install install-scale record clean
 
 demo: install
 	$(RUN) worldline pipeline --preset demo
@@ -37,6 +37,10 @@ install-scale: install
 # The recordings that the demo uses, made again from their seeds (needs software GL, see README).
 record: install
 	$(RUN) worldline record --config configs/recording/sample.yaml --output artifacts/recorded
+
+# The documentation as a site in site/; a dead link or a broken docstring ends it.
+docs: $(filter .bootstrap/bin/uv,$(UV))
+	$(UV) run --frozen --isolated --only-group docs mkdocs build
 
 # The package, and the shipped recordings and models as a second one: pip install worldline[assets] --find-links dist
 wheels: install

@@ -2,7 +2,7 @@
 
 The conditioning frame counts like every other. Means are taken over time by the caller, per trajectory and view.
 
-Robot-mask IoU by the paper's rules (appendix "Robot-mask IoU"; method.md section 6). Head view only.
+Robot-mask IoU by the paper's rules (appendix "Robot-mask IoU"; docs/method.md section 6). Head view only.
 
 A frame in which both masks are empty is left out; one in which only one is empty counts 0. Valid frames are averaged
 within a video, then videos are averaged. A video whose masks are empty in every frame is left out.

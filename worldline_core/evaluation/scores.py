@@ -153,7 +153,7 @@ def summarise(
 
     Returns:
         {"metrics": {group: {method: {metric: interval}}},
-         "differences": {group: [{"first", "second", "metric", mean, low, high, count}]}}
+        "differences": {group: [{"first", "second", "metric", mean, low, high, count}]}}
     """
     values: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for score in sorted(scores):

@@ -4,7 +4,7 @@ Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its s
 
 Sinusoidal time embedding, added to noisy tokens only.
 
-Action maps to token residuals (method.md section 2).
+Action maps to token residuals (docs/method.md section 2).
 """
 
 from __future__ import annotations

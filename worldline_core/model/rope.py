@@ -46,7 +46,7 @@ def video_positions(
     Args:
         frames: index of each latent frame, ``(t,)``.
         grid: patch rows and columns of one view.
-        views: names of the views, all sharing the temporal coordinates (method.md section 3).
+        views: names of the views, all sharing the temporal coordinates (docs/method.md section 3).
         temporal_offset: added to the temporal axis (text length plus margin when there is text).
     """
     rows, columns = grid

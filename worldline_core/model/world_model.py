@@ -154,7 +154,7 @@ class WorldModel(nn.Module):
         initialise(self, self.config.num_layers, generator)
 
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
-        """What Stage II trains besides the action branch (method.md section 4)."""
+        """What Stage II trains besides the action branch (docs/method.md section 4)."""
         for name, parameter in self.named_parameters():
             if not is_text_parameter(name) and not name.startswith("action_encoder."):
                 yield name, parameter

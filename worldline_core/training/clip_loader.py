@@ -236,7 +236,7 @@ class ClipLoader:
         return ClipFacts(clip.num_frames, rate / clip.stride, self.store.image_size)
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
-        """Maps at latent resolution: latent frame j takes the control of video frame 4 j (method.md section 2)."""
+        """Maps at latent resolution: latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""
         cut = []
         for clip in clips:
             frames = [clip.start + clip.stride * index for index in latent_frame_indices(clip.num_frames)]

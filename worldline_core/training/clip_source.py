@@ -61,7 +61,7 @@ class ClipBatch:
 
 
 def latent_frame_count(num_frames: int) -> int:
-    """T_l = 1 + (T - 1) / 4 (method.md section 2).
+    """T_l = 1 + (T - 1) / 4 (docs/method.md section 2).
 
     Raises:
         DataError: if ``num_frames`` is not one more than a multiple of four.

@@ -1,4 +1,4 @@
-"""Rectified-flow matching: noise schedule, targets and the loss (method.md section 4).
+"""Rectified-flow matching: noise schedule, targets and the loss (docs/method.md section 4).
 
 ``z_sigma = (1 - sigma) z + sigma eps``; the target velocity is ``eps - z``. The first latent frame of a clip is the
 clean observation: it is given to the model without noise and carries no loss.

@@ -1,4 +1,4 @@
-"""Stage I: action-free, text-conditioned prediction of a single task-facing view (method.md sections 1 and 4)."""
+"""Stage I: action-free, text-conditioned prediction of a single task-facing view (docs/method.md sections 1 and 4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage II: action-driven prediction of three synchronised views, without text (method.md section 4).
+"""Stage II: action-driven prediction of three synchronised views, without text (docs/method.md section 4).
 
 Successes and failures are trained alike; no outcome label reaches the model.
 """
