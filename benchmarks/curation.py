@@ -41,7 +41,7 @@ from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.scale.mapping import Outcome
+from worldline_core.scale.mapping import Shard, TakeOutcome, do_shard
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.store.store import ArtifactStore
 
@@ -250,17 +250,10 @@ class Processes:
     def __init__(self, count: int) -> None:
         self.pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"))
 
-    def map(
-        self,
-        function: Callable[[Any], Any],
-        jobs: Sequence[Any],
-        take: Callable[[Outcome[Any, Any]], None],
-        *,
-        one_at_a_time: bool = False,
-    ) -> None:
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
         del one_at_a_time
-        for job, result in zip(jobs, self.pool.map(function, jobs), strict=True):
-            take(Outcome(job, result))
+        for shard, _ in zip(shards, self.pool.map(do_shard, shards), strict=True):
+            take(shard, None)
 
 
 def in_processes(corpus: Path, work: Path, count: int) -> dict[str, float]:

@@ -18,15 +18,16 @@ from typing import Any
 
 from worldline_core.errors import UnavailableError
 from worldline_core.scale.mapping import (
-    Job,
-    Outcome,
     RunnerConfig,
     SerialMapper,
+    Shard,
     ShardMapper,
+    TakeOutcome,
     WorkerDiedError,
+    do_shard,
     retry_pauses,
 )
-from worldline_core.store.remote import is_transient
+from worldline_core.store.remote import is_transient, process_cache
 
 _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
@@ -37,11 +38,11 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def shard_mapper(config: RunnerConfig) -> ShardMapper:
     """What does mapped work as configured."""
-    return (
-        SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds)
-        if config.kind == "serial"
-        else (PrefectMapper(config))
-    )
+    return _serial(config) if config.kind == "serial" else PrefectMapper(config)
+
+
+def _serial(config: RunnerConfig) -> SerialMapper:
+    return SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds)
 
 
 class PrefectMapper:
@@ -49,48 +50,32 @@ class PrefectMapper:
 
     def __init__(self, config: RunnerConfig) -> None:
         self.config = config
+        self.episodes_per_shard = config.episodes_per_shard
 
-    @property
-    def episodes_per_shard(self) -> int:
-        return self.config.episodes_per_shard
-
-    def map[J: Job, R](
-        self,
-        function: Callable[[J], R],
-        jobs: Sequence[J],
-        take: Callable[[Outcome[J, R]], None],
-        *,
-        one_at_a_time: bool = False,
-    ) -> None:
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
         config = self.config
-        few = config.kind == "auto" and (sum(map(len, jobs)) < config.serial_below or self._workers() == 1)
+        few = config.kind == "auto" and (sum(map(len, shards)) < config.serial_below or self._workers() == 1)
         # What killed a worker must not get the chance to kill this process.
-        if not jobs or (few and not one_at_a_time):
-            SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds).map(function, jobs, take)
+        if not shards or (few and not one_at_a_time):
+            _serial(config).map(shards, take)
             return
-        waiting = deque(jobs)
+        waiting = deque(shards)
         limit = 1 if one_at_a_time else config.in_flight or 2 * self._workers()
         while waiting:  # a process pool that lost a worker is at its end: the next round has a new one
-            self._round(function, waiting, take, limit)
+            self._round(waiting, take, limit)
 
     def _workers(self) -> int:
         return self.config.workers or len(os.sched_getaffinity(0))
 
-    def _round(
-        self,
-        function: Callable[[Any], Any],
-        waiting: deque[Any],
-        take: Callable[[Outcome[Any, Any]], None],
-        limit: int,
-    ) -> None:
-        """One flow, until no job waits or the runner has lost a worker."""
+    def _round(self, waiting: deque[Shard[Any]], take: TakeOutcome, limit: int) -> None:
+        """One flow, until no shard waits or the runner has lost a worker."""
         # Read when Prefect is imported: without a server of its own it starts one, which takes a while on a busy machine.
         os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
         os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
         from prefect import Flow, Task
 
-        work = Task(
-            fn=do_shard,
+        task = Task(
+            fn=_work,
             name="shard",
             retries=self.config.retries,
             retry_delay_seconds=retry_pauses(self.config.retries, self.config.retry_seconds),
@@ -100,28 +85,27 @@ class PrefectMapper:
         )
         room = int(self.config.remote_cache_gb * 2**30)
 
-        def hand_out(job: Any) -> Any:
+        def hand_out(shard: Shard[Any]) -> Any:
             with self._one_try():
-                return work.with_options(task_run_name=job.label).submit(pickle.dumps((function, job)), room)
+                return task.with_options(task_run_name=shard.label).submit(pickle.dumps(shard), room)
 
-        first = waiting[0].label
-        name = first.rsplit(" shard", 1)[0]
-        shards = Flow(
-            fn=_shards,
-            name=f"{name} shards",
-            flow_run_name=f"{name}: {len(waiting)} shards from {first}",
+        first = waiting[0]
+        flow = Flow(
+            fn=_hand_out_shards,
+            name=f"{first.work.step} shards",
+            flow_run_name=f"{first.work.step}: {len(waiting)} shards from {first.label}",
             task_runner=self._task_runner(min(self._workers(), limit)),
             persist_result=False,
         )
         token = _round.set(_Round(waiting, hand_out, take, limit))
         try:
             with limited_threads(1):
-                shards()
+                flow()
         finally:
             _round.reset(token)
 
     def _one_try(self) -> AbstractContextManager[Any]:
-        """In which a shard is handed out: doing it again after its worker died is `run_jobs`' business, not the runner's."""
+        """In which a shard is handed out: doing it again after its worker died is `map_episodes`' business, not Ray's."""
         if self.config.kind != "ray":  # Dask's is said of the whole cluster, pools have none
             return nullcontext()
         from prefect_ray.context import remote_options
@@ -140,43 +124,41 @@ class PrefectMapper:
 
 @dataclass(frozen=True)
 class _Round:
-    waiting: deque[Any]
-    hand_out: Callable[[Any], Any]
-    take: Callable[[Outcome[Any, Any]], None]
+    waiting: deque[Shard[Any]]
+    hand_out: Callable[[Shard[Any]], Any]
+    take: TakeOutcome
     limit: int
 
 
-# Prefect sends the flow along with every task: its function must not hold the jobs.
+# Prefect sends the flow along with every task: its function must not hold the shards.
 _round: ContextVar[_Round] = ContextVar("_round")
 
 
-def _shards() -> None:
-    """The body of the flow: hand out a bounded number of jobs, take what comes back in their order."""
+def _hand_out_shards() -> None:
+    """The body of the flow: hand out a bounded number of shards, take what comes back in their order."""
     current = _round.get()
-    handed_out: deque[tuple[Any, Any]] = deque()
+    handed_out: deque[tuple[Shard[Any], Any]] = deque()
     broken = False
     while handed_out or (current.waiting and not broken):
         while current.waiting and not broken and len(handed_out) < current.limit:
-            job = current.waiting.popleft()
-            handed_out.append((job, current.hand_out(job)))
-        job, future = handed_out.popleft()
-        outcome = _outcome(job, future)
-        broken = broken or isinstance(outcome.error, WorkerDiedError)
-        current.take(outcome)
+            shard = current.waiting.popleft()
+            handed_out.append((shard, current.hand_out(shard)))
+        shard, future = handed_out.popleft()
+        error = _error(shard, future)
+        broken = broken or isinstance(error, WorkerDiedError)
+        current.take(shard, error)
 
 
-def do_shard(payload: bytes, remote_cache_bytes: int) -> Any:
-    """The body of every shard's task, in a worker: one thread for each worker, since there is one worker for each core."""
+def _work(payload: bytes, remote_cache_bytes: int) -> None:
+    """The body of every shard's task, in a worker: one thread per worker, since there is one worker per core."""
     import cv2
-
-    from worldline_core.store.remote import process_cache
 
     cv2.setNumThreads(1)
     process_cache().max_bytes = remote_cache_bytes
-    function, job = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
+    shard: Shard[Any] = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
-    return function(job)
+    do_shard(shard)
 
 
 def _may_pass(_task: Any, _run: Any, state: Any) -> bool:
@@ -185,18 +167,18 @@ def _may_pass(_task: Any, _run: Any, state: Any) -> bool:
     return isinstance(error, BaseException) and is_transient(error)
 
 
-def _outcome[J: Job](job: J, future: Any) -> Outcome[J, Any]:
+def _error(shard: Shard[Any], future: Any) -> Exception | None:
     try:
-        return Outcome(job, future.result())
-    except Exception as error:  # noqa: BLE001 - handed to the caller, which knows what ends the run
+        future.result()
+    except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
         if type(error).__name__ not in _DEATHS:
-            return Outcome(job, error=error)
-        died = WorkerDiedError(
+            return error
+        return WorkerDiedError(
             "A worker ended without an answer",
-            where=job.label,
+            where=shard.label,
             got="a crash in compiled code, or killed for its memory",
         )
-        return Outcome(job, error=died)
+    return None
 
 
 def process_runner(workers: int) -> Any:

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tools.corrupted.content import FPS, pictures
-from worldline_core.data.curation import shard as curate_shard
+from worldline_core.data.curation import curate as curate_step
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
@@ -28,14 +28,14 @@ Make = Callable[[int], tuple[Path, CurateConfig]]
 
 def during(episode: str, change: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `change` happen once the values of an episode were read, and before its pictures are."""
-    check = curate_shard.check_episode
+    check = curate_step.check_episode
 
     def changed(config: CurateConfig, loaded: LoadedEpisode) -> None:
         check(config, loaded)
         if loaded.episode.episode_id == episode:
             change()
 
-    monkeypatch.setattr(curate_shard, "check_episode", changed)
+    monkeypatch.setattr(curate_step, "check_episode", changed)
 
 
 def quarantined(output: Path) -> dict[str, str]:

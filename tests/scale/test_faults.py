@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import errno
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from pydantic import ValidationError
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.scale.mapping import RunnerConfig, ends_the_run, portable_message
-from worldline_core.scale.shard_manifest import (
+from worldline_core.scale.account import (
     InputRow,
     check_account,
-    read_shard_manifests,
-    write_shard_manifest,
+    portable_message,
+    read_account,
+    write_account,
+    write_shard_account,
 )
+from worldline_core.scale.mapping import RunnerConfig, ends_the_run
 from worldline_core.store import remote as transient
 from worldline_core.store.remote import UnreachableInputError, is_transient, with_retries
 
@@ -112,16 +115,25 @@ def test_what_ends_a_run(error: Exception, expected: bool) -> None:
     assert ends_the_run(error) is expected
 
 
-def rows(*statuses: str) -> list[InputRow]:
+def rows(*statuses: Literal["kept", "quarantined"]) -> list[InputRow]:
     return [
-        InputRow(f"e{n}", "s", status, None if status == "kept" else "too_short", "", 10, 0.5, 0.4)  # type: ignore[arg-type]
+        InputRow(
+            episode_id=f"e{n}",
+            source="s",
+            status=status,
+            reason=None if status == "kept" else "too_short",
+            stored_bytes=10,
+            seconds=0.5,
+            cpu_seconds=0.4,
+        )
         for n, status in enumerate(statuses)
     ]
 
 
 def test_the_account_is_complete_or_an_error(tmp_path: Path) -> None:
     whole = rows("kept", "quarantined", "kept")
-    check_account(3, {"e0", "e2"}, {"e1"}, whole, tmp_path)
+    write_account(tmp_path, whole)
+    check_account(tmp_path, 3, {"e0", "e2"}, {"e1"})
     for found, kept, quarantined, account in (
         (4, {"e0", "e2"}, {"e1"}, whole),  # an input in no row
         (3, {"e0"}, {"e1"}, whole),  # kept by the account, not in the index
@@ -129,17 +141,21 @@ def test_the_account_is_complete_or_an_error(tmp_path: Path) -> None:
         (3, {"e0", "e1"}, {"e2"}, whole),  # the other way round
         (3, {"e0", "e2"}, {"e1"}, [*whole[:2], whole[0]]),  # one twice
     ):
+        write_account(tmp_path, account)
         with pytest.raises(DataError, match="Inputs were lost"):
-            check_account(found, kept, quarantined, account, tmp_path)
+            check_account(tmp_path, found, kept, quarantined)
 
 
 def test_shards_are_merged_and_the_row_with_the_work_counts(tmp_path: Path) -> None:
     first, second = rows("kept", "quarantined")
-    unknown = InputRow("e0", "s", "kept", None, "", 10)
-    write_shard_manifest(tmp_path, "shard-1", [unknown, second])
-    write_shard_manifest(tmp_path, "shard-2", [first])
-    assert read_shard_manifests(tmp_path) == {"e0": first, "e1": second}
-    assert all(path.relative_to(tmp_path).parts[0] == "run" for path in tmp_path.rglob("*.parquet"))
+    unknown = replace(first, seconds=None, cpu_seconds=None)
+    write_shard_account(tmp_path, 0, [unknown, second])
+    write_shard_account(tmp_path, 1, [first])
+    write_account(tmp_path, [unknown, replace(second, seconds=None, cpu_seconds=None)])
+    assert read_account(tmp_path) == [first, second]
+    written = list(tmp_path.rglob("*.parquet"))
+    assert len(written) == 3
+    assert all(path.relative_to(tmp_path).parts[0] == "run" for path in written)
 
 
 def test_messages_say_nothing_of_this_machine() -> None:

@@ -20,8 +20,8 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
+from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import SerialMapper
-from worldline_core.scale.shard_manifest import read_merged_manifest
 from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
@@ -105,7 +105,7 @@ def test_a_store_that_stays_away_is_no_reason_to_quarantine(
     assert (writer.kept(), writer.rejected()) == ([], [])
     store.misbehave = lambda method, path: None
     assert curated_digest(config(url), tmp_path / "out") == curated_digest(config(recordings), tmp_path / "local")
-    assert {row.status for row in read_merged_manifest(tmp_path / "out")} == {"kept"}
+    assert {row.status for row in read_account(tmp_path / "out")} == {"kept"}
 
 
 class Forgetful(MemoryFileSystem):

@@ -24,8 +24,8 @@ from worldline_core.data.episodes.episode_index import read_index, read_quaranti
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
-from worldline_core.scale.shard_manifest import read_merged_manifest
 from worldline_core.store.digest import digest_folder
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
@@ -65,7 +65,7 @@ def both_digests(recordings: Path, output: Path, mapper: Any) -> tuple[str, str]
 def undisturbed(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     output = tmp_path_factory.mktemp("undisturbed")
     digests = both_digests(recordings, output, SerialMapper())
-    rows = read_merged_manifest(output / "set")
+    rows = read_account(output / "set")
     assert len(rows) == COUNT + 1
     rejected = {row.episode_id: row.reason for row in read_quarantine(output / "set")}
     assert rejected["episode-002"] == "nan_state"
@@ -76,7 +76,7 @@ def undisturbed(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> t
         r.episode_id for r in read_index(output / "set")
     }
     assert all(row.seconds is not None and row.seconds > 0 for row in rows)
-    assert len(read_merged_manifest(output / "index")) == len(rows) - len(rejected)
+    assert len(read_account(output / "index")) == len(rows) - len(rejected)
     return digests
 
 
@@ -160,7 +160,7 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
     assert not EpisodeSetWriter.finished(output)
     mapper = SerialMapper(5)
     assert both_digests(recordings, tmp_path, mapper) == undisturbed
-    rows = read_merged_manifest(output)
+    rows = read_account(output)
     assert len(rows) == COUNT + 1
     assert len({row.episode_id for row in rows}) == COUNT + 1
 
@@ -168,16 +168,16 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
 def test_an_unforeseen_error_is_a_quarantined_episode(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from worldline_core.data.curation import shard as curate_shard
+    from worldline_core.data.curation import curate as curate_step
 
-    whole = curate_shard.check_episode
+    whole = curate_step.check_episode
 
     def fails_on_one(configured: CurateConfig, loaded: Any) -> None:
         if loaded.episode.episode_id == "episode-004":
             raise ZeroDivisionError(f"at {tmp_path}/somewhere/x.py, object at 0x7f00deadbeef")
         whole(configured, loaded)
 
-    monkeypatch.setattr(curate_shard, "check_episode", fails_on_one)
+    monkeypatch.setattr(curate_step, "check_episode", fails_on_one)
     counts = curate(config(recordings), {}, tmp_path / "set")
     assert counts["reasons"]["crashed"] == 1
     assert counts["kept"] + counts["quarantined"] == counts["found"] == COUNT + 1
@@ -185,7 +185,7 @@ def test_an_unforeseen_error_is_a_quarantined_episode(
     evidence = json.loads(row.evidence)
     assert evidence["type"] == "ZeroDivisionError"
     assert evidence["trace"][-1].endswith("fails_on_one")
-    assert any(line.startswith("worldline_core/data/curation/shard.py:") for line in evidence["trace"])
+    assert any(line.startswith("worldline_core/data/curation/curate.py:") for line in evidence["trace"])
     assert str(tmp_path) not in row.evidence + row.detail
     assert "deadbeef" not in row.evidence + row.detail
 

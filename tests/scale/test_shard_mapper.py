@@ -1,47 +1,38 @@
-"""What becomes of jobs that fail, flicker or kill their worker, with each of the runners."""
+"""What becomes of episodes that fail, flicker or kill their worker, with each of the runners."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from copy import copy
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
-from scale_jobs import NumbersJob, attempts, jobs_of, write_numbers
+from number_work import NumberFileWork, NumberWork, attempts, do_numbers
 
 from tasks.shard_mapper import shard_mapper
-from worldline_core.errors import UnavailableError
-from worldline_core.scale.mapping import Job, RunnerConfig, run_jobs
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard, TakeOutcome, map_episodes
 from worldline_core.store.remote import UnreachableInputError
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
 
 
-class Record:
-    """Takes what `run_jobs` reports."""
-
-    def __init__(self) -> None:
-        self.done = 0
-        self.crashed: dict[int, str] = {}
-
-    def add(self, count: int) -> None:
-        self.done += count
-
-    def crash(self, job: NumbersJob, error: Exception) -> None:
-        (value,) = job.values
-        self.crashed[value] = type(error).__name__
-
-
-def run(folder: Path, jobs: list[Any], kind: str, **settings: Any) -> Record:
-    record = Record()
+def run(folder: Path, values: Sequence[int], size: int, kind: str, **settings: Any) -> None:
     config = RunnerConfig.model_validate({"kind": kind, "workers": 2, "retry_seconds": 0.1, **settings})
-    run_jobs(shard_mapper(config), write_numbers, jobs, done=record.add, crashed=record.crash)
-    return record
+    do_numbers(shard_mapper(config), folder, values, size)
 
 
 def results(folder: Path) -> dict[int, int]:
-    return {int(path.name): int(path.read_text()) for path in folder.iterdir() if path.name.isdigit()}
+    texts = {int(path.name): path.read_text() for path in folder.iterdir() if path.name.isdigit()}
+    return {value: int(text) for value, text in texts.items() if text.isdigit()}
+
+
+def crashed(folder: Path) -> dict[int, str]:
+    texts = {int(path.name): path.read_text() for path in folder.iterdir() if path.name.isdigit()}
+    return {value: text for value, text in texts.items() if not text.isdigit()}
 
 
 def processes(folder: Path) -> set[str]:
@@ -49,6 +40,8 @@ def processes(folder: Path) -> set[str]:
 
 
 SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("dask", "ray")]
+SEVEN = "Squaring ended with ZeroDivisionError: seven"
+THIRTEEN = "Squaring this episode alone ended its process, twice"
 
 
 @pytest.mark.parametrize("kind", ["processes", *SLOW])
@@ -56,51 +49,69 @@ def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kin
     # Asked without importing: what Ray reads at its import is set by the mapper.
     if kind in ("dask", "ray") and find_spec(f"prefect_{kind}") is None:
         pytest.skip(f"prefect_{kind} is not installed")
-    record = run(tmp_path, jobs_of(tmp_path, range(4, 24), 4), kind)  # 5 flickers, 7 fails, 13 kills its worker
-    assert record.crashed == {7: "ZeroDivisionError", 13: "WorkerDiedError"}
+    run(tmp_path, range(4, 24), 4, kind)  # 5 flickers, 7 fails, 13 kills its worker
+    assert crashed(tmp_path) == {7: SEVEN, 13: THIRTEEN}
     assert results(tmp_path) == {value: value**2 for value in range(4, 24) if value not in (7, 13)}
     assert attempts(tmp_path, 5) == 3  # retried: it passes
-    # In its shard and alone, which retries would make six: bad data is not retried. A dying worker may take along the shard
-    # (a pool ends as a whole) or an answer that it gave before (Dask then does that shard again).
-    assert attempts(tmp_path, 7) in {"processes": (1, 2), "dask": (2, 3), "ray": (2,)}[kind]
+    # Bad data is not retried. A dying worker may take along the shard (a pool ends as a whole).
+    assert attempts(tmp_path, 7) in {"processes": (1, 2), "dask": (1, 2), "ray": (1,)}[kind]
     assert attempts(tmp_path, 13) == 2
     assert str(os.getpid()) not in processes(tmp_path)
 
 
+def test_a_shard_with_one_file_is_made_again_without_the_episode_that_kills(tmp_path: Path) -> None:
+    config = RunnerConfig.model_validate({"kind": "processes", "workers": 2, "retry_seconds": 0.1})
+    map_episodes(shard_mapper(config), NumberFileWork(tmp_path), [[8, 9], [12, 13, 14]])
+    assert (tmp_path / "shard-0.txt").read_text() == "8:kept 9:kept"
+    assert (tmp_path / "shard-1.txt").read_text() == "12:kept 13:quarantined 14:kept"
+    assert attempts(tmp_path, 13) == 2
+
+
 def test_in_this_process_an_unforeseen_error_costs_one_episode(tmp_path: Path) -> None:
-    record = run(tmp_path, jobs_of(tmp_path, range(4, 12), 4), "serial")
-    assert record.crashed == {7: "ZeroDivisionError"}
+    run(tmp_path, range(4, 12), 4, "serial")
+    assert crashed(tmp_path) == {7: SEVEN}
     assert results(tmp_path) == {value: value**2 for value in (4, 5, 6, 8, 9, 10, 11)}
-    assert (attempts(tmp_path, 5), attempts(tmp_path, 7)) == (3, 2)
+    assert (attempts(tmp_path, 5), attempts(tmp_path, 7)) == (3, 1)
     assert processes(tmp_path) == {str(os.getpid())}
 
 
 @pytest.mark.parametrize("kind", ["serial", "processes"])
 def test_an_unreachable_input_is_said_after_all_else_is_done(tmp_path: Path, kind: str) -> None:
     with pytest.raises(UnreachableInputError, match="1 of 3 shards could not read all of their inputs"):
-        run(tmp_path, jobs_of(tmp_path, [0, 1, 2, 3, 4, 6, 8, 9, 10], 3), kind)
-    assert results(tmp_path) == {value: value**2 for value in (0, 1, 2, 8, 9, 10)}
+        run(tmp_path, [0, 1, 2, 3, 4, 6, 8, 9, 10], 3, kind)
+    assert results(tmp_path) == {value: value**2 for value in (0, 1, 2, 4, 6, 8, 9, 10)}
     assert attempts(tmp_path, 3) == 3
 
 
 def test_few_episodes_stay_in_this_process(tmp_path: Path) -> None:
-    run(tmp_path, jobs_of(tmp_path, range(8, 12), 2), "auto", serial_below=5)
+    run(tmp_path, range(8, 12), 2, "auto", serial_below=5)
     assert processes(tmp_path) == {str(os.getpid())}
 
 
 def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path) -> None:
-    """Ten jobs wait as plain values; no more than `in_flight` are with the runner when one is answered."""
+    """Ten shards wait as plain values; no more than `in_flight` are with the runner when one is answered."""
     begun_before_taken: list[int] = []
     config = RunnerConfig.model_validate({"kind": "processes", "workers": 1, "in_flight": 3})
-    record = Record()
 
-    def taken(count: int) -> None:
-        begun_before_taken.append(len((tmp_path / "log.txt").read_text().splitlines()) - record.done)
-        record.add(count)
+    class Watched:
+        """Notes how many numbers were begun, but not taken, whenever a shard is taken."""
 
-    jobs = jobs_of(tmp_path, range(20, 40), 2)
-    run_jobs(shard_mapper(config), write_numbers, jobs, done=taken, crashed=record.crash)
-    assert len(results(tmp_path)) == record.done == 20
+        def __init__(self) -> None:
+            self.inner = shard_mapper(config)
+            self.episodes_per_shard = self.inner.episodes_per_shard
+            self.done = 0
+
+        def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+            def taken(shard: Shard[Any], error: Exception | None) -> None:
+                begun_before_taken.append(len((tmp_path / "log.txt").read_text().splitlines()) - self.done)
+                self.done += len(shard)
+                take(shard, error)
+
+            self.inner.map(shards, taken, one_at_a_time=one_at_a_time)
+
+    watched = Watched()
+    do_numbers(watched, tmp_path, range(20, 40), 2)
+    assert len(results(tmp_path)) == watched.done == 20
     assert max(begun_before_taken) <= 3 * 2
 
 
@@ -109,9 +120,24 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setitem(sys.modules, "prefect_ray", None)
     with pytest.raises(UnavailableError, match="the extra `ray`"):
-        run(tmp_path, jobs_of(tmp_path, range(8, 10), 1), "ray")
+        run(tmp_path, range(8, 10), 1, "ray")
 
 
-def test_jobs_satisfy_the_protocol(tmp_path: Path) -> None:
-    job: Job = jobs_of(tmp_path, range(2), 2)[0]
-    assert [len(single) for single in job.split()] == [1, 1]
+def test_workers_get_what_a_step_states_and_not_what_it_opened(tmp_path: Path) -> None:
+    work = NumberWork(tmp_path)
+    object.__setattr__(work, "opened", object())  # as a cached property leaves it
+    sent = copy(work)  # by the same protocol as pickle
+    assert sent == work
+    assert "opened" not in vars(sent)
+
+
+def test_a_shard_that_cannot_be_finished_is_an_error(tmp_path: Path) -> None:
+    class Unfinished(NumberWork):
+        def remaining(self, number: int, episodes: Sequence[int]) -> list[int]:
+            return list(episodes)
+
+        def finish_shard(self, number: int, results: Sequence[Any]) -> None:
+            raise ZeroDivisionError("no end")
+
+    with pytest.raises(DataError, match=r"Some episodes could not be processed[\s\S]*numbers shard 0"):
+        map_episodes(SerialMapper(), Unfinished(tmp_path), [[8, 9]])

@@ -1,48 +1,41 @@
-"""`render_actions`: tracks of every episode of a set, counts of what was masked, and previews of the first few.
-
-What `render_actions` projects, and how much it draws.
-
-A shard of `render_actions`: the tracks of some episodes, in one file, wherever the shard is worked on.
-"""
+"""`render_actions`: the tracks of every episode of a set, counts of what was masked, and previews of the first few."""
 
 from __future__ import annotations
 
 import json
-import uuid
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import batched
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
-from tqdm import tqdm
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, shard_name, write_index, write_shard
+from worldline_core.actions.episode_tracks import (
+    ARRAYS,
+    ActionTracks,
+    EpisodeTracks,
+    shard_name,
+    write_index,
+    write_shard,
+)
 from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_quarantine
+from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
-from worldline_core.scale.mapping import (
-    SerialMapper,
-    ShardMapper,
-    crash_evidence,
-    cut,
-    ends_the_run,
-    portable_message,
-    run_jobs,
-)
+from worldline_core.scale.account import InputRow, check_account, write_account
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_transient
 
@@ -66,72 +59,6 @@ class RenderActionsConfig(StrictModel):
     preview_rows: int = Field(4, ge=1)
     sigma_px_ref: float = Field(SIGMA_PX_REFERENCE, gt=0)
     episodes_per_shard: int = Field(256, ge=1)
-
-
-@dataclass(frozen=True)
-class RenderShard:
-    """Plain values only: a shard is sent to other processes and machines, which share the folders.
-
-    Attributes:
-        run: names the call of `render_actions`, so that a set that one call opened does not serve the next.
-        config: JSON of the RenderActionsConfig.
-        episodes: folder of the set.
-        start, stop: positions in it.
-        probe: the tracks are computed and dropped, to find out which episode ends the process.
-    """
-
-    number: int
-    run: str
-    config: str
-    episodes: str
-    output: str
-    start: int
-    stop: int
-    probe: bool = False
-
-    @property
-    def label(self) -> str:
-        return f"render_actions shard {self.number}"
-
-    def __len__(self) -> int:
-        return self.stop - self.start
-
-    def split(self) -> list[RenderShard]:
-        return [replace(self, start=i, stop=i + 1, probe=True) for i in range(self.start, self.stop)]
-
-
-@dataclass
-class _Result:
-    tracks: list[EpisodeTracks] = field(default_factory=list)
-    rejected: list[dict[str, str]] = field(default_factory=list)
-    counts: dict[str, list[TrackCounts]] = field(default_factory=dict)
-
-    def reject(self, row: EpisodeRow, reason: str, detail: str, evidence: Mapping[str, Any]) -> None:
-        self.rejected.append(
-            {
-                "episode_id": row.episode_id,
-                "source": row.source,
-                "reason": reason,
-                "detail": detail,
-                "evidence": json.dumps(dict(evidence), sort_keys=True),
-            }
-        )
-
-
-@lru_cache(maxsize=2)
-def opened(run: str, folder: str, config: str) -> tuple[EpisodeSet, KinematicsByName]:
-    """A set and the kinematics of its robots, once for all shards of a run that this process works on."""
-    del run  # part of the key only
-    return EpisodeSet.open(Path(folder)), KinematicsByName(RenderActionsConfig.model_validate_json(config))
-
-
-def result_path(output: Path, number: int) -> Path:
-    """Where the index rows, rejections and counts of a shard are kept until the index is written."""
-    return output / "run" / f"shard-{number:05d}.json"
-
-
-def _crash_path(output: Path, position: int) -> Path:
-    return output / "run" / "crashed" / f"{position:08d}.json"
 
 
 class KinematicsByName:
@@ -162,67 +89,111 @@ def _reason(error: WorldLineError) -> str:
     return "unknown_embodiment" if isinstance(error, ConfigError) else "invalid_controls"
 
 
-def render_shard(shard: RenderShard) -> int:
-    """Tracks of some episodes into one file, and what is known of them into another beside it.
+@dataclass(frozen=True, kw_only=True)
+class ProjectedEpisode(InputRow):
+    """What became of one episode.
 
-    Returns: the number of episodes.
+    Attributes:
+        tracks, counts: of an episode that is kept.
+        rejection: of one that is not.
     """
-    output = Path(shard.output)
-    done = result_path(output, shard.number)
-    if shard.probe or not (done.is_file() and (output / shard_name(shard.number)).is_file()):
-        result = _computed(shard)
-        if not shard.probe:
-            rows = write_shard(output, shard.number, result.tracks)
-            counts = {name: add_counts(c) for name, c in result.counts.items()}
-            write_json_atomic(done, {"rows": rows, "rejected": result.rejected, "counts": counts})
-    return len(shard)
+
+    embodiment: str
+    tracks: EpisodeTracks | None = None
+    counts: TrackCounts | None = None
+    rejection: QuarantineRow | None = None
 
 
-def note_crash(shard: RenderShard, error: Exception) -> None:
-    """Remember the one episode of a shard that ended its worker twice: its shard is then made without it."""
-    write_json_atomic(_crash_path(Path(shard.output), shard.start), crash_evidence(error))
+@dataclass(frozen=True)
+class RenderWork(EpisodeWork[int, ProjectedEpisode]):
+    """Computes the tracks of each episode, named by its position in the set; a shard becomes one file of the artifact.
 
+    Attributes:
+        folder: of the set.
+    """
 
-def _computed(shard: RenderShard) -> _Result:
-    config, output = RenderActionsConfig.model_validate_json(shard.config), Path(shard.output)
-    episodes, kinematics = opened(shard.run, shard.episodes, shard.config)
-    result = _Result()
-    for position in range(shard.start, shard.stop):
-        row = episodes.rows[position]
-        crash = _crash_path(output, position)
-        if crash.is_file():
-            detail = "Projecting this episode alone ended its process, twice"
-            result.reject(row, "crashed", detail, json.loads(crash.read_text()))
-            continue
+    step: ClassVar[str] = "render_actions"
+    doing: ClassVar[str] = "Projecting"
+
+    config: RenderActionsConfig
+    folder: Path
+
+    @cached_property
+    def episodes(self) -> EpisodeSet:
+        return EpisodeSet.open(self.folder)
+
+    @cached_property
+    def _kinematics(self) -> KinematicsByName:
+        return KinematicsByName(self.config)
+
+    def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
+        done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()
+        return () if done else episodes
+
+    def do(self, episode: int) -> ProjectedEpisode:
         try:
-            episode = episodes.episode(position)
-            if episode.state_kind == "none":
+            recorded = self.episodes.episode(episode)
+            if recorded.state_kind == "none":
                 # A plain video: there is nothing to project. It is counted with the others that have no tracks.
-                detail = "Recording has no states and no actions"
-                result.reject(row, "missing_actions", detail, {"state_kind": "none"})
-                continue
-            built = kinematics.get(episode.embodiment) if _needs_kinematics(episode) else None
-            computed, numbers = compute_tracks(
-                episode, built, controls=config.source, without_mount=config.without_mount
+                return self._reject(
+                    episode, "missing_actions", "Recording has no states and no actions", {"state_kind": "none"}
+                )
+            kinematics = self._kinematics.get(recorded.embodiment) if recorded.T_base_ee is None else None
+            tracks, counts = compute_tracks(
+                recorded, kinematics, controls=self.config.source, without_mount=self.config.without_mount
             )
         except (DataError, ConfigError, UnavailableError) as error:
             if is_transient(error):
                 raise
-            result.reject(row, _reason(error), error.what, {"expected": str(error.expected), "got": str(error.got)})
-            continue
-        except Exception as error:
-            if is_transient(error) or ends_the_run(error):
-                raise
-            detail = f"Projecting ended with {type(error).__name__}: {portable_message(str(error))}"
-            result.reject(row, "crashed", detail, crash_evidence(error))
-            continue
-        result.tracks.append(computed)
-        result.counts.setdefault(episode.embodiment, []).append(numbers)
-    return result
+            evidence = {"expected": str(error.expected), "got": str(error.got)}
+            return self._reject(episode, _reason(error), error.what, evidence)
+        row = self.episodes.rows[episode]
+        return ProjectedEpisode(
+            episode_id=row.episode_id,
+            source=row.source,
+            status="kept",
+            stored_bytes=sum(getattr(tracks, name).nbytes for name in ARRAYS),
+            embodiment=recorded.embodiment,
+            tracks=tracks,
+            counts=counts,
+        )
 
+    def quarantine_crashed(self, episode: int, detail: str, evidence: Mapping[str, Any]) -> ProjectedEpisode:
+        return self._reject(episode, "crashed", detail, evidence)
 
-def _needs_kinematics(episode: Episode) -> bool:
-    return episode.T_base_ee is None
+    def finish_shard(self, number: int, results: Sequence[ProjectedEpisode]) -> None:
+        """Write the tracks of a shard into one file, and what is known of its episodes into another."""
+        counts: dict[str, list[TrackCounts]] = {}
+        for result in results:
+            if result.counts is not None:
+                counts.setdefault(result.embodiment, []).append(result.counts)
+        rows = write_shard(self.output, number, [result.tracks for result in results if result.tracks is not None])
+        summary = {
+            "rows": rows,
+            "rejected": [asdict(result.rejection) for result in results if result.rejection is not None],
+            "counts": {name: add_counts(parts) for name, parts in counts.items()},
+            "stored_bytes": {result.episode_id: result.stored_bytes for result in results},
+        }
+        write_json_atomic(self._summary_path(number), summary)
+
+    def summary(self, number: int) -> dict[str, Any]:
+        """Index rows, rejections, counts by embodiment and stored bytes by episode of a finished shard."""
+        return json.loads(self._summary_path(number).read_text(encoding="utf-8"))
+
+    def _summary_path(self, number: int) -> Path:
+        return self.output / "run" / f"shard-{number:05d}.json"
+
+    def _reject(self, position: int, reason: str, detail: str, evidence: Mapping[str, Any]) -> ProjectedEpisode:
+        row = self.episodes.rows[position]
+        numbers = json.dumps(dict(evidence), sort_keys=True)
+        return ProjectedEpisode(
+            episode_id=row.episode_id,
+            source=row.source,
+            status="quarantined",
+            reason=reason,
+            embodiment=row.embodiment,
+            rejection=QuarantineRow(row.episode_id, row.source, reason, detail, numbers),
+        )
 
 
 def render_actions(
@@ -246,16 +217,22 @@ def render_actions(
     """
     if "episodes" not in inputs:
         raise ConfigError("render_actions needs an EpisodeSet", expected="input episodes", got=sorted(inputs))
-    episodes = EpisodeSet.open(inputs["episodes"])
-    shards = _compute_all(config, episodes, output, mapper or SerialMapper())
+    work = RenderWork(output, config, inputs["episodes"])
+    episodes = work.episodes
+    pieces = list(batched(range(len(episodes)), config.episodes_per_shard))
+    map_episodes(mapper or SerialMapper(), work, pieces)
     rows: list[dict[str, Any]] = []
     rejected: list[QuarantineRow] = []
     counts: dict[str, list[TrackCounts]] = {}
-    for shard in shards:
+    stored: dict[str, int] = {}
+    for number in range(len(pieces)):
+        shard = work.summary(number)
         rows += shard["rows"]
         rejected += [QuarantineRow(**row) for row in shard["rejected"]]
+        stored |= shard["stored_bytes"]
         for embodiment, numbers in shard["counts"].items():
             counts.setdefault(embodiment, []).append(numbers)
+    _account(episodes, rows, rejected, stored, output)
     write_index(output, rows)
     write_quarantine(output, rejected)
     _previews(config, episodes, ActionTracks.open(output), output)
@@ -273,39 +250,29 @@ def render_actions(
     return summary
 
 
-def _compute_all(
-    config: RenderActionsConfig, episodes: EpisodeSet, output: Path, mapper: ShardMapper
-) -> Iterator[dict[str, Any]]:
-    """Write every shard that is not there yet; yields what is known of each, in order."""
-    run, text, folder = uuid.uuid4().hex, config.model_dump_json(), str(episodes.root)
-    pieces = cut(range(len(episodes)), config.episodes_per_shard)
-    shards = [RenderShard(n, run, text, folder, str(output), p[0], p[-1] + 1) for n, p in enumerate(pieces)]
-
-    def unfinished() -> list[RenderShard]:
-        return [s for s in shards if not (result_path(output, s.number).is_file() and _shard_file(output, s).is_file())]
-
-    with tqdm(total=len(episodes), desc="tracks", unit="episode", disable=None) as progress:
-        todo = unfinished()
-        progress.update(len(episodes) - sum(map(len, todo)))
-        try:
-            run_jobs(mapper, render_shard, todo, done=progress.update, crashed=note_crash)
-            # A shard with an episode that ends its process is made again, without that episode.
-            run_jobs(mapper, render_shard, unfinished(), done=progress.update, crashed=note_crash)
-        finally:
-            opened.cache_clear()
-    if left := unfinished():
-        raise DataError(
-            "Tracks of some episodes could not be computed",
-            where=str(output),
-            got=", ".join(shard.label for shard in left[:5]),
-            next_step="run the step again; if it stays, look at the machine's memory",
-        )
-    for shard in shards:
-        yield json.loads(result_path(output, shard.number).read_text(encoding="utf-8"))
-
-
-def _shard_file(output: Path, shard: RenderShard) -> Path:
-    return output / shard_name(shard.number)
+def _account(
+    episodes: EpisodeSet,
+    rows: Sequence[Mapping[str, Any]],
+    rejected: Sequence[QuarantineRow],
+    stored: Mapping[str, int],
+    output: Path,
+) -> None:
+    """Raises: DataError unless every episode has tracks or is quarantined."""
+    reasons = {row.episode_id: row.reason for row in rejected}
+    write_account(
+        output,
+        [
+            InputRow(
+                episode_id=row.episode_id,
+                source=row.source,
+                status="quarantined" if row.episode_id in reasons else "kept",
+                reason=reasons.get(row.episode_id),
+                stored_bytes=stored[row.episode_id],
+            )
+            for row in episodes.rows
+        ],
+    )
+    check_account(output, len(episodes), {row["episode_id"] for row in rows}, set(reasons))
 
 
 def _camera_motion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

@@ -1,1 +1,1 @@
-"""Work on many episodes: shards as data, the interface of what maps them, object stores, and what is retried."""
+"""Work on many episodes: cut into shards, done by any mapper, and every input accounted for."""

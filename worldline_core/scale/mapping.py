@@ -1,30 +1,29 @@
-"""How work on many episodes is spread: jobs are data, and one function, importable by name, does a job anywhere.
+"""Work on many episodes, cut into shards that any process or machine sharing the folders can do.
 
-A job (a shard) is a frozen dataclass of plain values that names some episodes. Its function keeps what it finishes on
-disk, episode by episode, so doing a job again only does what is missing: that is what makes a retry, another size of
-shards and a resumed run give the same result.
-
-Where mapped work runs. It never changes a result, and is therefore no part of any cache key.
-
-What is known about an episode whose processing ended in an unforeseen way, without this machine's paths.
+A step says what it does with one episode (`EpisodeWork`); everything else is here, once: what is left to do, retries, crashes,
+workers that die, the account. An episode's result (or a shard's) appears on disk whole or not at all, so doing a shard
+again only does what is missing: a retry, another shard size and a resumed run give the same result. Where work runs never
+changes a result, and is part of no cache key.
 """
 
 from __future__ import annotations
 
 import errno
 import logging
-import re
 import time
-import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol
 
 from pydantic import Field, model_validator
+from tqdm import tqdm
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import ConfigError, UnavailableError, WorldLineError
+from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
 from worldline_core.store.remote import UnreachableInputError, is_transient
 
 logger = logging.getLogger(__name__)
@@ -36,64 +35,159 @@ _MACHINE_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE
 
 
 class WorkerDiedError(WorldLineError):
-    """The process that did a job ended without an answer: a crash in compiled code, or killed for its memory."""
-
-
-class Job(Protocol):
-    """Some episodes to work on."""
-
-    @property
-    def label(self) -> str:
-        """What the job is called where people look: the step and the number of the shard."""
-        ...
-
-    def __len__(self) -> int:
-        """How many episodes it has."""
-        ...
-
-    def split(self) -> list[Self]:
-        """One job an episode."""
-        ...
+    """The process that did a shard ended without an answer: a crash in compiled code, or killed for its memory."""
 
 
 @dataclass(frozen=True)
-class Outcome[J, R]:
-    """What became of a job: its result, or the error that ended it."""
+class EpisodeWork[E, R: InputRow](ABC):
+    """What one step does with its episodes; E names an episode (a hashable plain value), R is what becomes of it.
 
-    job: J
-    result: R | None = None
-    error: Exception | None = None
+    Subclasses are frozen dataclasses. Their fields are sent to the workers; what they open (`cached_property`) is
+    opened in each process once per run.
+
+    Attributes:
+        output: the step's folder.
+        run: names one call of the step, so that what one call opened does not serve the next.
+    """
+
+    step: ClassVar[str]
+    doing: ClassVar[str]
+    """Begins the detail of a crash: "Filtering ended with ..."."""
+
+    output: Path
+    run: str = field(default_factory=lambda: uuid.uuid4().hex, kw_only=True)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {own.name: getattr(self, own.name) for own in fields(self)}
+
+    @abstractmethod
+    def remaining(self, number: int, episodes: Sequence[E]) -> Sequence[E]:
+        """Of the episodes of shard `number` those that are not done yet."""
+
+    @abstractmethod
+    def do(self, episode: E) -> R:
+        """Keep or quarantine one episode.
+
+        Raises: what is transient or ends the run; every other error quarantines the episode as crashed.
+        """
+
+    @abstractmethod
+    def quarantine_crashed(self, episode: E, detail: str, evidence: Mapping[str, Any]) -> R:
+        """Quarantine an episode whose processing ended in an unforeseen way."""
+
+    def finish_shard(self, number: int, results: Sequence[R]) -> None:  # noqa: B027 - most steps have nothing to write
+        """Write what a shard has as a whole, when all of its episodes are done. Nothing by default."""
+
+
+@dataclass(frozen=True)
+class Shard[E]:
+    """Some episodes of a step, sent to whoever does them.
+
+    Attributes:
+        alone: one suspected episode, done to see whether it ends its worker; the whole shard is finished afterwards.
+        crashed: evidence for the episodes that did.
+    """
+
+    work: EpisodeWork[E, Any]
+    number: int
+    episodes: tuple[E, ...]
+    alone: bool = False
+    crashed: Mapping[E, Mapping[str, Any]] = field(default_factory=dict[E, Mapping[str, Any]])
+
+    @property
+    def label(self) -> str:
+        """Shown in logs and by Prefect."""
+        return f"{self.work.step} shard {self.number}"
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+
+_current_work: dict[str, EpisodeWork[Any, Any]] = {}
+"""The work of the run that this process works on, by the run's name: at most one."""
+
+
+def do_shard(shard: Shard[Any]) -> None:
+    """Do what is left of a shard and write its account; called in any process.
+
+    Raises: UnreachableInputError when the inputs of some episodes could not be read for a reason that passes (all others
+        are done); what ends the run.
+    """
+    if shard.work.run not in _current_work:
+        _current_work.clear()
+    work = _current_work.setdefault(shard.work.run, shard.work)
+    results: list[InputRow] = []
+    unreachable: list[Exception] = []
+    todo = work.remaining(shard.number, shard.episodes)
+    for episode in todo:
+        clock, processor = time.perf_counter(), time.process_time()
+        try:
+            result = _do_episode(work, episode, shard.crashed.get(episode))
+        except Exception as error:
+            if not is_transient(error):
+                raise
+            unreachable.append(error)
+            continue
+        seconds, cpu_seconds = time.perf_counter() - clock, time.process_time() - processor
+        results.append(replace(result, seconds=seconds, cpu_seconds=cpu_seconds))
+    if todo and not unreachable and not shard.alone:
+        work.finish_shard(shard.number, results)
+    if results:
+        write_shard_account(work.output, shard.number, results)
+    if unreachable:
+        raise UnreachableInputError(
+            f"{len(unreachable)} of {len(shard)} episodes could not be read",
+            where=shard.label,
+            got=str(unreachable[0]).splitlines()[0],
+        ) from unreachable[0]
+
+
+def _do_episode[E](work: EpisodeWork[E, Any], episode: E, crash: Mapping[str, Any] | None) -> InputRow:
+    if crash is not None:
+        return work.quarantine_crashed(episode, f"{work.doing} this episode alone ended its process, twice", crash)
+    try:
+        return work.do(episode)
+    except Exception as error:
+        if is_transient(error) or ends_the_run(error):
+            raise
+        detail = f"{work.doing} ended with {type(error).__name__}: {portable_message(str(error))}"
+        return work.quarantine_crashed(episode, detail, crash_evidence(error))
+
+
+def ends_the_run(error: BaseException) -> bool:
+    """Whether every other episode would fail as well, for a reason that the user must remove first."""
+    if isinstance(error, UnreachableInputError):
+        return False
+    if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
+        return True
+    return isinstance(error, ConfigError | UnavailableError)
+
+
+type TakeOutcome = Callable[[Shard[Any], Exception | None], None]
+"""Is given each shard with the error that ended it (None: it is done); an error that it raises ends the work."""
 
 
 class ShardMapper(Protocol):
-    """Does jobs somewhere, a bounded number at a time, and says what became of each."""
+    """Does shards somewhere, a bounded number at a time, and says what became of each."""
 
     @property
     def episodes_per_shard(self) -> int: ...
 
-    def map[J: Job, R](
-        self,
-        function: Callable[[J], R],
-        jobs: Sequence[J],
-        take: Callable[[Outcome[J, R]], None],
-        *,
-        one_at_a_time: bool = False,
-    ) -> None:
-        """Do the jobs in any order.
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+        """Call `do_shard` for each shard, in any order.
 
         Args:
-            function: a module's function, so that another process can import it.
-            take: is given the outcome of each job, here, as they come; an error that it raises ends the work.
-            one_at_a_time: no two jobs at once, so that a dying worker can only be the doing of the one job.
+            take: is called here with each outcome, as they come.
+            one_at_a_time: no two shards at once, so that only the one shard can be what ends a worker.
         """
         ...
 
 
 class SerialMapper:
-    """Does the jobs in this process, one after the other.
+    """Does the shards in this process, one after the other.
 
     Args:
-        retries: further attempts at a job that could not reach its input, the first after `retry_seconds`.
+        retries: further attempts at a shard that could not reach its input, the first after `retry_seconds`.
     """
 
     def __init__(
@@ -102,36 +196,27 @@ class SerialMapper:
         retries: int = DEFAULT_RETRIES,
         retry_seconds: float = DEFAULT_RETRY_SECONDS,
     ) -> None:
-        self._episodes_per_shard = episodes_per_shard
+        self.episodes_per_shard = episodes_per_shard
         self._pauses = retry_pauses(retries, retry_seconds)
 
-    @property
-    def episodes_per_shard(self) -> int:
-        return self._episodes_per_shard
-
-    def map[J: Job, R](
-        self,
-        function: Callable[[J], R],
-        jobs: Sequence[J],
-        take: Callable[[Outcome[J, R]], None],
-        *,
-        one_at_a_time: bool = False,
-    ) -> None:
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
         del one_at_a_time  # always
-        for job in jobs:
-            take(self._outcome(function, job))
+        for shard in shards:
+            take(shard, self._error(shard))
 
-    def _outcome[J: Job, R](self, function: Callable[[J], R], job: J) -> Outcome[J, R]:
+    def _error(self, shard: Shard[Any]) -> Exception | None:
         waiting = iter(self._pauses)
         while True:
             try:
-                return Outcome(job, function(job))
-            except Exception as error:  # noqa: BLE001 - handed to the caller, which knows what ends the run
+                do_shard(shard)
+            except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
                 pause = next(waiting, None) if is_transient(error) else None
                 if pause is None:
-                    return Outcome(job, error=error)
-                logger.warning("%s: %s; trying again in %.1f s", job.label, _first_line(error), pause)
+                    return error
+                logger.warning("%s: %s; trying again in %.1f s", shard.label, _first_line(error), pause)
                 time.sleep(pause)
+            else:
+                return None
 
 
 def retry_pauses(retries: int, first_seconds: float) -> list[float]:
@@ -139,75 +224,74 @@ def retry_pauses(retries: int, first_seconds: float) -> list[float]:
     return [first_seconds * 2**number for number in range(retries)]
 
 
-def ends_the_run(error: BaseException) -> bool:
-    """Whether every other job would fail as well, for a reason that the user must remove first."""
-    if isinstance(error, UnreachableInputError):
-        return False
-    if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
-        return True
-    return isinstance(error, ConfigError | UnavailableError)
+def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequence[Sequence[E]]) -> None:
+    """Do all episodes, each of `pieces` as a shard; one that fails does not keep the others from being done.
 
-
-def run_jobs[J: Job, R](
-    mapper: ShardMapper,
-    function: Callable[[J], R],
-    jobs: Sequence[J],
-    *,
-    done: Callable[[R], object],
-    crashed: Callable[[J, Exception], None],
-) -> None:
-    """Do all jobs; one that fails does not keep the others from being done.
-
-    A job that fails, or whose worker died, is done again episode by episode, one at a time: `crashed` is told the
-    episodes that fail again.
-
-    Args:
-        done: is given each result.
-        crashed: quarantines the one episode of a job.
+    The episodes of a shard that failed, or whose worker died, are done again one at a time. Those that fail again are
+    quarantined as crashed.
 
     Raises: UnreachableInputError, after everything else is done, when inputs could not be read for a reason that
         passes; at once, what ends the run (a wrong configuration, a full disk).
     """
-    suspects: list[J] = []
-    unreachable: list[Exception] = []
+    shards = [Shard(work, number, tuple(piece)) for number, piece in enumerate(pieces)]
+    unfinished = [shard for shard in shards if work.remaining(shard.number, shard.episodes)]
+    suspects: list[Shard[E]] = []
+    crashed: dict[E, dict[str, Any]] = {}
+    unreachable: dict[int, Exception] = {}
 
-    def taking(failed: Callable[[J, Exception], None]) -> Callable[[Outcome[J, R]], None]:
-        def take(outcome: Outcome[J, R]) -> None:
-            if outcome.error is None:
-                done(outcome.result)  # type: ignore[arg-type]
-            elif ends_the_run(outcome.error):
-                raise outcome.error
-            elif is_transient(outcome.error):
-                unreachable.append(outcome.error)
+    def taking(failed: Callable[[Shard[E], Exception], None], done: Callable[[int], object]) -> TakeOutcome:
+        def take(shard: Shard[Any], error: Exception | None) -> None:
+            if error is None:
+                done(len(shard))
+            elif ends_the_run(error):
+                raise error
+            elif is_transient(error):
+                unreachable[shard.number] = error
             else:
-                failed(outcome.job, outcome.error)
+                failed(shard, error)
 
         return take
 
-    def suspect(job: J, error: Exception) -> None:
-        logger.warning("%s: %s; its episodes are done again one at a time", job.label, _first_line(error))
-        suspects.append(job)
+    def suspect(shard: Shard[E], error: Exception) -> None:
+        logger.warning("%s: %s; its episodes are done again one at a time", shard.label, _first_line(error))
+        suspects.append(shard)
 
-    mapper.map(function, jobs, taking(suspect))
-    singles = [single for job in suspects for single in job.split()]
-    if singles:
-        mapper.map(function, singles, taking(crashed), one_at_a_time=True)
+    def crash(shard: Shard[E], error: Exception) -> None:
+        crashed[shard.episodes[0]] = crash_evidence(error)
+
+    def give_up(shard: Shard[E], error: Exception) -> None:
+        raise DataError(
+            "Some episodes could not be processed",
+            where=shard.label,
+            got=_first_line(error),
+            next_step="run the step again; if it stays, look at the machine's memory",
+        ) from error
+
+    total = sum(map(len, shards))
+    with tqdm(total=total, desc=work.step, unit="episode", disable=None) as progress:
+        progress.update(total - sum(map(len, unfinished)))
+        try:
+            mapper.map(unfinished, taking(suspect, progress.update))
+            singles = [replace(shard, episodes=(one,), alone=True) for shard in suspects for one in shard.episodes]
+            mapper.map(singles, taking(crash, lambda _: None), one_at_a_time=True)
+            again = [
+                replace(shard, crashed={e: crashed[e] for e in shard.episodes if e in crashed}) for shard in suspects
+            ]
+            mapper.map(again, taking(give_up, progress.update))
+        finally:
+            _current_work.pop(work.run, None)
     if unreachable:
+        first = next(iter(unreachable.values()))
         raise UnreachableInputError(
-            f"{len(unreachable)} of {len(jobs)} shards could not read all of their inputs; all else is done",
-            got=_first_line(unreachable[0]),
+            f"{len(unreachable)} of {len(unfinished)} shards could not read all of their inputs; all else is done",
+            got=_first_line(first),
             next_step="run the same command again when the store answers: only what is missing is read",
-        ) from unreachable[0]
+        ) from first
 
 
 def _first_line(error: BaseException) -> str:
     lines = str(error).splitlines()
     return f"{type(error).__name__}: {lines[0] if lines else ''}"
-
-
-def cut[T](items: Sequence[T], size: int) -> list[Sequence[T]]:
-    """Consecutive pieces of `size`, the last one shorter."""
-    return [items[start : start + size] for start in range(0, len(items), size)]
 
 
 class RunnerConfig(StrictModel):
@@ -217,12 +301,12 @@ class RunnerConfig(StrictModel):
     """
 
     kind: Literal["auto", "serial", "processes", "dask", "ray"] = "auto"
-    workers: int | None = Field(default=None, ge=1, description="processes; null: one for each core of this machine")
+    workers: int | None = Field(default=None, ge=1, description="processes; null: one per core of this machine")
     address: str | None = Field(
         default=None, description="scheduler of a Dask or Ray cluster; null: a cluster of its own on this machine"
     )
     episodes_per_shard: int = Field(default=DEFAULT_EPISODES_PER_SHARD, ge=1)
-    in_flight: int | None = Field(default=None, ge=1, description="shards handed out at a time; null: two for a worker")
+    in_flight: int | None = Field(default=None, ge=1, description="shards handed out at a time; null: two per worker")
     serial_below: int = Field(default=256, ge=0, description="auto: fewer episodes than this are done in this process")
     retries: int = Field(
         default=DEFAULT_RETRIES, ge=0, description="further attempts at a shard that could not reach its input"
@@ -230,7 +314,7 @@ class RunnerConfig(StrictModel):
     retry_seconds: float = Field(
         default=DEFAULT_RETRY_SECONDS, ge=0, description="pause before the first of them; doubles"
     )
-    remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, each worker")
+    remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, per worker")
     nodes_at_once: int = Field(
         default=1,
         ge=1,
@@ -242,35 +326,3 @@ class RunnerConfig(StrictModel):
         if self.address is not None and self.kind not in ("dask", "ray"):
             raise ValueError(f"an address is that of a Dask or Ray cluster; the kind is {self.kind}")
         return self
-
-
-_ADDRESS = re.compile(r"0x[0-9a-fA-F]{4,}")
-_ABSOLUTE = re.compile(r"(?<![\w.:/])/(?:[^\s'\":,;()]+/)+")
-_FRAMES = 5
-_PACKAGE_ROOT = Path(__file__).parents[2]
-
-
-def crash_evidence(error: BaseException) -> dict[str, Any]:
-    """{"type", "message", "trace"}: the trace is the innermost frames as `file:line function`, innermost last."""
-    frames = traceback.extract_tb(error.__traceback__)[-_FRAMES:]
-    return {
-        "type": type(error).__name__,
-        "message": portable_message(str(error)),
-        "trace": [f"{_short(frame.filename)}:{frame.lineno} {frame.name}" for frame in frames],
-    }
-
-
-def portable_message(text: str) -> str:
-    """A message without addresses in memory and without folders: it must not differ from run to run."""
-    return _ABSOLUTE.sub("", _ADDRESS.sub("0x…", text))
-
-
-def _short(filename: str) -> str:
-    """A file within its package."""
-    path = Path(filename)
-    if path.is_relative_to(_PACKAGE_ROOT) and "site-packages" not in path.parts:
-        return path.relative_to(_PACKAGE_ROOT).as_posix()
-    parts = path.parts
-    if "site-packages" in parts:
-        return "/".join(parts[parts.index("site-packages") + 1 :])
-    return path.name

@@ -2,37 +2,32 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import batched
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
+from typing import Any, ClassVar
 
 from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.recorded_episode import check_episode, prepare_episode
 from worldline_core.data.curation.rules import decided_findings
-from worldline_core.data.curation.shard import (
-    CurateShard,
-    ListedEpisode,
-    account,
-    curate_shard,
-    open_writer,
-    opened_source,
-    quarantine_crashed,
-)
 from worldline_core.data.curation.source_table import write_source_table
 from worldline_core.data.curation.source_weights import write_source_weights
-from worldline_core.data.episodes.episode_index import read_index, read_quarantine
+from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
+from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.plain_files import read_json
-from worldline_core.data.guards.rejection import unique_identity
-from worldline_core.scale.mapping import SerialMapper, ShardMapper, cut, run_jobs
-from worldline_core.scale.shard_manifest import (
-    check_account,
-    read_merged_manifest,
-    read_shard_manifests,
-    write_merged_manifest,
-)
+from worldline_core.data.guards.rejection import RejectedInputError, check_id, unique_identity
+from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files, watch_run
+from worldline_core.data.sources.open import open_source
+from worldline_core.errors import CalibrationError, DataError
+from worldline_core.scale.account import InputRow, check_account, write_account
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
+from worldline_core.store.remote import is_transient
+
+_OPEN_SOURCES = 4
 
 
 def curate(
@@ -52,87 +47,177 @@ def curate(
         could not be read for a reason that passes (what is done stays, the next call does the rest).
     """
     mapper = mapper or SerialMapper()
-    try:
-        shards = _shards(config, inputs, output, mapper.episodes_per_shard)
-        identities = [episode.identity for shard in shards for episode in shard.episodes]
-        if not EpisodeSetWriter.finished(output):
-            _work(config, shards, identities, output, mapper)
-        _describe(config, shards, output)
-    finally:
-        opened_source.cache_clear()
-    return _counts(output, identities)
-
-
-def _shards(config: CurateConfig, inputs: Mapping[str, Path], output: Path, size: int) -> list[CurateShard]:
-    """Every episode that the sources list, in their order, cut into shards of one source each."""
-    shards: list[CurateShard] = []
-    seen: set[str] = set()
-    run, text = uuid.uuid4().hex, config.model_dump_json()
-    for number, source_config in enumerate(config.sources):
-        root = str(inputs.get(f"source.{number}", source_config.path))
-        source = opened_source(run, text, number, root)
-        episodes: list[ListedEpisode] = []
-        for listed_id in filter(source_config.includes, source.episode_ids()):
-            repeated = listed_id in seen
-            identity = unique_identity(listed_id, number, seen)
-            seen |= {identity, listed_id}
-            episodes.append(ListedEpisode(identity, listed_id, repeated))
-        for piece in cut(episodes, size):
-            shards.append(CurateShard(len(shards), run, text, number, root, str(output), tuple(piece)))
-    return shards
-
-
-def _work(
-    config: CurateConfig, shards: list[CurateShard], identities: list[str], output: Path, mapper: ShardMapper
-) -> None:
-    writer = open_writer(config, output)
-    todo = [shard for shard in shards if not all(writer.has(episode.identity) for episode in shard.episodes)]
-    with tqdm(total=len(identities), desc="curate", unit="episode", disable=None) as progress:
-        progress.update(len(identities) - sum(len(shard) for shard in todo))
-        run_jobs(mapper, curate_shard, todo, done=progress.update, crashed=quarantine_crashed)
-    _take_out(config, shards, writer, output)
-    write_merged_manifest(output, account(writer, output, identities, read_shard_manifests(output)))
-    writer.close()
-
-
-def _take_out(config: CurateConfig, shards: list[CurateShard], writer: EpisodeSetWriter, output: Path) -> None:
-    """Quarantine what the rules over the whole set refuse: duplicates, leaking scenes.
-
-    Raises: DataError when a scene is both learnt from and tested on.
-    """
-    labels = {episode.identity: config.sources[shard.source].label for shard in shards for episode in shard.episodes}
-    kept = {part["episode_id"]: part for part in writer.kept()}
-    findings = decided_findings(config, [kept[identity] for identity in labels if identity in kept], output)
-    for row in findings.rows:
-        writer.quarantine(row.episode_id, labels[row.episode_id], row.reason, row.detail, row.numbers)
-        writer.discard(row.episode_id)
-
-
-def _describe(config: CurateConfig, shards: list[CurateShard], output: Path) -> None:
-    """Write what the finished set does not say of itself: its sources with their licences, their weights in training."""
-    listed: list[list[str]] = [[] for _ in config.sources]
-    for shard in shards:
-        listed[shard.source] += [episode.identity for episode in shard.episodes]
-    rows = read_index(output)
-    write_source_table(output, config, listed, rows, read_quarantine(output))
-    write_source_weights(output, rows, config.sampling)
-
-
-def _counts(output: Path, identities: list[str]) -> dict[str, Any]:
+    roots = tuple(str(inputs.get(f"source.{n}", source.path)) for n, source in enumerate(config.sources))
+    work = CurateWork(output, config, roots)
+    listed = work.listed_episodes()
+    identities = [episode.identity for episodes in listed for episode in episodes]
+    if not EpisodeSetWriter.finished(output):
+        # Shards of one source each: a worker then opens few sources.
+        pieces = [piece for episodes in listed for piece in batched(episodes, mapper.episodes_per_shard)]
+        map_episodes(mapper, work, pieces)
+        _take_out(work, listed)
+        write_account(output, [work.row(identity) for identity in identities])
+        work.writer.close()
     rows, rejected = read_index(output), read_quarantine(output)
-    kept, quarantined = {row.episode_id for row in rows}, {row.episode_id for row in rejected}
-    check_account(len(identities), kept, quarantined, read_merged_manifest(output), output)
-    reasons: dict[str, int] = {}
-    for rejection in rejected:
-        reasons[rejection.reason] = reasons.get(rejection.reason, 0) + 1
-    splits: dict[str, int] = {}
-    for row in rows:
-        splits[row.split] = splits.get(row.split, 0) + 1
+    write_source_table(output, config, [[e.identity for e in episodes] for episodes in listed], rows, rejected)
+    write_source_weights(output, rows, config.sampling)
+    check_account(output, len(identities), {row.episode_id for row in rows}, {row.episode_id for row in rejected})
     return {
         "found": len(identities),
         "kept": len(rows),
         "quarantined": len(rejected),
-        "reasons": dict(sorted(reasons.items())),
-        "splits": dict(sorted(splits.items())),
+        "reasons": dict(sorted(Counter(row.reason for row in rejected).items())),
+        "splits": dict(sorted(Counter(row.split for row in rows).items())),
         "videos": {name: count for name, count in read_json(output / VIDEOS_FILE).items() if name != "codecs"},
     }
+
+
+def _take_out(work: CurateWork, listed: Sequence[Sequence[ListedEpisode]]) -> None:
+    """Quarantine what the rules over the whole set refuse: duplicates, leaking scenes.
+
+    Raises: DataError when a scene is both learnt from and tested on.
+    """
+    labels = {e.identity: work.label(e.source) for episodes in listed for e in episodes}
+    kept = {part["episode_id"]: part for part in work.writer.kept()}
+    findings = decided_findings(work.config, [kept[identity] for identity in labels if identity in kept], work.output)
+    for row in findings.rows:
+        work.writer.quarantine(row.episode_id, labels[row.episode_id], row.reason, row.detail, row.numbers)
+        work.writer.discard(row.episode_id)
+
+
+@dataclass(frozen=True)
+class ListedEpisode:
+    """One episode that a source lists.
+
+    Attributes:
+        source: number of the source in the configuration.
+        identity: its id in the set.
+        listed_id: its id in the source.
+        repeated: whether a source listed an episode of that id before.
+    """
+
+    source: int
+    identity: str
+    listed_id: str
+    repeated: bool
+
+
+@dataclass(frozen=True)
+class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
+    """Keeps or quarantines listed episodes.
+
+    Attributes:
+        roots: where each source lies.
+    """
+
+    step: ClassVar[str] = "curate"
+    doing: ClassVar[str] = "Processing"
+
+    config: CurateConfig
+    roots: tuple[str, ...]
+
+    @cached_property
+    def writer(self) -> EpisodeSetWriter:
+        """The set that all shards write into."""
+        return EpisodeSetWriter(
+            self.output,
+            fps=self.config.common_fps,
+            image_size=self.config.common_image_size,
+            video_crf=self.config.video_crf,
+            video_preset=self.config.video_preset,
+            pixel_format=self.config.pixel_format,
+            video_mode=self.config.video_mode,
+            key_frame_interval=self.config.key_frame_interval,
+        )
+
+    @cached_property
+    def _source(self) -> Callable[[int], EpisodeSource]:
+        """Opens source `number`; the last few stay open."""
+        run, sources, roots = self.run, self.config.sources, self.roots
+
+        @lru_cache(maxsize=_OPEN_SOURCES)
+        def opened(number: int) -> EpisodeSource:
+            watch_run(run)
+            return open_source(sources[number], parse_location(roots[number]))
+
+        return opened
+
+    def label(self, source: int) -> str:
+        """What a source is called in quarantine rows."""
+        return self.config.sources[source].label
+
+    def listed_episodes(self) -> list[list[ListedEpisode]]:
+        """What each source lists, in its order, under ids that are unique in the set."""
+        listed: list[list[ListedEpisode]] = []
+        seen: set[str] = set()
+        for number, source in enumerate(self.config.sources):
+            episodes: list[ListedEpisode] = []
+            for listed_id in filter(source.includes, self._source(number).episode_ids()):
+                repeated = listed_id in seen
+                identity = unique_identity(listed_id, number, seen)
+                seen |= {identity, listed_id}
+                episodes.append(ListedEpisode(number, identity, listed_id, repeated))
+            listed.append(episodes)
+        return listed
+
+    def remaining(self, number: int, episodes: Sequence[ListedEpisode]) -> list[ListedEpisode]:
+        del number
+        return [episode for episode in episodes if not self.writer.has(episode.identity)]
+
+    def do(self, episode: ListedEpisode) -> InputRow:
+        try:
+            self._keep(episode)
+        except DataError as error:
+            # A reader may have wrapped it: an input that cannot be reached just now is not a bad one.
+            if is_transient(error):
+                raise
+            match error:
+                case RejectedInputError():
+                    return self._quarantine(episode, error.reason, str(error), error.evidence)
+                case CalibrationError():
+                    return self._quarantine(episode, "invalid_extrinsics", str(error), {})
+                case _:
+                    return self._quarantine(episode, "unreadable", str(error), {})
+        return self.row(episode.identity)
+
+    def _keep(self, episode: ListedEpisode) -> None:
+        """Raises: DataError (RejectedInputError, CalibrationError) for an episode that does not get through."""
+        label = self.label(episode.source)
+        if episode.repeated:
+            raise RejectedInputError(
+                "duplicate_id", "Another source has an episode of this id", where=label, got=episode.listed_id
+            )
+        check_id(episode.listed_id, label)
+        own = self.config.for_source(episode.source)
+        with unchanged_files(episode.identity):
+            loaded = self._source(episode.source).load(episode.listed_id)
+            check_episode(own, loaded)
+            prepared = prepare_episode(own, loaded)
+            self.writer.add(prepared.episode, prepared.frames, prepared.masks or None, prepared.described)
+
+    def quarantine_crashed(self, episode: ListedEpisode, detail: str, evidence: Mapping[str, Any]) -> InputRow:
+        return self._quarantine(episode, "crashed", detail, evidence)
+
+    def _quarantine(self, episode: ListedEpisode, reason: str, detail: str, evidence: Mapping[str, Any]) -> InputRow:
+        self.writer.discard(episode.identity)  # written from files that changed meanwhile
+        label, root = self.label(episode.source), parse_location(self.roots[episode.source])
+        self.writer.quarantine(episode.identity, label, reason, portable_text(detail, root, label), evidence)
+        return self.row(episode.identity)
+
+    def row(self, identity: str) -> InputRow:
+        """The account of an episode that is done.
+
+        Raises: DataError when it is not.
+        """
+        found = self.writer.recorded(identity)
+        if found is None:
+            raise DataError("An episode was neither kept nor quarantined", where=str(self.output), got=identity)
+        if isinstance(found, QuarantineRow):
+            return InputRow(episode_id=identity, source=found.source, status="quarantined", reason=found.reason)
+        return InputRow(
+            episode_id=identity,
+            source=found["source"],
+            status="kept",
+            digest=found["fingerprint"]["digest"],
+            stored_bytes=sum(file.stat().st_size for file in found.folder.iterdir()),
+        )
