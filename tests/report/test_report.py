@@ -12,11 +12,11 @@ import av
 import pytest
 
 from worldline_core.errors import ArtifactError
+from worldline_core.report.cost import block_ratio, block_words, blocks_of
 from worldline_core.report.report import ReportConfig, report
-from worldline_core.report.sections.efficiency import block_ratio, block_words, blocks_of
 
 SECTIONS = (
-    "summary", "videos", "video", "policy", "planning", "cost", "data", "filters", "actions", "training", "models", "provenance",
+    "videos", "quality", "policy", "planning", "cost", "data", "filters", "actions", "training", "models", "provenance",
 )  # fmt: skip
 VOID = {"meta", "img", "input", "br", "hr", "link", "source"}
 
@@ -55,28 +55,38 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def section(text: str, anchor: str) -> str:
-    return text.split(f'id="{anchor}"')[1].split("</section>")[0]
+def pages(folder: Path) -> dict[str, str]:
+    """The text of every page by its name."""
+    found = {path.stem: path.read_text() for path in sorted(folder.glob("*.html"))}
+    assert set(found) >= {"index", *SECTIONS}
+    return found
 
 
-def test_page_is_well_formed_and_has_every_section(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
-    page = Page(text)
-    assert page.open == []
-    assert len(page.identities) == len(set(page.identities))
-    assert set(SECTIONS) <= set(page.identities)
-    assert "Missing:" not in text
+def run_parts(folder: Path) -> dict[str, str]:
+    text = (folder / "run" / "run.js").read_text()
+    return json.loads(text.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
+
+
+def test_pages_are_well_formed_and_complete(full_report: Path) -> None:
+    for name, text in pages(full_report).items():
+        page = Page(text)
+        assert page.open == []
+        assert len(page.identities) == len(set(page.identities))
+        assert ("summary" if name == "index" else name) in page.identities
+        assert "Missing:" not in text
+        assert {f"{anchor}.html" for anchor in SECTIONS} <= set(page.references)  # every page leads to every other
 
 
 def test_nothing_comes_from_a_network(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
-    assert [r for r in Page(text).references if re.match(r"^[a-z]+:|^//", r)] == []
-    assert not re.search(r"url\(|@import|https?://", text)
-    assert "default-src &#x27;none&#x27;" in text
+    for text in pages(full_report).values():
+        assert [r for r in Page(text).references if re.match(r"^[a-z]+:|^//", r)] == []
+        assert not re.search(r"url\(|@import|https?://", text)
+        assert "default-src 'none'" in text
 
 
 def test_every_referenced_file_exists_and_every_medium_is_referenced(full_report: Path) -> None:
-    references = {r for r in Page((full_report / "index.html").read_text()).references if not r.startswith("#")}
+    found = {r for text in pages(full_report).values() for r in Page(text).references}
+    references = {r for r in found if not r.startswith("#")}
     assert [r for r in references if not (full_report / r).is_file()] == []
     assert {f"media/{path.name}" for path in (full_report / "media").iterdir()} <= references
     assert any(r.endswith(".rrd") for r in references)
@@ -84,12 +94,25 @@ def test_every_referenced_file_exists_and_every_medium_is_referenced(full_report
 
 
 def test_hostile_text_stays_text(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
-    page = Page(text)
-    assert page.scripts == 2  # the run's facts and the page's own script
-    assert page.handlers == []
-    assert "&lt;script&gt;alert(" in text
+    for text in pages(full_report).values():
+        page = Page(text)
+        assert page.scripts == 2  # the run's facts and the page's own script
+        assert page.handlers == []
+        assert "<script>alert" not in text
+    shown = [name for name, text in pages(full_report).items() if "&lt;script&gt;alert(" in text]
+    assert set(shown) >= {"planning", "actions", "models", "provenance", "videos"}
     assert "</script>" not in (full_report / "run" / "run.js").read_text()
+
+
+def test_videos_are_loaded_when_they_are_seen(full_report: Path) -> None:
+    found = pages(full_report)
+    videos = [tag for name in ("index", "videos") for tag in re.findall(r"<video[^>]*>", found[name])]
+    assert len(videos) > 6
+    for tag in videos:
+        assert 'preload="none"' in tag
+        assert "poster=" in tag
+        assert "aria-label=" in tag  # what is in the columns, for those who cannot see them
+    assert "IntersectionObserver" in found["videos"]
 
 
 def test_videos_play_in_browsers(full_report: Path) -> None:
@@ -106,9 +129,7 @@ def test_videos_play_in_browsers(full_report: Path) -> None:
 def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: Path, tmp_path: Path) -> None:
     report(ReportConfig(tile_height=64, rerun=False, mcap=False), run_artifacts, tmp_path)
     again, before = digest(tmp_path), digest(full_report)
-    assert {name: value for name, value in again.items() if name != "index.html"} == {
-        n: v for n, v in before.items() if n != "index.html"
-    }
+    assert {name for name in before if again[name] != before[name]} == {"videos.html"}  # it links recordings
     # A killed call leaves half-written files; they must not enter the digest of the next one.
     (tmp_path / "media" / ".episode0.123.tmp.mp4").write_bytes(b"half")
     (tmp_path / ".index.123.tmp.html").write_bytes(b"half")
@@ -117,19 +138,18 @@ def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: P
 
 
 def test_times_and_versions_stay_out_of_the_reproducible_page(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
+    text = "".join(pages(full_report).values())
     run = (full_report / "run" / "run.js").read_text()
-    for fact in ("2026-11-21T05:00:00Z", "12.5 s", "torch 2.11"):
+    for fact in ("2026-11-21T05:00:00Z", ">12.5<", "torch 2.11"):
         assert fact not in text
         assert fact in run
-    parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
+    parts = run_parts(full_report)
     assert set(parts) == set(re.findall(r'data-run="(\w+)"', text))
     assert Page(parts["cost"]).open == []
 
 
-def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path, tmp_path: Path) -> None:
-    run = (full_report / "run" / "run.js").read_text()
-    parts = json.loads(run.removeprefix("window.WORLDLINE_RUN = ").rstrip(";\n"))
+def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path) -> None:
+    parts = run_parts(full_report)
     cost = parts["cost"]
     assert "Time of each block, from the first to number 50" in cost
     assert "1.04\u202f\u00d7" in cost
@@ -149,48 +169,46 @@ def test_a_ratio_needs_enough_blocks_at_both_ends() -> None:
     assert "1.04" not in block_words("causal", [0.5, 0.52])
 
 
-def test_numbers_of_the_scores_are_on_the_page(full_report: Path) -> None:
-    text = (full_report / "index.html").read_text()
-    summary = section(text, "summary")
-    assert "+0.21" in summary  # over shuffled actions
-    assert "94\u202f%" in summary  # kept by the causal model
-    assert "lpips" in section(text, "video")
-    assert "no weights in the configured folder" in section(text, "video")
-    assert "0.930" in section(text, "video")  # the segmenter's own accuracy
-    assert "by a second segmenter, colour" in section(text, "video")
-    assert "selector&#x27;s ceiling" in section(text, "planning")
+def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
+    found = pages(full_report)
+    assert "+0.21" in found["index"]  # over shuffled actions
+    assert "94\u202f%" in found["index"]  # kept by the causal model
+    assert "lpips" in found["quality"]
+    assert "no weights in the configured folder" in found["quality"]
+    assert "0.930" in found["quality"]  # the segmenter's own accuracy
+    assert "by a second segmenter, colour" in found["quality"]
+    assert "selector&#39;s ceiling" in found["planning"]
     # A choice that succeeds in two of five runs is neither a success nor a failure.
-    assert re.search(r"bank_2.*?<td[^>]*>0\.40</td>", section(text, "planning"), re.DOTALL)
-    assert re.search(
-        r"<th[^>]*>lift</th><td[^>]*>3</td><td[^>]*>0\.45</td><td[^>]*>0\.95</td>", section(text, "planning")
-    )
-    assert "median of 3 on held-out scenes" in section(text, "videos")
-    assert "truncated_video" in section(text, "filters")
-    assert "refused_static.jpg" in section(text, "filters")
+    assert re.search(r"bank_2.*?<td[^>]*>0\.40</td>", found["planning"], re.DOTALL)
+    assert re.search(r"<th[^>]*>lift</th><td[^>]*>3</td><td[^>]*>0\.45</td><td[^>]*>0\.95</td>", found["planning"])
+    assert "median of 3 on held-out scenes" in found["videos"]
+    assert "truncated_video" in found["filters"]
+    assert "refused_static.jpg" in found["filters"]
 
 
 def test_split_is_checked_not_assumed(full_report: Path) -> None:
-    assert "none of the 2 test scenes is among the 1 training scenes" in section(
-        (full_report / "index.html").read_text(), "data"
-    )
+    assert "none of the 2 test scenes is among the 1 training scenes" in pages(full_report)["data"]
 
 
 def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     some = {name: run_artifacts[name] for name in ("curate", "train_stage1")}
     metrics = report(ReportConfig(), some, tmp_path)
-    text = (tmp_path / "index.html").read_text()
-    assert Page(text).open == []
-    assert metrics["missing"] == ["videos", "video", "policy", "planning", "cost", "actions", "models"]
+    found = pages(tmp_path)
+    assert [name for name, text in found.items() if Page(text).open] == []
+    assert metrics["missing"] == ["videos", "quality", "policy", "planning", "cost", "actions", "models"]
     for anchor in metrics["missing"]:
-        assert "Missing:" in section(text, anchor)
-    assert "Stage II: action-driven, three views, Distillation" in section(text, "training")
-    assert "filtered EpisodeSet is missing" in section(text, "filters")
+        assert "Missing:" in found[anchor]
+    assert "6 of 7 episodes were kept; no prediction was measured yet." in found["index"]
+    assert "Stage II: action-driven, three views, Distillation" in found["training"]
+    assert "filtered EpisodeSet is missing" in found["filters"]
 
 
 def test_a_report_of_nothing_is_a_page(tmp_path: Path) -> None:
     metrics = report(ReportConfig(), {}, tmp_path)
     assert metrics["sections"] == 1
-    assert Page((tmp_path / "index.html").read_text()).open == []
+    found = pages(tmp_path)
+    assert "Nothing was measured yet." in found["index"]
+    assert [name for name, text in found.items() if Page(text).open] == []
 
 
 def test_a_damaged_artifact_is_named(run_artifacts: dict[str, Path], tmp_path: Path) -> None:

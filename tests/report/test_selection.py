@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from worldline_core.report.filters import with_unit
 from worldline_core.report.methods import in_order, method
-from worldline_core.report.sections.filters import with_unit
-from worldline_core.report.selection import best_median_worst, choose_episodes
-from worldline_core.report.video_scores import VideoScores
+from worldline_core.report.video_scores import VideoScores, best_median_worst, choose_episodes
 
 
 @pytest.mark.parametrize(
@@ -56,3 +55,8 @@ def test_without_scores_episodes_are_taken_by_name() -> None:
 )
 def test_evidence_is_written_with_its_unit(key: str, value: float, text: str) -> None:
     assert with_unit(key, value) == text
+
+
+def test_another_number_of_steps_is_not_shown_as_the_usual_method() -> None:
+    assert method("shipped_stage2").label == "Stage II"
+    assert method("shipped_stage2_35_steps").label == "Stage II, 35 steps"

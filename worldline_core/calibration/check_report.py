@@ -1,7 +1,4 @@
-"""What a calibration check found, as a table for the terminal and as JSON.
-
-What a calibration check found, as a page with a picture of every episode.
-"""
+"""What a calibration check found: a table for the terminal, JSON, and a page with a picture of every episode."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from worldline_core.calibration.diagnosis import (
     CalibrationCheck,
@@ -20,8 +18,7 @@ from worldline_core.calibration.diagnosis import (
     SetDiagnosis,
     SetFinding,
 )
-from worldline_core.report.markup import Child, Column, Html, element, figure, join, notice, table
-from worldline_core.report.page import asset
+from worldline_core.pages.page import Table, render, words
 
 ORDER = ("unexplained", "explained", "unreadable", "too_little_evidence", "consistent")
 MEASURES = ("hand-eye", "camera lag", "image lag", "in view", "flow")
@@ -204,97 +201,54 @@ MEANING = {
     "too_little_evidence": "too little moves, or too little is calibrated, to judge",
     "unreadable": "the episode cannot be read",
 }
+TONES = {"consistent": "good", "explained": "bad", "unexplained": "bad", "unreadable": "bad"}
 RANKED_SHOWN = 6
 
 
 def page(check: CalibrationCheck) -> str:
     """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", "Calibration check"),
-        element("style", Html(asset("style.css"))),
-    )
     counted = Counter(finding.verdict for finding in check.findings)
-    tiles = [
-        element(
-            "div",
-            element("div", str(counted[name]), class_="figure"),
-            element("div", name.replace("_", " "), class_="what"),
-            element("div", MEANING[name], class_="how"),
-            class_=f"tile {_tone(name)}".strip(),
-        )
-        for name in ORDER
-        if counted[name]
-    ]
     ordered = sorted(check.findings, key=lambda finding: (ORDER.index(finding.verdict), finding.episode_id))
-    body = element(
-        "body",
-        element(
-            "main",
-            element(
-                "header",
-                element("h1", "Calibration check"),
-                element("p", f"{len(check.findings)} episodes, judged by what they show.", class_="subtitle"),
-                element("div", tiles, class_="tiles"),
-            ),
-            element("section", element("h2", "Conclusions"), _conclusions(check)),
-            element("section", element("h2", "Episodes"), _episode_table(ordered)),
-            element("section", element("h2", "Pictures"), [_card(finding) for finding in ordered]),
-        ),
-        element("footer", "Made by ", element("code", "worldline calibrate check"), "."),
+    return render(
+        "calibration/check_page.html",
+        title="Calibration check",
+        subtitle=f"{len(check.findings)} episodes, judged by what they show.",
+        tiles=[(counted[name], name, MEANING[name]) for name in ORDER if counted[name]],
+        tones=TONES,
+        conclusions=[
+            (set_headline(found.diagnosis), votes_text(found.diagnosis), cautions(found.diagnosis), found)
+            for found in check.sets
+        ],
+        episodes=_episode_table(ordered),
+        findings=[(finding, _ranked(finding)) for finding in ordered],
     )
-    return "<!doctype html>\n" + str(element("html", head, body, lang="en")) + "\n"
 
 
-def _tone(verdict: str) -> str:
-    return {"consistent": "good", "explained": "bad", "unexplained": "bad", "unreadable": "bad"}.get(verdict, "")
+def _tag(verdict: str) -> Markup:
+    return Markup('<span class="tag {}">{}</span>').format(TONES.get(verdict, ""), words(verdict))
 
 
-def _conclusions(check: CalibrationCheck) -> Html:
-    parts: list[Child] = []
-    for found in check.sets:
-        parts.append(element("h3", set_headline(found.diagnosis)))
-        parts.append(element("p", f"Single episodes say: {votes_text(found.diagnosis)}."))
-        parts += [notice(caution) for caution in cautions(found.diagnosis)]
-        parts += [element("p", note, class_="muted") for note in found.diagnosis.notes]
-        if found.config_lines:
-            parts.append(element("pre", "\n".join(found.config_lines)))
-    return join(parts or element("p", "Too few episodes of one source to conclude anything over them together."))
-
-
-def _episode_table(findings: Sequence[Finding]) -> Html:
-    columns = [Column("Episode"), Column("Verdict"), Column("Best explanation"), Column("Score", numeric=True)]
-    columns += [Column("As recorded", numeric=True), *(Column(name, numeric=True) for name in MEASURES)]
+def _episode_table(findings: Sequence[Finding]) -> Table:
     rows: list[list[object]] = []
     for finding in findings:
-        tag = element("span", finding.verdict.replace("_", " "), class_=f"tag {_tone(finding.verdict)}".strip())
+        tag = _tag(finding.verdict)
         if (diagnosis := finding.diagnosis) is None:
             rows.append([finding.episode_id, tag, finding.reason, None, None, *([None] * len(MEASURES))])
             continue
         shown = measures_shown(diagnosis)
-        link = element("a", finding.episode_id, href=f"#{finding.episode_id}")
+        link = Markup('<a href="#{0}">{0}</a>').format(finding.episode_id)
         scores = [f"{diagnosis.best.score:.1f}", f"{diagnosis.none.score:.1f}"]
         rows.append([link, tag, diagnosis.best.mistake, *scores, *(shown[name] for name in MEASURES)])
-    return table(columns, rows, caption="Log-likelihood scores: 0 is as a healthy recording, lower is worse.")
+    headings = ("Episode", "Verdict", "Best explanation", "Score", "As recorded", *MEASURES)
+    caption = "Log-likelihood scores: 0 is as a healthy recording, lower is worse."
+    return Table(headings, rows, range(3, len(headings)), caption)
 
 
-def _card(finding: Finding) -> Html:
-    tag = element("span", finding.verdict.replace("_", " "), class_=f"tag {_tone(finding.verdict)}".strip())
-    parts: list[Child] = [element("h3", finding.episode_id, " ", tag, id=finding.episode_id)]
+def _ranked(finding: Finding) -> Table | None:
+    """Readings that were tried, the likeliest first, with what speaks most against each."""
     if finding.diagnosis is None:
-        return join(*parts, notice(element("strong", f"{finding.reason}: "), finding.detail))
-    if finding.config_lines:
-        parts.append(element("pre", "\n".join(finding.config_lines)))
-    parts += [element("p", note, class_="muted") for note in (*finding.diagnosis.notes, *finding.notes)]
-    if finding.picture:
-        repaired = finding.diagnosis.verdict == "explained"
-        caption = "Left as recorded, right as repaired, the same frames." if repaired else "As recorded."
-        image = element("img", src=finding.picture, alt=f"Overlay of {finding.episode_id}", loading="lazy")
-        parts.append(figure(element("a", image, href=finding.picture), caption, class_="wide"))
-    ranked = [
+        return None
+    rows = [
         [
             e.mistake,
             f"{e.score:.1f}",
@@ -302,6 +256,4 @@ def _card(finding: Finding) -> Html:
         ]
         for e in finding.diagnosis.ranked[:RANKED_SHOWN]
     ]
-    columns = [Column("Reading"), Column("Score", numeric=True), Column("What costs it most")]
-    parts.append(element("details", element("summary", "Readings that were tried"), table(columns, ranked)))
-    return join(parts)
+    return Table(("Reading", "Score", "What costs it most"), rows, [1])

@@ -1,5 +1,5 @@
 "use strict";
-// Fill the slots with what was recorded outside the reproducible part of the page.
+// Fill the slots with what was recorded outside of the reproducible part of the pages.
 const run = window.WORLDLINE_RUN || {};
 for (const slot of document.querySelectorAll("[data-run]")) {
   const content = run[slot.dataset.run];
@@ -11,6 +11,9 @@ document.getElementById("theme").addEventListener("click", () => {
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   root.dataset.theme = dark ? "light" : "dark";
 });
+// On narrow screens the navigation scrolls: begin at this page's own link.
+const here = document.querySelector("nav .here");
+if (here) here.parentElement.scrollLeft = here.offsetLeft - here.parentElement.offsetLeft - 40;
 // Tabs: buttons that show one panel of their group.
 for (const tabs of document.querySelectorAll(".tabs")) {
   const buttons = [...tabs.querySelectorAll("button")];
@@ -34,36 +37,33 @@ for (const tabs of document.querySelectorAll(".tabs")) {
   });
   select(buttons[0]);
 }
-// One player for each card: all of its videos show the same instant. A card plays while it is seen; a reader who
-// prefers less motion starts it.
+// One player for each card: all of its videos show the same instant. Nothing is loaded before a card is seen; then it
+// plays, unless the reader prefers less motion and starts it.
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const icons = { play: "M4 2l9 6-9 6z", pause: "M4 2h3v12H4zM9 2h3v12H9z" };
 let rate = 1;
 for (const card of document.querySelectorAll("[data-player]")) {
   const videos = [...card.querySelectorAll("video")];
-  if (!videos.length) continue;
-  for (const video of videos) video.removeAttribute("controls");
   const bar = card.querySelector(".player");
-  const [button, slider, clock] = [bar.querySelector("button"), bar.querySelector("input"), bar.querySelector("output")];
-  bar.hidden = false;
+  const [button, slider, clock] = bar ? [bar.querySelector("button"), bar.querySelector("input"), bar.querySelector("output")] : [];
+  if (bar) bar.hidden = false;
   let wanted = !still, seen = false;
-  const shown = () => videos.filter((video) => video.offsetParent !== null);
   const apply = () => {
-    const playing = wanted && seen;
-    const visible = shown();
     for (const video of videos) {
+      if (bar) video.removeAttribute("controls");
       video.playbackRate = rate;
-      if (playing && visible.includes(video)) video.play().catch(() => {});
+      if (wanted && seen && video.offsetParent !== null) video.play().catch(() => {});
       else video.pause();
     }
+    if (!bar) return;
     button.querySelector("path").setAttribute("d", wanted ? icons.pause : icons.play);
     button.setAttribute("aria-label", wanted ? "Pause" : "Play");
   };
   const show = () => {
-    const main = shown()[0];
-    if (!main || !main.duration) return;
-    for (const video of videos) {
-      if (video !== main && Math.abs(video.currentTime - main.currentTime) > 0.08) video.currentTime = main.currentTime;
+    const [main, ...others] = videos.filter((video) => video.offsetParent !== null);
+    if (!bar || !main || !main.duration) return;
+    for (const video of others) {
+      if (video.readyState > 0 && Math.abs(video.currentTime - main.currentTime) > 0.08) video.currentTime = main.currentTime;
     }
     slider.max = main.duration;
     slider.value = main.currentTime;
@@ -71,22 +71,20 @@ for (const card of document.querySelectorAll("[data-player]")) {
   };
   const tick = () => { if (wanted && seen) show(); requestAnimationFrame(tick); };
   const toggle = () => { wanted = !wanted; apply(); };
-  button.addEventListener("click", toggle);
-  for (const video of videos) video.addEventListener("click", toggle);
-  slider.addEventListener("input", () => {
-    wanted = false;
-    apply();
-    for (const video of videos) video.currentTime = Number(slider.value);
-    clock.textContent = `${Number(slider.value).toFixed(1)} / ${Number(slider.max).toFixed(1)} s`;
-  });
+  for (const video of videos) if (bar) video.addEventListener("click", toggle);
+  if (bar) {
+    button.addEventListener("click", toggle);
+    slider.addEventListener("input", () => {
+      wanted = false;
+      apply();
+      for (const video of videos) video.currentTime = Number(slider.value);
+      clock.textContent = `${Number(slider.value).toFixed(1)} / ${Number(slider.max).toFixed(1)} s`;
+    });
+    tick();
+  }
   card.addEventListener("change-view", () => { show(); apply(); });
-  videos[0].addEventListener("loadedmetadata", show);
-  if ("IntersectionObserver" in window) {
-    new IntersectionObserver(([entry]) => { seen = entry.isIntersecting; apply(); }, { threshold: 0.2 }).observe(card);
-  } else { seen = true; }
   card.addEventListener("change-rate", apply);
-  apply();
-  tick();
+  new IntersectionObserver(([entry]) => { seen = entry.isIntersecting; apply(); }, { threshold: 0.2 }).observe(card);
 }
 for (const button of document.querySelectorAll("[data-speed]")) {
   button.addEventListener("click", () => {
@@ -95,12 +93,4 @@ for (const button of document.querySelectorAll("[data-speed]")) {
     rate = slow ? 0.4 : 1;
     document.querySelectorAll("[data-player]").forEach((card) => card.dispatchEvent(new Event("change-rate")));
   });
-}
-// The section in view is marked in the navigation.
-if ("IntersectionObserver" in window) {
-  const links = new Map([...document.querySelectorAll("nav .links a")].map((a) => [a.getAttribute("href").slice(1), a]));
-  const spy = new IntersectionObserver((entries) => {
-    for (const { target, isIntersecting } of entries) links.get(target.id)?.classList.toggle("here", isIntersecting);
-  }, { rootMargin: "-20% 0px -70% 0px" });
-  document.querySelectorAll("main section").forEach((section) => spy.observe(section));
 }

@@ -54,8 +54,8 @@ def _markdown_reader(pictures: bool) -> MarkdownIt:
     reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink"])
     if not pictures:
         reader.disable("image")
-    reader.add_render_rule("table_open", lambda *_: '<div class="table-wrap" tabindex="0"><table>\n')
-    reader.add_render_rule("table_close", lambda *_: "</table></div>\n")
+    reader.add_render_rule("table_open", lambda *_: '<div class="table-wrap"><div tabindex="0"><table>\n')
+    reader.add_render_rule("table_close", lambda *_: "</table></div></div>\n")
     return reader
 
 
@@ -66,7 +66,7 @@ def markdown(text: str, *, heading: int = 4, pictures: bool = False) -> Markup:
         heading: level of the text's first level of headings.
     """
     reader = _markdown_reader(pictures)
-    tokens = reader.parse(text)
+    tokens = reader.parse(str(text))
     for token in tokens:
         if token.type in ("heading_open", "heading_close"):
             token.tag = f"h{min(6, int(token.tag[1]) + heading - 1)}"
@@ -85,7 +85,7 @@ def number(value: object, digits: int = 2, *, signed: bool = False) -> str:
 
 def percent(share: float, digits: int = 0) -> str:
     """A share as `64 %`."""
-    return f"{100 * share:.{digits}f}{NARROW_SPACE}%"
+    return f"{number(100 * float(share), digits)}{NARROW_SPACE}%"
 
 
 def words(name: object) -> str:

@@ -31,12 +31,19 @@ class SideBySide:
 
 
 def compose_side_by_side(
-    columns: Mapping[str, NDArray[np.uint8]], *, tile_height: int = 256, upscale: Upscale = "lanczos"
+    columns: Mapping[str, NDArray[np.uint8]],
+    *,
+    tile_height: int = 256,
+    upscale: Upscale = "lanczos",
+    labels: bool = True,
 ) -> NDArray[np.uint8]:
     """Composes labelled columns of `n h w 3` frames into `n H W 3`.
 
     Methods may predict different numbers of frames: the result is as long as the shortest column, so that no
     column ever shows a frozen picture as if it were a prediction.
+
+    Args:
+        labels: draw the columns' names above them.
 
     Raises:
         ValueError: no columns, or an empty one.
@@ -47,15 +54,16 @@ def compose_side_by_side(
     first = next(iter(columns.values()))
     height, width = scaled_size(first.shape[1], first.shape[2], tile_height)
     pieces: list[NDArray[np.uint8]] = []
-    gap = np.full((count, height + LABEL_HEIGHT_PX, GAP_PX, 3), STRIP_PAPER, dtype=np.uint8)
+    gap = np.full((count, height + LABEL_HEIGHT_PX * labels, GAP_PX, 3), STRIP_PAPER, dtype=np.uint8)
     size_px = 19 if width >= 260 else 15
     for label, frames in columns.items():
-        strip = text_strip(
-            label, width, LABEL_HEIGHT_PX, size_px=size_px, ink=STRIP_INK, paper=STRIP_PAPER, align="centre"
-        )
         body = scale_frames(frames[:count], (height, width), upscale)
-        strips = np.broadcast_to(strip, (count, *strip.shape))
-        pieces += [np.concatenate([strips, body], axis=1), gap]
+        if labels:
+            strip = text_strip(
+                label, width, LABEL_HEIGHT_PX, size_px=size_px, ink=STRIP_INK, paper=STRIP_PAPER, align="centre"
+            )
+            body = np.concatenate([np.broadcast_to(strip, (count, *strip.shape)), body], axis=1)
+        pieces += [body, gap]
     return np.concatenate(pieces[:-1], axis=2)
 
 
@@ -66,10 +74,13 @@ def write_side_by_side(
     *,
     tile_height: int = 256,
     upscale: Upscale = "lanczos",
-    poster_at: float = 0.6,
 ) -> SideBySide:
-    """Writes `path` (mp4) and a poster JPEG beside it, taken at the fraction `poster_at` of the clip."""
-    frames = compose_side_by_side(columns, tile_height=tile_height, upscale=upscale)
+    """Write labelled columns as `path` (mp4) with a poster beside it."""
+    return write_video(path, compose_side_by_side(columns, tile_height=tile_height, upscale=upscale), fps)
+
+
+def write_video(path: Path, frames: NDArray[np.uint8], fps: float, *, poster_at: float = 0.6) -> SideBySide:
+    """Write `n h w 3` frames as `path` (mp4) and a poster JPEG beside it, taken at the fraction `poster_at` of the clip."""
     with atomic_path(path) as temporary:
         encode_video(temporary, frames, fps, crf=20, preset="medium")
     poster = path.with_suffix(".jpg")

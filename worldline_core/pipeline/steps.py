@@ -246,13 +246,13 @@ _STEPS = (
     ),
     Step(
         "report",
-        4,
+        5,
         "worldline_core.report.report",
         "report",
         "ReportConfig",
         (),
         ("*",),
-        summary="one static page with tables, plots and videos",
+        summary="static pages with tables, plots and videos",
     ),
 )
 STEPS: dict[str, Step] = {step.name: step for step in _STEPS}

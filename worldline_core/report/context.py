@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from markupsafe import Markup
+
+from worldline_core.pages.page import render
 from worldline_core.pictures.labels import jpeg_bytes, png_bytes
-from worldline_core.report.config import ReportConfig
-from worldline_core.report.markup import Child, Html, element, join
+from worldline_core.report.report_config import ReportConfig
 from worldline_core.report.video_scores import VideoScores
 from worldline_core.store.artifact_files import JsonObject, read_json
 from worldline_core.store.atomic import write_bytes_atomic
@@ -35,10 +38,9 @@ class ReportInputs:
         """All folders of a step: variant -> folder; the plain name has the variant ""."""
         found = {"": self.folders[step]} if step in self.folders else {}
         prefix = f"{step}."
-        found |= {
+        return found | {
             name.removeprefix(prefix): path for name, path in sorted(self.folders.items()) if name.startswith(prefix)
         }
-        return found
 
     def manifest(self, name: str) -> JsonObject:
         """An artifact's manifest, or an empty object for a folder without one."""
@@ -48,27 +50,31 @@ class ReportInputs:
 
 @dataclass(frozen=True)
 class Section:
-    """One section: its anchor, title, one sentence of introduction, and its content; or why it is missing."""
+    """One page of the report: its name, title, a sentence of introduction, and its content; or why it is missing."""
 
     anchor: str
     title: str
-    lead: Child = None
-    body: Child = None
+    lead: str = ""
+    body: Markup | None = None
     missing: str | None = None
+
+    @property
+    def file(self) -> str:
+        return f"{self.anchor}.html"
 
 
 @dataclass
 class ReportContext:
     """The configuration, the inputs, and the folder that media go to.
 
-    `run_parts` collects what is not reproducible (times, devices, versions): it is written to `run/run.js`, outside
-    the digested page, and put into the page's slots when it is opened.
+    `run_parts` collects what is not reproducible (times, devices, versions): it is written to `run/run.js`, outside of
+    the digested pages, and put into their slots when they are opened.
     """
 
     config: ReportConfig
     inputs: ReportInputs
     output: Path
-    run_parts: dict[str, Html] = field(default_factory=dict)
+    run_parts: dict[str, Markup] = field(default_factory=dict)
 
     @cached_property
     def media(self) -> Path:
@@ -101,29 +107,35 @@ class ReportContext:
         folder = self.inputs.get("filter") or self.inputs.get("curate") or self.inputs.get("episodes")
         return None if folder is None else EpisodeSet.open(folder)
 
-    def picture(self, name: str, picture: Picture, *, alt: str, photo: bool = False) -> Html:
-        """Writes a picture and returns the element that shows it; photographs become JPEG, drawings PNG."""
+    def picture(self, name: str, picture: Picture, *, alt: str, photo: bool = False) -> Markup:
+        """Write a picture and return the element that shows it; photographs become JPEG, drawings PNG."""
         path = self.media / f"{name}.{'jpg' if photo else 'png'}"
         write_bytes_atomic(path, jpeg_bytes(picture) if photo else png_bytes(picture))
         height, width = picture.shape[:2]
-        return element("img", src=f"media/{path.name}", alt=alt, width=width, height=height, loading="lazy")
+        return Markup('<img src="media/{}" alt="{}" width="{}" height="{}" loading="lazy">').format(
+            path.name, alt, width, height
+        )
 
     def slot(
-        self, name: str, content: Html, fallback: str | None = "Recorded when the report was made; see run/run.js."
-    ) -> Html:
-        """A place in the page that is filled from `run/run.js`."""
+        self, name: str, content: Markup, fallback: str = "Recorded when the report was made; see run/run.js."
+    ) -> Markup:
+        """A place in a page that is filled from `run/run.js`."""
         self.run_parts[name] = content
-        return element("div", element("p", fallback, class_="muted") if fallback else None, data_run=name)
+        note = Markup('<p class="muted">{}</p>').format(fallback) if fallback else ""
+        return Markup('<div data-run="{}">{}</div>').format(name, note)
 
+    def section(self, anchor: str, title: str, lead: str = "", /, **values: object) -> Section:
+        """A section whose content is the template of its name, filled with values."""
+        return Section(anchor, title, lead, render(f"report/{anchor}.html", **values))
 
-def evaluation_section(
-    context: ReportContext, step: str, anchor: str, title: str, lead: str, show: Callable[[JsonObject], Html]
-) -> Section:
-    """A section with a part for every evaluation of a step; one that says so where there is none."""
-    found = context.summaries(step)
-    if not found:
-        return Section(anchor, title, missing=f"no {title.lower().split()[0]} evaluation was given (input {step}).")
-    return Section(anchor, title, lead, join(show(summary) for summary in found))
-
-
-SectionMaker = Callable[[ReportContext], Section]
+    def write_pages(self, home: Markup, sections: Sequence[Section]) -> None:
+        """Write `index.html`, one page per section, and what is filled in when they are opened."""
+        for place, section in enumerate(sections):
+            following = sections[place + 1] if place + 1 < len(sections) else None
+            page = render("report/page.html", title=section.title, section=section, sections=sections, next=following)
+            write_bytes_atomic(self.output / section.file, page.encode())
+        # `</` would end a script element if this text were ever put into one.
+        parts = json.dumps({name: str(part) for name, part in sorted(self.run_parts.items())}, indent=1)
+        script = "window.WORLDLINE_RUN = " + parts.replace("</", "<\\/") + ";\n"
+        write_bytes_atomic(self.output / "run" / "run.js", script.encode())
+        write_bytes_atomic(self.output / "index.html", home.encode())

@@ -1,42 +1,42 @@
-"""The dataset card of an EpisodeSet: README.md (as the Hugging Face hub reads it), index.html, one picture a source."""
+"""The dataset card of an EpisodeSet: README.md (as the Hugging Face hub reads it), index.html, one picture per source.
+
+The page is the Markdown file's text made into HTML: what is said is written once, in `card.md`.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
+from markupsafe import Markup
 
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError
+from worldline_core.pages.charts import funnel_chart
+from worldline_core.pages.page import markdown, render, words
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import jpeg_bytes
-from worldline_core.report.card_blocks import (
-    Block,
-    FunnelBlock,
-    Heading,
-    Paragraph,
-    PictureBlock,
-    TableBlock,
-    card_blocks,
-    summary,
-)
-from worldline_core.report.charts import funnel_chart
-from worldline_core.report.dataset_facts import UNKNOWN, DatasetFacts
-from worldline_core.report.markup import Column, Html, element, figure, join, paragraph, table
-from worldline_core.report.page import asset
+from worldline_core.report.dataset_facts import UNKNOWN, DatasetFacts, hours_of
 from worldline_core.store.atomic import write_bytes_atomic
 
 PICTURES = "pictures"
-ROWS_A_SOURCE = 6
+ROWS_PER_SOURCE = 6
 MOMENTS = 6
 SHEET_WIDTH = 1180
+MOST_INSTRUCTIONS = 15
+MOST_LEAKS = 12
+NONE = "-"
+
 # The hub knows these by name; every other licence is "other" with its name beside it.
 HUB_LICENSES = frozenset(
-    {
+    [
         "apache-2.0",
         "mit",
         "bsd-2-clause",
@@ -64,7 +64,7 @@ HUB_LICENSES = frozenset(
         "lgpl-3.0",
         "agpl-3.0",
         "unknown",
-    }
+    ]
 )
 _SIZES = (
     (10**3, "n<1K"),
@@ -90,19 +90,22 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
     """
     facts = DatasetFacts.read(folder)
     heading = title or f"EpisodeSet {folder.resolve().name}"
-    pictures, files = _write_pictures(facts, output)
-    blocks = card_blocks(facts, pictures)
+    pictures = _write_pictures(facts, output)
+    text = render("report/card.md", pictures=pictures, picture_folder=PICTURES, **card_values(facts))
+    summary = summary_of(facts)
+    header = yaml.safe_dump(hub_metadata(facts, heading), sort_keys=False, allow_unicode=True, width=120)
     readme, page = output / "README.md", output / "index.html"
-    write_bytes_atomic(readme, markdown_card(facts, heading, blocks).encode())
-    write_bytes_atomic(page, html_card(facts, heading, blocks).encode())
-    return [readme, page, *files]
-
-
-def markdown_card(facts: DatasetFacts, title: str, blocks: Sequence[Block]) -> str:
-    """Markdown with the hub's YAML header."""
-    header = yaml.safe_dump(hub_metadata(facts, title), sort_keys=False, allow_unicode=True, width=120)
-    parts = [f"---\n{header}---", f"# {_plain(title)}", *(_markdown(block) for block in blocks)]
-    return "\n\n".join(parts) + "\n"
+    write_bytes_atomic(readme, f"---\n{header}---\n\n# {plain(heading)}\n\n{plain(summary)}\n\n{text}".encode())
+    funnel = funnel_chart(facts.funnel, title="Episodes left after each step")
+    html = render(
+        "report/card.html",
+        title=heading,
+        subtitle=summary,
+        funnel=funnel,
+        body=markdown(text, heading=1, pictures=True),
+    )
+    write_bytes_atomic(page, html.encode())
+    return [readme, page, *(output / PICTURES / name for _, name, _ in pictures)]
 
 
 def hub_metadata(facts: DatasetFacts, title: str) -> dict[str, object]:
@@ -128,92 +131,195 @@ def hub_metadata(facts: DatasetFacts, title: str) -> dict[str, object]:
     return {key: value for key, value in metadata.items() if value}
 
 
-def _markdown(block: Block) -> str:
-    match block:
-        case Heading(text):
-            return f"## {_plain(text)}"
-        case Paragraph(text):
-            return _plain(text)
-        case PictureBlock(path, caption):
-            return f"![{_plain(caption)}]({path})\n\n{_plain(caption)}"
-        case FunnelBlock(steps):
-            rows = [(label, str(count)) for label, count in steps]
-            return _markdown(TableBlock(("Step", "Number"), rows, frozenset({1})))
-        case TableBlock(columns, rows, numeric):
-            rule = ["---:" if position in numeric else "---" for position in range(len(columns))]
-            lines = [columns, rule, *rows]
-            return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+def card_part(name: str, facts: DatasetFacts) -> Markup:
+    """One part of the card, `sources` or `duplicates`, as HTML for another page."""
+    return markdown(render(f"report/card_{name}.md", **card_values(facts)), heading=2)
 
 
-def _plain(text: str) -> str:
+def card_values(facts: DatasetFacts) -> dict[str, object]:
+    """What the card says, by the names that its template uses: plain values, and tables as Markdown."""
+    rows = facts.rows
+    instructions = [(text or "(none)", count) for text, count in facts.instructions(MOST_INSTRUCTIONS)]
+    return {
+        "plain": plain,
+        "sources": markdown_table(
+            ("Source", "Kind", "Found", "Kept", "Hours", "fps", "Share in training", "Licence", "Redistribution"),
+            [_source_row(facts, name) for name in facts.names],
+            range(2, 7),
+        ),
+        "undeclared": facts.licenses().get(UNKNOWN, []),
+        "funnel": markdown_table(("Step", "Number"), facts.funnel, [1]),
+        "reasons": markdown_table(("Step", "Reason", "Episodes", "For example"), facts.reasons, [2]),
+        "contents": [
+            ("Embodiments", _contents(facts, "Embodiment", [row.embodiment for row in rows])),
+            ("Tasks", _contents(facts, "Task family", [words(row.task_family) for row in rows])),
+            ("Splits", _contents(facts, "Split", [words(row.split) for row in rows])),
+        ],
+        "views": markdown_table(("View", "Episodes", "Width x height", "fps", "Primary in"), _views(facts), [1, 4]),
+        "primary_views": _primary_views(facts),
+        "instructions": markdown_table(("Instruction", "Episodes"), instructions, [1]),
+        "instruction_notes": _instruction_notes(facts),
+        "calibrated": f"{facts.calibrated} of {len(rows)}",
+        "declared": markdown_table(
+            ("Source", "Convention", "As recorded"),
+            [(s.label, name, value) for s in facts.sources for name, value in sorted(s.conventions.items())],
+        ),
+        "detectors": markdown_table(
+            ("Detector", "Episodes passed", "Episodes failed"),
+            [(words(name), passed, failed) for name, passed, failed in facts.calibration],
+            [1, 2],
+        ),
+        "filtered": facts.filtered,
+        "taken_out": {r: facts.duplicates(r) for r in ("duplicate", "near_duplicate", "duplicate_id", "scene_leak")},
+        "split_note": _split_note(facts),
+        "leakage": _leakage(facts),
+    }
+
+
+def plain(text: str) -> str:
     """Text of recordings in Markdown: no markup, no line break, whatever was recorded."""
     escaped = re.sub(r"([\\`*\[\]<>#|])", r"\\\1", " ".join(text.split()))
     return re.sub(r"(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])", r"\\_", escaped)  # within a word it is no markup
 
 
-def _cell(text: str) -> str:
-    return text if re.fullmatch(r"-+:?", text) else _plain(text)
+def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[object]], numeric: Iterable[int] = ()) -> str:
+    """A table in Markdown, or nothing where there are no rows; `numeric` columns are aligned right."""
+    rule = ["---:" if position in set(numeric) else "---" for position in range(len(headings))]
+    cells = [[plain(str(cell)) for cell in row] for row in (headings, *rows)]
+    lines = [cells[0], rule, *cells[1:]]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) if rows else ""
 
 
-def html_card(facts: DatasetFacts, title: str, blocks: Sequence[Block]) -> str:
-    """One static page; its pictures lie beside it, nothing comes from a network."""
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element(
-            "meta",
-            http_equiv="Content-Security-Policy",
-            content="default-src 'none'; img-src 'self' file:; style-src 'unsafe-inline'",
-        ),
-        element("title", title),
-        element("style", Html(asset("style.css"))),
+def summary_of(facts: DatasetFacts) -> str:
+    """One sentence of size, one of what outcomes are."""
+    rows = facts.rows
+    segments = f" ({len(rows)} segments)" if len(rows) != facts.num_episodes else ""
+    outcomes = Counter(row.outcome for row in rows)
+    return (
+        f"{hours_text(rows)} hours in {facts.num_episodes} episodes{segments}, {facts.num_frames} frames per view;"
+        f" {counted(len({row.embodiment for row in rows}), 'embodiment')}, {counted(len({row.scene for row in rows}), 'scene')},"
+        f" {counted(len({row.instruction for row in rows if row.instruction}), 'instruction')}. Outcomes: {outcomes['success']}"
+        f" successes, {outcomes['failure']} failures, {outcomes['unknown']} unknown; they are labels for evaluation and"
+        " never reach a model."
     )
-    shown = [block_html(block) for block in blocks if block != Paragraph(summary(facts))]
-    body = element(
-        "body",
-        element(
-            "main",
-            element("header", element("h1", title), element("p", summary(facts), class_="subtitle")),
-            element("section", element("h2", title), shown),
-        ),
-        element("footer", "Made by ", element("code", "worldline card"), " from the set's own tables."),
+
+
+def counted(count: int, noun: str) -> str:
+    """A number and its noun."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def hours_text(rows: Sequence[EpisodeRow]) -> str:
+    """Hours with three digits that say something."""
+    hours = hours_of(rows)
+    if 0 < hours < 0.001:
+        return "< 0.001"
+    return f"{hours:,.0f}" if hours >= 100 else f"{hours:.3g}"
+
+
+def _source_row(facts: DatasetFacts, name: str) -> tuple[object, ...]:
+    """Where episodes come from, how many came through, and what their licence allows."""
+    own = [row for row in facts.rows if row.source == name]
+    noted, weight = facts.source_facts(name), facts.weights.get(name)
+    share = f"{100 * float(weight['share']):.1f} %" if isinstance(weight, dict) else NONE
+    kind, found = (NONE, NONE) if noted is None else (noted.kind, noted.found)
+    kept, fps = len({(row.dataset, row.episode_index) for row in own}), sorted({f"{row.fps:g}" for row in own})
+    rights = (UNKNOWN, UNKNOWN) if noted is None else (noted.license, noted.redistribution)
+    return name, kind, found, kept, hours_text(own), ", ".join(fps) or NONE, share, *rights
+
+
+def _contents(facts: DatasetFacts, heading: str, values: Sequence[str]) -> str:
+    """Scenes, episodes, hours and outcomes by one property of the episodes."""
+    table = []
+    for value in sorted(set(values)):
+        own = [row for row, found in zip(facts.rows, values, strict=True) if found == value]
+        outcomes = Counter(row.outcome for row in own)
+        counts = (outcomes["success"], outcomes["failure"], outcomes["unknown"])
+        table.append((value, len({row.scene for row in own}), len(own), hours_text(own), *counts))
+    headings = (heading, "Scenes", "Episodes", "Hours", "Success", "Failure", "Unknown")
+    return markdown_table(headings, table, range(1, 7))
+
+
+def _views(facts: DatasetFacts) -> list[tuple[object, ...]]:
+    table = []
+    for view in facts.views:
+        own = [row for row in facts.rows if view in row.views]
+        sizes = ", ".join(facts.resolutions(own, view)) or UNKNOWN
+        fps = ", ".join(sorted({f"{row.fps:g}" for row in own}))
+        table.append((view, len(own), sizes, fps, sum(row.primary_view == view for row in own)))
+    return table
+
+
+def _primary_views(facts: DatasetFacts) -> str:
+    why = {
+        "source": "as the source declares",
+        "configured": "as configured",
+        "head": "the head's, because the source's own choice has no images",
+        "most_motion": "the view with most motion",
+    }
+    return "; ".join(
+        f"{view} in {count} ({why.get(reason, reason)})"
+        for (view, reason), count in sorted(facts.primary_views.items(), key=lambda item: (-item[1], item[0]))
     )
-    return "<!doctype html>\n" + str(element("html", head, body, lang="en")) + "\n"
 
 
-def block_html(block: Block) -> Html:
-    """One block of a card as HTML."""
-    match block:
-        case Heading(text):
-            return element("h3", text)
-        case Paragraph(text):
-            return paragraph(text)
-        case PictureBlock(path, caption):
-            return figure(element("img", src=path, alt=caption, loading="lazy"), caption, class_="wide")
-        case FunnelBlock(steps):
-            return funnel_chart(steps, title="Episodes left after each step")
-        case TableBlock(columns, rows, numeric):
-            headings = [Column(name, numeric=position in numeric) for position, name in enumerate(columns)]
-            return join(table(headings, rows))
+def _instruction_notes(facts: DatasetFacts) -> str:
+    kinds = len({row.instruction for row in facts.rows})
+    notes: list[str] = []
+    if kinds > MOST_INSTRUCTIONS:
+        notes.append(f"The {MOST_INSTRUCTIONS} most frequent of {kinds}.")
+    if facts.rewritten_instructions:
+        notes.append(
+            f"{facts.rewritten_instructions} were brought to one spelling; their raw texts are kept in the index"
+            " (conventions, raw_instruction)."
+        )
+    telling = sum(mentions_outcome(row.instruction) for row in facts.rows)
+    if telling:
+        notes.append(
+            f"Warning: the instruction of {counted(telling, 'episode')} speaks of the outcome, which models must not see."
+        )
+    return " ".join(notes)
 
 
-def _write_pictures(facts: DatasetFacts, output: Path) -> tuple[list[PictureBlock], list[Path]]:
-    """One contact sheet a source: up to six episodes, over embodiments and tasks, six moments of the primary view."""
+def _leakage(facts: DatasetFacts) -> tuple[str, str]:
+    """What was found about scenes on both sides of the split, in words and as a table."""
+    leaks = facts.curation.get("scene_leaks", [])
+    if not facts.curation:
+        return "Leakage was not looked for: this set does not come from curation.", ""
+    if facts.curation.get("leakage_action") == "off":
+        return "Leakage was not looked for: curate.leakage.action is off.", ""
+    if not leaks:
+        return "No two differently named scenes on both sides of the split look like one.", ""
+    rows = [(leak["learning_scene"], leak["testing_scene"], leak["distance"]) for leak in leaks[:MOST_LEAKS]]
+    text = f"{counted(len(leaks), 'pair')} of scenes across the split look like one (first images; bits of 256):"
+    return text, markdown_table(("Learnt from", "Tested on", "Differing bits"), rows, [2])
+
+
+def _split_note(facts: DatasetFacts) -> str:
+    """Whether training and test share a scene: counted, not assumed."""
+    learnt = {row.scene for row in facts.rows if row.split in ("train", "validation")}
+    tested = {row.scene for row in facts.rows if row.split in ("test", "ood_test")}
+    if not learnt or not tested:
+        return "Only one side of the split is in this set, so no scene can be on both."
+    shared = sorted(learnt & tested)
+    if shared:
+        return f"Warning: {len(shared)} scenes are both learnt from and tested on ({', '.join(shared[:4])})."
+    return f"No scene that is tested on ({len(tested)}) is among those that are learnt from ({len(learnt)})."
+
+
+def _write_pictures(facts: DatasetFacts, output: Path) -> list[tuple[str, str, int]]:
+    """(source, file name, number of episodes) of one contact sheet per source: up to six episodes, over embodiments and
+    tasks, six moments of the primary view."""
     episodes = EpisodeSet.open(facts.folder)
-    blocks: list[PictureBlock] = []
-    files: list[Path] = []
+    written: list[tuple[str, str, int]] = []
     for number, name in enumerate(facts.names):
         rows = [row for index in _examples(facts, name) if (row := _sheet_row(episodes, index)) is not None]
-        if not rows:
-            continue
-        path = output / PICTURES / f"source_{number:02d}.jpg"
-        write_bytes_atomic(path, jpeg_bytes(contact_sheet(rows, tile_height=128, min_width=SHEET_WIDTH)))
-        caption = f"Source {name}: {len(rows)} episodes from their first to their last frame, primary view."
-        blocks.append(PictureBlock(f"{PICTURES}/{path.name}", caption))
-        files.append(path)
-    return blocks, files
+        if rows:
+            file = f"source_{number:02d}.jpg"
+            sheet = contact_sheet(rows, tile_height=128, min_width=SHEET_WIDTH)
+            write_bytes_atomic(output / PICTURES / file, jpeg_bytes(sheet))
+            written.append((name, file, len(rows)))
+    return written
 
 
 def _examples(facts: DatasetFacts, source: str) -> list[int]:
@@ -225,12 +331,12 @@ def _examples(facts: DatasetFacts, source: str) -> list[int]:
     turns = [positions for _, positions in sorted(groups.items())]
     chosen: list[int] = []
     depth = 0
-    while len(chosen) < ROWS_A_SOURCE and any(depth < len(positions) for positions in turns):
+    while len(chosen) < ROWS_PER_SOURCE and any(depth < len(positions) for positions in turns):
         chosen += [positions[depth] for positions in turns if depth < len(positions)]
         depth += 1
-    if len(turns) > ROWS_A_SOURCE:
-        chosen = [chosen[round(i)] for i in np.linspace(0, len(turns) - 1, ROWS_A_SOURCE)]
-    return sorted(chosen[:ROWS_A_SOURCE])
+    if len(turns) > ROWS_PER_SOURCE:
+        chosen = [chosen[round(i)] for i in np.linspace(0, len(turns) - 1, ROWS_PER_SOURCE)]
+    return sorted(chosen[:ROWS_PER_SOURCE])
 
 
 def _sheet_row(episodes: EpisodeSet, index: int) -> SheetRow | None:

@@ -14,10 +14,11 @@ import numpy as np
 
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import DataError
-from worldline_core.pictures.clip_strip import ClipStrip, clip_strip, stacked
+from worldline_core.filters.verdict import REASONS
+from worldline_core.pages.page import render
+from worldline_core.pictures.clip_strip import KEPT_COLOUR, ClipStrip, clip_strip, reason_colour, stacked
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
-from worldline_core.report.filters_page import ReasonGroup, filters_page
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
 
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 KEPT = "kept"
 LOST_WITH_THEM = "lost_with_them"
 MOMENTS = 8
-CLIPS_A_REASON = 4
-_SHOWN_NUMBERS = 6
+CLIPS_PER_REASON = 4
+NUMBERS_SHOWN = 6
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def chosen_moments(bad: np.ndarray | None, count: int) -> list[int]:
 
 def numbers_line(numbers: Any) -> str:
     """Measured values in one line."""
-    shown = [(k, v) for k, v in numbers.items() if v is not None and not isinstance(v, list)][:_SHOWN_NUMBERS]
+    shown = [(k, v) for k, v in numbers.items() if v is not None and not isinstance(v, list)][:NUMBERS_SHOWN]
     return "   ".join(
         f"{k.replace('_', ' ')} {v:.3g}" if isinstance(v, float) else f"{k.replace('_', ' ')} {v}" for k, v in shown
     )
@@ -232,7 +233,7 @@ def reason_sheet(filtered: FilteredSet, reason: str, clips: Sequence[FilteredCli
     """A sheet of up to four clips under one heading; unreadable ones are left out, None where all are."""
     strips: list[Picture] = []
     for clip in clips:
-        if len(strips) == CLIPS_A_REASON:
+        if len(strips) == CLIPS_PER_REASON:
             break
         try:
             strips.append(filtered.strip(clip, reason))
@@ -243,33 +244,39 @@ def reason_sheet(filtered: FilteredSet, reason: str, clips: Sequence[FilteredCli
 
 def write_filter_page(filtered: FilteredSet, output: Path) -> list[Path]:
     """`index.html` with a sheet for every reason, and the sheets as `<reason>.jpg`; returns the page and the sheets."""
-    groups: list[ReasonGroup] = []
+    groups: list[dict[str, object]] = []
     written: list[Path] = []
-    by_reason = filtered.by_reason()
-    for reason, clips in by_reason.items():
+    for reason, clips in filtered.by_reason().items():
         picture = reason_sheet(filtered, reason, clips)
         path = output / f"{safe_stem(reason)}.jpg"
         if picture is not None:
             write_bytes_atomic(path, jpeg_bytes(picture, quality=86))
             written.append(path)
+        counts = {
+            "dropped whole": sum(c.reason == reason for c in clips),
+            "lost frames": sum(reason in c.cut_by for c in clips),
+            "kept for Stage I only": sum(
+                c.reason is None and c.stage2_reason == reason and reason not in c.cut_by for c in clips
+            ),
+        }
         groups.append(
-            ReasonGroup(
-                reason,
-                whole=len(clips) if reason == KEPT else sum(c.reason == reason for c in clips),
-                partly=sum(reason in c.cut_by for c in clips),
-                stage2=sum(c.reason is None and c.stage2_reason == reason and reason not in c.cut_by for c in clips),
-                picture=None if picture is None else path.name,
-                size=(0, 0) if picture is None else (picture.shape[1], picture.shape[0]),
-            )
-        )
-    kept = next((group for group in groups if group.reason == KEPT), ReasonGroup(KEPT, 0, 0, 0, None))
+            {
+                "reason": reason, "name": "kept whole" if reason == KEPT else reason,
+                "colour": KEPT_COLOUR if reason == KEPT else reason_colour(reason),
+                "text": "No detector found anything." if reason == KEPT else REASONS.get(reason, ""),
+                "counts": [f"{len(clips)} episodes"] if reason == KEPT else [f"{n} {what}" for what, n in counts.items() if n],
+                "total": len(clips), "picture": None if picture is None else path.name,
+                "size": None if picture is None else (picture.shape[1], picture.shape[0]),
+            }
+        )  # fmt: skip
     total, dropped = len(filtered.clips), sum(clip.reason is not None for clip in filtered.clips.values())
     segments = sum(len(clip.segments) for clip in filtered.clips.values())
     subtitle = (
-        f"{total} episodes: {total - dropped} kept in {segments} segments, {dropped} dropped whole. Green is kept, a colour"
-        " of its own is dropped, pale grey went with it (too few frames in a row, or condemned whole); the curve is what the detector measured, the dashed line its threshold."
+        f"{total} episodes: {total - dropped} kept in {segments} segments, {dropped} dropped whole. Green is kept; each reason has"
+        " its own colour; pale grey went with what was dropped (too few frames in a row, or dropped whole). The curve is what the"
+        " detector measured, the dashed line its threshold."
     )
-    page = filters_page("What the filters kept and dropped", subtitle, [g for g in groups if g.reason != KEPT], kept)
+    page = render("report/clips.html", title="What the filters kept and dropped", subtitle=subtitle, groups=groups)
     write_bytes_atomic(output / "index.html", page.encode())
     return [output / "index.html", *written]
 

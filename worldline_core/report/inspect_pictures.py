@@ -12,9 +12,10 @@ from tqdm import tqdm
 
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pages.page import render, words
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, one_of_each
 from worldline_core.pictures.labels import Picture, png_bytes
-from worldline_core.report.inspect_sheets import MOMENTS, episode_sheet, rollout_sheet, tracks_sheet
+from worldline_core.report.actions import episode_overlay
 from worldline_core.report.refusals import episode_of
 from worldline_core.store.artifact_files import linked_folder, read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from worldline_core.rollout.rollout_set import RolloutSet
 
 PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
+SHEET_ROWS = 8
+MOMENTS = 6
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,8 @@ class Subject:
             moments = evenly_spaced(row.video_frames, MOMENTS)
             rows = [SheetRow(view, np.asarray(self.episodes.frames(position, view, moments))) for view in row.views]
             return contact_sheet(rows, title=f"{row.embodiment}  ·  {row.instruction}")
-        return tracks_sheet(self.episodes, position, tracks, self.sigma_px_ref)
+        title = f"{row.episode_id}  ·  {row.embodiment}  ·  {row.instruction}"
+        return episode_overlay(self.episodes, position, tracks, self.sigma_px_ref, title)
 
     def write_video(self, output: Path, episode_id: str) -> list[Path]:
         """All views side by side with the controls drawn over them, `<episode>.mp4`; truth beside a prediction."""
@@ -222,25 +226,28 @@ class Subject:
 
         An episode that cannot be shown stays on the page, with the reason.
         """
-        from worldline_core.report.dataset_page import EpisodeCard, dataset_page
-        from worldline_core.report.sections.data import one_of_each
-
         rows = self.episodes.rows
         index = read_rows(self.episodes.root / "index.parquet")
         chosen = sorted(one_of_each(index, count)) if count else list(range(len(rows)))
-        cards: list[EpisodeCard] = []
+        cards: list[dict[str, object]] = []
         for position in tqdm(chosen, "page", unit="episode", disable=None):
             row = rows[position]
             path = output / "videos" / f"{safe_stem(row.episode_id)}.mp4"
+            problem = ""
             try:
                 if not path.is_file():
                     self._write_overlay(path, position, self.tracks(row.episode_id))
-                cards.append(EpisodeCard(row, f"videos/{path.name}"))
             except WorldLineError as error:
-                cards.append(EpisodeCard(row, None, f"{error.what} ({error.where})"))
+                problem = f"{error.what} ({error.where})"
+            facts = [row.embodiment, row.task_family, row.scene, words(row.split), row.source]
+            facts = [row.episode_id, *facts, f"{row.num_frames} frames, {row.fps:g} Hz"]
+            found = " ".join([row.instruction, row.outcome, *facts]).lower()
+            video = None if problem else f"videos/{path.name}"
+            cards.append({"row": row, "facts": facts, "words": found, "video": video, "problem": problem})
         title = f"{len(cards)} of {len(rows)} episodes"
         subtitle = "Recorded frames with the commanded tools, projected by the recorded calibration."
-        write_bytes_atomic(output / "index.html", dataset_page(title, subtitle, cards).encode())
+        page = render("report/browse.html", title=title, subtitle=subtitle, cards=cards)
+        write_bytes_atomic(output / "index.html", page.encode())
         return output / "index.html"
 
     def _write_overlay(self, path: Path, position: int, tracks: EpisodeTracks) -> None:
@@ -267,3 +274,50 @@ class Subject:
         content = recording_content(rollouts, self.episodes, tracks, episode_id, sigma_px_ref=self.sigma_px_ref)
         write_rerun_recording(path, content)
         return path
+
+
+def episode_sheet(episodes: EpisodeSet) -> Picture | None:
+    """Six moments of up to eight episodes, spread over embodiments and tasks."""
+    rows: list[SheetRow] = []
+    for index in one_of_each(read_rows(episodes.root / "index.parquet"), SHEET_ROWS):
+        row = episodes.rows[index]
+        try:
+            frames = np.asarray(episodes.frames(index, row.primary_view, evenly_spaced(row.video_frames, MOMENTS)))
+        except DataError:
+            continue
+        rows.append(SheetRow(f"{row.embodiment}  ·  {row.instruction}  ·  {row.outcome}", frames, row.episode_id))
+    return contact_sheet(rows) if rows else None
+
+
+def rollout_sheet(rollouts: RolloutSet, episode_id: str | None) -> Picture | None:
+    """Six moments of one prediction in all its views, or of up to eight predictions, head view first.
+
+    Raises:
+        DataError: the set has no prediction of this episode.
+    """
+    rows: list[SheetRow] = []
+    if episode_id is not None:
+        if episode_id not in rollouts.episode_ids:
+            raise DataError(
+                "No prediction of this episode",
+                where=rollouts.root,
+                expected=f"one of {', '.join(sorted(rollouts.episode_ids)[:3])}, ...",
+                got=episode_id,
+            )
+        for view in rollouts.views(episode_id):
+            frames = np.asarray(rollouts.frames(episode_id, view, rollouts.seeds(episode_id)[0]))
+            rows.append(SheetRow(view, frames[evenly_spaced(len(frames), MOMENTS)]))
+        return contact_sheet(rows, title=f"{rollouts.method}  ·  {episode_id}")
+    views = {str(row["episode_id"]): str(row["view"]) for row in reversed(read_rows(rollouts.root / "index.parquet"))}
+    for episode_id in evenly_chosen(sorted(rollouts.episode_ids)):
+        frames = np.asarray(rollouts.frames(episode_id, views[episode_id], rollouts.seeds(episode_id)[0]))
+        moments = evenly_spaced(len(frames), MOMENTS)
+        rows.append(SheetRow(f"{rollouts.method}  ·  {episode_id}", frames[moments], views[episode_id]))
+    return contact_sheet(rows) if rows else None
+
+
+def evenly_chosen(names: list[str]) -> list[str]:
+    """Up to eight names, spread over the list."""
+    if len(names) <= SHEET_ROWS:
+        return names
+    return [names[round(i)] for i in np.linspace(0, len(names) - 1, SHEET_ROWS)]

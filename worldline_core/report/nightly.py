@@ -11,11 +11,20 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from markupsafe import Markup
+
 from worldline_core.errors import ArtifactError
+from worldline_core.pages.charts import Series, line_chart
+from worldline_core.pages.page import Table, code, interval, render, words
+from worldline_core.report.context import ReportContext, ReportInputs, Section
+from worldline_core.report.planning import planning_section
+from worldline_core.report.policy import policy_section
+from worldline_core.report.quality import quality_section
+from worldline_core.report.report_config import ReportConfig
 from worldline_core.store.artifact_files import read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
@@ -24,6 +33,9 @@ logger = logging.getLogger(__name__)
 HISTORY_FILE = "history.jsonl"
 EVALUATIONS = ("evaluate_video", "evaluate_policy", "evaluate_planning")
 LOWER_IS_BETTER = ("lpips", "error", "seconds", "malformed")
+TITLE = "Nights"
+MOST_CHARTS = 8
+HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
 Verdict = Literal["better", "worse", "same", "new"]
 
 
@@ -70,7 +82,7 @@ class NightlyComparison:
 
 
 def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> Path:
-    """Records a night, writes `comparison.json` and a page with trends into the history's folder, and returns it.
+    """Record a night, write `comparison.json` and pages with trends into the history's folder, and return it.
 
     Args:
         scores: finished Scores by step name.
@@ -80,14 +92,6 @@ def compare_with_history(scores: Mapping[str, Path], history: Path, night: str |
     Raises:
         ArtifactError: nothing was measured, or the history is damaged.
     """
-    from worldline_core.report.config import ReportConfig
-    from worldline_core.report.context import ReportContext, ReportInputs
-    from worldline_core.report.page import render_page, run_script
-    from worldline_core.report.sections.planning import planning_section
-    from worldline_core.report.sections.policy import policy_section
-    from worldline_core.report.sections.trend import trend_section
-    from worldline_core.report.sections.video import video_section
-
     compared = record_night(history, night or time.strftime("%Y-%m-%d", time.gmtime()), scores)
     for change in compared.regressions:
         was = change.previous
@@ -98,11 +102,13 @@ def compare_with_history(scores: Mapping[str, Path], history: Path, night: str |
         history / "comparison.json", asdict(compared) | {"regressions": [c.metric for c in compared.regressions]}
     )
     context = ReportContext(ReportConfig(), ReportInputs({**scores, "history": history}), history)
-    sections = [maker(context) for maker in (trend_section, video_section, policy_section, planning_section)]
-    title = "WorldLine nightly evaluation"
-    subtitle = f"Night {compared.night}: {len(compared.regressions)} of {len(compared.changes)} metrics became worse."
-    write_bytes_atomic(history / "run" / "run.js", run_script(context.run_parts).encode())
-    write_bytes_atomic(history / "index.html", render_page(title, subtitle, None, sections).encode())
+    nights = nights_section(context)
+    sections = [nights, *(make(context) for make in (quality_section, policy_section, planning_section))]
+    text = f"Night {compared.night}: {len(compared.regressions)} of {len(compared.changes)} metrics became worse."
+    first = replace(nights, title="WorldLine nightly evaluation", lead=f"{text} {nights.lead}")
+    context.write_pages(
+        render("report/page.html", title=first.title, section=first, sections=sections, next=None), sections
+    )
     return history
 
 
@@ -223,3 +229,64 @@ def verdict(metric: str, present: Measured, previous: Measured | None) -> Verdic
     low, high = sorted((sign * previous.low, sign * previous.high))
     mean = sign * present.mean
     return "worse" if mean < low else "better" if mean > high else "same"
+
+
+def nights_section(context: ReportContext) -> Section:
+    """The present night against the one before, and charts over all nights."""
+    folder = context.inputs.get("history")
+    nights = read_history(folder) if folder is not None else []
+    if not nights:
+        return Section("nights", TITLE, missing="the history holds no night yet.")
+    compared = compare_nights(nights)
+    lead = (
+        f"The first night, {compared.night}: there is nothing to compare it with yet."
+        if compared.previous is None
+        else f"Night {compared.night} beside {compared.previous}. A metric is flagged when its mean left the interval of the"
+        " night before."
+    )
+    better = [change for change in compared.changes if change.verdict == "better"]
+    tables = [change_table("Worse", compared.regressions), change_table("Better", better)]
+    return context.section(
+        "nights",
+        TITLE,
+        lead,
+        compared=compared,
+        tables=tables if compared.previous else [],
+        charts=trend_charts(nights),
+    )
+
+
+def change_table(caption: str, changes: Sequence[Change]) -> Table | None:
+    """Metrics that moved, before and now."""
+    rows = [
+        [code(change.metric), interval(None if was is None else asdict(was), 3), interval(asdict(change.present), 3)]
+        for change in changes
+        for was in [change.previous]
+    ]
+    return Table(("Metric", "Night before", "This night"), rows, [1, 2], caption) if rows else None
+
+
+def trend_charts(nights: Sequence[Night]) -> list[Markup]:
+    """Headline metrics over the nights: one chart per metric and split, a line per method."""
+    names = sorted({name for night in nights for name in night.metrics})
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        parts = name.split("/")
+        if len(parts) == 4 and parts[3].startswith(HEADLINES):
+            grouped.setdefault((f"{parts[0]}, {parts[1]}", parts[3]), []).append(name)
+    charts = []
+    for (where, metric), members in sorted(grouped.items())[:MOST_CHARTS]:
+        series = []
+        for index, name in enumerate(members[:8]):
+            points = [(float(i + 1), night.metrics[name]) for i, night in enumerate(nights) if name in night.metrics]
+            means, low, high = ([getattr(v, key) for _, v in points] for key in ("mean", "low", "high"))
+            x = [place for place, _ in points]
+            series.append(Series(name.split("/")[2], x, means, low, high, colour=f"c{index}", markers=True))
+        charts.append(
+            line_chart(
+                series, title=f"{words(metric)} ({where})", y_label=metric,
+                x_label=f"night ({nights[0].night} to {nights[-1].night})",
+                x_ticks=[float(i + 1) for i in range(0, len(nights), max(1, len(nights) // 8))],
+            )
+        )  # fmt: skip
+    return charts

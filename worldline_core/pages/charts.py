@@ -1,0 +1,197 @@
+"""Charts as inline SVG: they follow the page's theme, fit a phone, print well, and their bytes are reproducible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from worldline_core.pages.page import MINUS, NARROW_SPACE, number, percent, render_macro
+
+WIDTH, HEIGHT = 480, 270
+LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 30
+VALUE_WIDTH = 70
+"""Room for the number at the right end of a row."""
+ROW_HEIGHT = 46
+CHARACTER = 7.4
+"""Mean width of a letter of a row's label, in the chart's units."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line: points, optionally an interval around each, and a colour class (`c0` .. `c7`)."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] | None = None
+    high: Sequence[float] | None = None
+    colour: str = "c0"
+    dashed: bool = False
+    markers: bool = False
+    faint: bool = False
+    """A raw curve behind its smoothed one: thin, pale, without an entry in the legend."""
+
+
+@dataclass(frozen=True)
+class Dot:
+    """One row of an interval chart."""
+
+    label: str
+    value: float
+    low: float | None = None
+    high: float | None = None
+    colour: str = "c0"
+
+
+def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
+    """Round numbers that cover a range."""
+    if not math.isfinite(low) or not math.isfinite(high) or low == high:
+        return [low]
+    raw = (high - low) / max(wanted, 1)
+    magnitude = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * magnitude for m in (1, 2, 2.5, 5, 10) if m * magnitude >= raw * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return [round(i * step, 12) for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def tick_label(value: float) -> str:
+    """A short number for an axis."""
+    if value and (abs(value) >= 1e5 or abs(value) < 1e-3):
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{value:,.6g}".replace(",", NARROW_SPACE).replace("-", MINUS)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A linear or logarithmic map from values to the chart's units."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+    log: bool = False
+
+    def at(self, value: float) -> float:
+        """Where a value is drawn; values outside of the range are drawn at its edge."""
+        value = min(max(float(value), self.low), self.high)
+        low, high, value = (math.log10(max(v, 1e-300)) if self.log else v for v in (self.low, self.high, value))
+        share = 0.5 if high == low else (value - low) / (high - low)
+        return round(self.start + share * (self.stop - self.start), 2)
+
+    def ticks(self, wanted: int = 5) -> list[float]:
+        decades = math.log10(self.high / self.low) if self.log else 0.0
+        if decades < 0.5:
+            return nice_ticks(self.low, self.high, wanted)
+        exponents = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+        factors = (1,) if decades > 3 else (1, 3) if decades > 1.3 else (1, 2, 3, 5, 7)
+        ticks = [m * 10.0**e for e in exponents for m in factors]
+        return [t for t in ticks if self.low * 0.999 <= t <= self.high * 1.001]
+
+
+def value_range(series: Sequence[Series], log: bool) -> tuple[float, float]:
+    """Range of all finite values with a little air; logarithmic ranges look at positive values only."""
+    values = [float(v) for s in series for part in (s.y, s.low or (), s.high or ()) for v in part if math.isfinite(v)]
+    values = [v for v in values if v > 0] if log else values
+    if not values:
+        return (0.1, 1.0) if log else (0.0, 1.0)
+    low, high = min(values), max(values)
+    if log:
+        return low / 1.15, high * 1.15
+    air = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    return low - air, high + air
+
+
+def line_chart(
+    series: Sequence[Series],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    log_y: bool = False,
+    log_x: bool = False,
+    y_range: tuple[float, float] | None = None,
+    x_ticks: Sequence[float] | None = None,
+    in_percent: bool = False,
+) -> Markup:
+    """Lines with optional interval bands and a legend below the title.
+
+    Args:
+        log_y, log_x: logarithmic axes; values that are not positive are left out.
+        x_ticks: where the x axis is labelled (default: round numbers).
+        in_percent: y values are shares and are labelled in per cent.
+    """
+    xs = [float(v) for s in series for v in s.x if math.isfinite(v) and (not log_x or v > 0)]
+    x_axis = Axis(min(xs, default=0.0), max(xs, default=1.0), LEFT, WIDTH - RIGHT, log_x)
+    y_axis = Axis(*(y_range or value_range(series, log_y)), HEIGHT - BOTTOM, TOP, log_y)
+    rows = [(y_axis.at(v), percent(v) if in_percent else tick_label(v)) for v in y_axis.ticks()]
+    columns = [(x_axis.at(v), tick_label(v)) for v in (x_axis.ticks(6) if x_ticks is None else x_ticks)]
+    legend = [item for item in series if not item.faint]
+    return render_macro(
+        "pages/charts.html", "lines", title=title, x_label=x_label, y_label=y_label, rows=rows, columns=columns,
+        lines=[_line(item, x_axis, y_axis) for item in series], legend=legend if len(legend) > 1 else [],
+        width=WIDTH, height=HEIGHT, left=LEFT, right=WIDTH - RIGHT, bottom=HEIGHT - BOTTOM,
+    )  # fmt: skip
+
+
+def _line(item: Series, x_axis: Axis, y_axis: Axis) -> dict[str, object]:
+    """The points of one series as SVG's attribute texts: the line, its band, and single points with their tooltips."""
+    usable = [
+        i
+        for i, (x, y) in enumerate(zip(item.x, item.y, strict=True))
+        if math.isfinite(x) and math.isfinite(y) and (not y_axis.log or y > 0) and (not x_axis.log or x > 0)
+    ]
+
+    def points(values: Sequence[float]) -> list[str]:
+        return [f"{x_axis.at(item.x[i]):g},{y_axis.at(values[i]):g}" for i in usable]
+
+    band = ""
+    if item.low is not None and item.high is not None and len(usable) > 1:
+        band = " ".join(points(item.low) + points(item.high)[::-1])
+    dots = [
+        (x_axis.at(item.x[i]), y_axis.at(item.y[i]), f"{item.label}: {tick_label(item.x[i])}, {item.y[i]:.4g}")
+        for i in (usable if item.markers or len(usable) == 1 else ())
+    ]
+    line = " ".join(points(item.y)) if len(usable) > 1 else ""
+    return {"style": item, "line": line, "band": band, "dots": dots}
+
+
+def interval_chart(
+    dots: Sequence[Dot], *, title: str, value_label: str, zero_line: bool = False, digits: int = 3, signed: bool = False
+) -> Markup:
+    """Dots with interval whiskers below their labels, a row each: comparisons with their uncertainty."""
+    values = [v for d in dots for v in (d.value, d.low, d.high) if v is not None and math.isfinite(v)]
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    if zero_line:
+        low, high = min(low, 0.0), max(high, 0.0)
+    air = 0.08 * (high - low) or 0.1
+    axis = Axis(low - air, high + air, 8, WIDTH - VALUE_WIDTH)
+    bottom = 8 + ROW_HEIGHT * len(dots)
+    rows = [
+        {
+            "dot": dot, "top": 8 + ROW_HEIGHT * i, "at": axis.at(dot.value),
+            "ends": None if dot.low is None or dot.high is None else (axis.at(dot.low), axis.at(dot.high)),
+            "shown": number(float(dot.value), digits, signed=signed),
+        }
+        for i, dot in enumerate(dots)
+    ]  # fmt: skip
+    return render_macro(
+        "pages/charts.html", "dots", title=title, x_label=value_label, rows=rows, bottom=bottom, width=WIDTH,
+        zero=axis.at(0.0) if zero_line else None, ticks=[(axis.at(v), tick_label(v)) for v in axis.ticks(4)],
+    )  # fmt: skip
+
+
+def funnel_chart(steps: Sequence[tuple[str, int]], *, title: str) -> Markup:
+    """Bars below their labels that shrink from what was found to what was kept, with counts and shares."""
+    most = max((count for _, count in steps), default=1) or 1
+    rows = [
+        {
+            "label": label, "top": 4 + ROW_HEIGHT * i, "length": max(1.0, round((WIDTH - 8) * count / most, 2)),
+            "count": number(count), "share": percent(count / most),
+        }
+        for i, (label, count) in enumerate(steps)
+    ]  # fmt: skip
+    height = 8 + ROW_HEIGHT * len(steps)
+    return render_macro("pages/charts.html", "bars", title=title, rows=rows, height=height, width=WIDTH)
