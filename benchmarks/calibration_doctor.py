@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.diagnosis import Diagnosis
 from worldline_core.calibration.observation import small_gray
@@ -26,8 +27,6 @@ from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     applicable,
     apply_conventions,
-    corrupt,
-    corrupted_image_frames,
 )
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from flows.command_line import main
+from tools.corrupted.conventions import corrupt
 from worldline_core.calibration.check import ListedEpisode, check_calibration, combined_conventions, repairing_lines
 from worldline_core.calibration.check_report import as_json, cautions, page, plain, table_text
 from worldline_core.calibration.diagnosis import (
@@ -22,7 +23,7 @@ from worldline_core.calibration.diagnosis import (
     SetFinding,
     ViewMeasures,
 )
-from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, corrupt
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.guards.rejection import RejectedInputError

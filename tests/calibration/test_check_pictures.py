@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import pictures
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, VerdictName, ViewMeasures
@@ -19,7 +20,7 @@ from worldline_core.calibration.pictures import (
     recorded_tracks,
     telling_moments,
 )
-from worldline_core.data.episodes.conventions import RecordedConventions, corrupt, corrupted_image_frames
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
     arm_blocks,
-    corrupt,
-    corrupted_image_frames,
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode

@@ -12,9 +12,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from tools.corrupted.conventions import corrupt
 from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
 from worldline_core.calibration.diagnosis import Diagnosis
-from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment

@@ -11,10 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.conventions import RecordedConventions, corrupt, corrupted_image_frames
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes

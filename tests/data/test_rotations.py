@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tools.corrupted.conventions import written_as_moving, written_as_wxyz
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
@@ -24,8 +25,6 @@ from worldline_core.geometry.rotations import (
     rotation_deviation,
     rotation_from_euler_moving_xyz,
     rotation_from_quaternion_wxyz,
-    written_as_moving,
-    written_as_wxyz,
 )
 from worldline_core.geometry.transforms import (
     pose_from_euler_fixed_xyz,

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldline_core.data.episodes.conventions import RecordedConventions, corrupt
+from tools.corrupted.conventions import corrupt
+from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails

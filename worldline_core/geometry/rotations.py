@@ -181,22 +181,12 @@ def reread_as_wxyz(rotation: np.ndarray) -> np.ndarray:
     return rotation_from_quaternion_wxyz(quaternion_xyzw_from_rotation(rotation))
 
 
-def written_as_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when they are written wxyz and read as xyzw."""
-    return rotation_from_quaternion_xyzw(quaternion_wxyz_from_rotation(rotation))
-
-
 def reread_as_moving(rotation: np.ndarray) -> np.ndarray:
     """The true rotations (..., 3, 3) where Euler angles about moving axes were read as angles about fixed ones.
 
     At pitch = +-90 degrees the angles are not unique and the result is one of several.
     """
     return rotation_from_euler_moving_xyz(euler_fixed_xyz_from_rotation(rotation))
-
-
-def written_as_moving(rotation: np.ndarray) -> np.ndarray:
-    """What rotations (..., 3, 3) become when their angles are written about moving axes and read about fixed ones."""
-    return rotation_from_euler_fixed_xyz(euler_moving_xyz_from_rotation(rotation))
 
 
 def _matrix(rows: list[list[np.ndarray]]) -> np.ndarray:

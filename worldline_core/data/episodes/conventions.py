@@ -1,10 +1,8 @@
-"""How a source wrote its numbers where it departs from the contract, how to undo that, and how to do it on purpose.
+"""How a source wrote its numbers where it departs from the contract, and how to undo that.
 
-The contract (`worldline_core.data.episodes.episode`): `T_base_camera` maps camera points to base, cameras have OpenCV axes, metres,
-radians, quaternions xyzw, state blocks left then right, tool poses between the fingertips, K at the image's own size,
+The contract (`worldline_core.data.episodes.episode`): `T_base_camera` maps camera points to base, cameras have OpenCV axes,
+metres, radians, quaternions xyzw, state blocks left then right, tool poses between the fingertips, K at the image's own size,
 all arrays of one frame from one instant, gripper 0 closed .. 1 open.
-
-What an episode must have for a convention to say anything about it.
 """
 
 from __future__ import annotations
@@ -20,15 +18,15 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.geometry.rotations import (
-    quaternion_wxyz_from_rotation,
+    quaternion_xyzw_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
-    rotation_from_quaternion_wxyz,
-    written_as_moving,
-    written_as_wxyz,
+    rotation_from_quaternion_xyzw,
 )
 from worldline_core.geometry.transforms import rigid_inverse
 
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+# What an episode must have for a convention to say anything about it.
 _NEEDS = {
     **dict.fromkeys(("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size"), "a calibrated camera"),
     "camera_lag_frames": "a calibrated camera that moves",
@@ -81,9 +79,6 @@ def applicable(episode: Episode, field: str) -> bool:
         equal = len(blocks) == 2 and len(blocks[0]) == len(blocks[1])
         return equal and (episode.T_base_ee is None or episode.T_base_ee.shape[1] == 2)
     return field == "image_lag_frames" or bool(blocks)
-
-
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class RecordedConventions(StrictModel):
@@ -152,14 +147,8 @@ class RecordedConventions(StrictModel):
 
 def image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
     """Which recorded images belong to the frames of the repaired episode, in order."""
-    first, last = _kept(num_frames, conventions)
+    first, last = frames_with_all(num_frames, conventions)
     return slice(first + conventions.image_lag_frames, last + conventions.image_lag_frames)
-
-
-def corrupted_image_frames(num_frames: int, conventions: RecordedConventions) -> slice:
-    """Which images of a healthy episode belong to the frames of `corrupt(episode, conventions)`, in order."""
-    first, last = _kept(num_frames, _backwards(conventions))
-    return slice(first - conventions.image_lag_frames, last - conventions.image_lag_frames)
 
 
 def apply_conventions(episode: Episode, conventions: RecordedConventions) -> Episode:
@@ -173,55 +162,27 @@ def apply_conventions(episode: Episode, conventions: RecordedConventions) -> Epi
             example a quaternion order where no tool poses are recorded; (too_short): a lag leaves fewer than two frames.
     """
     check_applicable(episode, conventions.departures)
-    episode = _shift(episode, conventions)
+    episode = shift(episode, conventions)
     episode = replace(episode, cameras={v: _repair_camera(c, conventions) for v, c in episode.cameras.items()})
     if conventions.angle_unit == "deg":
-        episode = _scale_joints(episode, np.pi / 180)
-    offset = _source_offset(episode)
+        episode = scale_joints(episode, np.pi / 180)
+    offset = source_offset(episode)
     poses = episode.T_base_ee
     if poses is not None:
         poses = along_tool_z(poses, -offset)
-        poses = _scaled(poses, 1e-3 if conventions.pose_unit == "mm" else 1.0)
+        poses = scaled(poses, 1e-3 if conventions.pose_unit == "mm" else 1.0)
         if conventions.quaternion == "wxyz":
-            poses = _rotated(poses, reread_as_wxyz(poses[..., :3, :3]))
+            poses = rotated(poses, reread_as_wxyz(poses[..., :3, :3]))
         if conventions.euler == "moving_xyz":
-            poses = _rotated(poses, reread_as_moving(poses[..., :3, :3]))
+            poses = rotated(poses, reread_as_moving(poses[..., :3, :3]))
         poses = along_tool_z(poses, offset + conventions.tool_offset_z_m)
         episode = replace(episode, T_base_ee=poses)
-    episode = _pose_columns(episode, conventions, undo=True)
+    if {"pose_unit", "quaternion", "euler"} & set(conventions.departures):
+        scale = 1e-3 if conventions.pose_unit == "mm" else 1.0
+        episode = pose_columns(episode, scale, lambda xyzw: _reread(xyzw, conventions))
     if conventions.arms == "exchanged":
-        episode = _exchange_arms(episode)
-    return _invert_gripper(episode) if conventions.gripper == "inverted" else episode
-
-
-def corrupt(episode: Episode, conventions: RecordedConventions) -> Episode:
-    """The reverse: a healthy episode as a source with these conventions would hand it over, read as the contract.
-
-    `apply_conventions(corrupt(e, c), c)` is e, up to rounding and to the frames that a lag loses at the ends;
-    `corrupted_image_frames` says which images go with it.
-
-    Raises: RejectedInputError as `apply_conventions`.
-    """
-    check_applicable(episode, conventions.departures)
-    if conventions.gripper == "inverted":
-        episode = _invert_gripper(episode)
-    if conventions.arms == "exchanged":
-        episode = _exchange_arms(episode)
-    episode = _pose_columns(episode, conventions, undo=False)
-    offset = _source_offset(episode)
-    poses = episode.T_base_ee
-    if poses is not None:
-        poses = along_tool_z(poses, -offset - conventions.tool_offset_z_m)
-        if conventions.euler == "moving_xyz":
-            poses = _rotated(poses, written_as_moving(poses[..., :3, :3]))
-        if conventions.quaternion == "wxyz":
-            poses = _rotated(poses, written_as_wxyz(poses[..., :3, :3]))
-        poses = _scaled(poses, 1e3 if conventions.pose_unit == "mm" else 1.0)
-        episode = replace(episode, T_base_ee=along_tool_z(poses, offset))
-    if conventions.angle_unit == "deg":
-        episode = _scale_joints(episode, 180 / np.pi)
-    episode = replace(episode, cameras={v: _corrupt_camera(c, conventions) for v, c in episode.cameras.items()})
-    return _shift(episode, _backwards(conventions))
+        episode = exchange_arms(episode)
+    return invert_gripper(episode) if conventions.gripper == "inverted" else episode
 
 
 def along_tool_z(poses: np.ndarray, offset_m: float) -> np.ndarray:
@@ -234,9 +195,9 @@ def along_tool_z(poses: np.ndarray, offset_m: float) -> np.ndarray:
 def _repair_camera(camera: CameraTrack, conventions: RecordedConventions) -> CameraTrack:
     if conventions.views is not None and camera.view not in conventions.views:
         return camera
-    poses = _scaled(camera.T_base_camera, 1e-3 if conventions.extrinsics_unit == "mm" else 1.0)
+    poses = scaled(camera.T_base_camera, 1e-3 if conventions.extrinsics_unit == "mm" else 1.0)
     poses = rigid_inverse(poses) if conventions.extrinsics == "base_to_camera" else poses
-    poses = poses @ _OPENGL if conventions.camera_axes == "opengl" else poses
+    poses = poses @ OPENGL_AXES if conventions.camera_axes == "opengl" else poses
     K = camera.K
     if conventions.intrinsics_size is not None:
         height, width = conventions.intrinsics_size
@@ -244,37 +205,24 @@ def _repair_camera(camera: CameraTrack, conventions: RecordedConventions) -> Cam
     return replace(camera, K=K, T_base_camera=poses)
 
 
-def _corrupt_camera(camera: CameraTrack, conventions: RecordedConventions) -> CameraTrack:
-    if conventions.views is not None and camera.view not in conventions.views:
-        return camera
-    K = camera.K
-    if conventions.intrinsics_size is not None:
-        height, width = conventions.intrinsics_size
-        K = camera.resized(width, height).K
-    poses = camera.T_base_camera
-    poses = poses @ _OPENGL if conventions.camera_axes == "opengl" else poses
-    poses = rigid_inverse(poses) if conventions.extrinsics == "base_to_camera" else poses
-    poses = _scaled(poses, 1e3 if conventions.extrinsics_unit == "mm" else 1.0)
-    return replace(camera, K=K, T_base_camera=poses)
+def _reread(xyzw: np.ndarray, conventions: RecordedConventions) -> np.ndarray:
+    """The true quaternions (..., 4) of a state, whose columns are in the order of the file."""
+    if conventions.quaternion == "wxyz":
+        xyzw = np.roll(xyzw, -1, axis=-1)
+    return turned(xyzw, reread_as_moving) if conventions.euler == "moving_xyz" else xyzw
 
 
-def _backwards(conventions: RecordedConventions) -> RecordedConventions:
-    return RecordedConventions(
-        camera_lag_frames=-conventions.camera_lag_frames, image_lag_frames=-conventions.image_lag_frames
-    )
-
-
-def _kept(num_frames: int, conventions: RecordedConventions) -> tuple[int, int]:
+def frames_with_all(num_frames: int, conventions: RecordedConventions) -> tuple[int, int]:
     """First and end (exclusive) of the state frames for which camera pose and image exist."""
     lags = (0, conventions.camera_lag_frames, conventions.image_lag_frames)
     return max(0, -min(lags)), num_frames - max(0, *lags)
 
 
-def _shift(episode: Episode, conventions: RecordedConventions) -> Episode:
+def shift(episode: Episode, conventions: RecordedConventions) -> Episode:
     """State i with the camera pose of i + camera_lag_frames; frames without one are cut."""
     if conventions.camera_lag_frames == 0 and conventions.image_lag_frames == 0:
         return episode
-    first, last = _kept(episode.num_frames, conventions)
+    first, last = frames_with_all(episode.num_frames, conventions)
     if last - first < 2:
         raise RejectedInputError(
             "too_short",
@@ -293,7 +241,8 @@ def _shift(episode: Episode, conventions: RecordedConventions) -> Episode:
     return replace(cut, cameras=cameras, video_frames=with_images)
 
 
-def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+def scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+    """Poses (..., 4, 4) with their places scaled."""
     if scale == 1.0:
         return poses
     result = poses.copy()
@@ -301,19 +250,20 @@ def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
     return result
 
 
-def _rotated(poses: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def rotated(poses: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) with other rotations (..., 3, 3)."""
     result = poses.copy()
     result[..., :3, :3] = rotation
     return result
 
 
-def _source_offset(episode: Episode) -> float:
+def source_offset(episode: Episode) -> float:
     """Offset along z that the source's reader already added to the recorded poses [m]."""
-    value = episode.conventions.get("tool_offset_m", 0.0)
-    return float(value)
+    return float(episode.conventions.get("tool_offset_m", 0.0))
 
 
-def _scale_joints(episode: Episode, scale: float) -> Episode:
+def scale_joints(episode: Episode, scale: float) -> Episode:
+    """The state's columns except grippers, scaled."""
     grippers = {block[-1] for block in arm_blocks(episode)}
     joints = [i for i in range(episode.state.shape[1]) if i not in grippers]
     state, action = episode.state.copy(), episode.action.copy()
@@ -322,7 +272,8 @@ def _scale_joints(episode: Episode, scale: float) -> Episode:
     return replace(episode, state=state, action=action)
 
 
-def _exchange_arms(episode: Episode) -> Episode:
+def exchange_arms(episode: Episode) -> Episode:
+    """The left block, tool and gripper as the right one's, and the reverse."""
     first, second = arm_blocks(episode)
     order = [*second, *first]
     return replace(
@@ -334,7 +285,8 @@ def _exchange_arms(episode: Episode) -> Episode:
     )
 
 
-def _invert_gripper(episode: Episode) -> Episode:
+def invert_gripper(episode: Episode) -> Episode:
+    """Openings o as 1 - o."""
     columns = [block[-1] for block in arm_blocks(episode)]
     state, action = episode.state.copy(), episode.action.copy()
     state[:, columns] = 1 - state[:, columns]
@@ -344,34 +296,24 @@ def _invert_gripper(episode: Episode) -> Episode:
     )
 
 
-def _pose_columns(episode: Episode, conventions: RecordedConventions, *, undo: bool) -> Episode:
-    """The same for the pose columns (x y z qx qy qz qw a block) of a state of tool poses."""
-    changes = (conventions.pose_unit == "mm", conventions.quaternion == "wxyz", conventions.euler == "moving_xyz")
-    if episode.state_kind != "ee_pose" or not any(changes):
+def pose_columns(episode: Episode, scale: float, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
+    """A state of tool poses with the places of its blocks (x y z qx qy qz qw) scaled and their quaternions changed."""
+    if episode.state_kind != "ee_pose":
         return episode
     names = episode.state_names or ()
-    arrays = []
+    arrays: list[np.ndarray] = []
     for values in (episode.state, episode.action):
         result = values.astype(np.float64)
         for block in arm_blocks(episode):
             column = {names[i].rsplit("/", 1)[-1]: i for i in block}
-            if changes[0]:
-                result[:, [column[axis] for axis in "xyz" if axis in column]] *= 1e-3 if undo else 1e3
+            result[:, [column[axis] for axis in "xyz" if axis in column]] *= scale
             if all(name in column for name in ("qx", "qy", "qz", "qw")):
                 xyzw = [column[name] for name in ("qx", "qy", "qz", "qw")]
-                result[:, xyzw] = _requaternion(result[:, xyzw], changes[1], changes[2], undo=undo)
+                result[:, xyzw] = change(result[:, xyzw])
         arrays.append(result.astype(values.dtype))
     return replace(episode, state=arrays[0], action=arrays[1])
 
 
-def _requaternion(xyzw: np.ndarray, reorder: bool, moving: bool, *, undo: bool) -> np.ndarray:
-    if moving and not undo:
-        xyzw = _turned(xyzw, written_as_moving)
-    if reorder:
-        xyzw = np.roll(xyzw, -1 if undo else 1, axis=-1)
-    return _turned(xyzw, reread_as_moving) if moving and undo else xyzw
-
-
-def _turned(xyzw: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    rotation = rotation_from_quaternion_wxyz(np.roll(xyzw, 1, axis=-1))
-    return np.roll(quaternion_wxyz_from_rotation(change(rotation)), -1, axis=-1)
+def turned(xyzw: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Quaternions (..., 4) whose rotation matrices are changed."""
+    return quaternion_xyzw_from_rotation(change(rotation_from_quaternion_xyzw(xyzw)))
