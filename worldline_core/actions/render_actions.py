@@ -30,8 +30,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
-from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
 from worldline_core.scale.account import InputRow, check_account, write_account
@@ -59,26 +58,6 @@ class RenderActionsConfig(StrictModel):
     preview_rows: int = Field(4, ge=1)
     sigma_px_ref: float = Field(SIGMA_PX_REFERENCE, gt=0)
     episodes_per_shard: int = Field(256, ge=1)
-
-
-class KinematicsByName:
-    """Kinematics of each embodiment, built once; a failure is remembered, not repeated."""
-
-    def __init__(self, config: RenderActionsConfig) -> None:
-        self.config = config
-        self._built: dict[str, ArmKinematics | WorldLineError] = {}
-
-    def get(self, name: str) -> ArmKinematics:
-        if name not in self._built:
-            try:
-                embodiment = load_embodiment(name, self.config.description_paths.get(name))
-                self._built[name] = ArmKinematics(embodiment)
-            except (ConfigError, DataError, UnavailableError) as error:
-                self._built[name] = error
-        result = self._built[name]
-        if isinstance(result, WorldLineError):
-            raise result
-        return result
 
 
 def _reason(error: WorldLineError) -> str:
@@ -124,7 +103,7 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
 
     @cached_property
     def _kinematics(self) -> KinematicsByName:
-        return KinematicsByName(self.config)
+        return KinematicsByName(self.config.description_paths)
 
     def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
         done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()

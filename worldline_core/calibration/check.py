@@ -1,19 +1,15 @@
 """`worldline calibrate check`: every episode of a source or a set diagnosed, pictured, and summed up.
 
 Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here: the
-result is a line for the source's configuration.
-
-`worldline calibrate check` without the command line: what to look at, where to write, what to print.
-
-The episodes that a calibration check looks at, and the configuration line that repairs what is found of them.
+result is a line for the source's configuration (`repairing_lines`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -24,22 +20,26 @@ from worldline_core.calibration.diagnosis import CalibrationCheck, Diagnosis, Ex
 from worldline_core.calibration.pictures import diagnosis_picture
 from worldline_core.config import apply_overrides, read_yaml, validate
 from worldline_core.data.curation.checks import check_camera, check_times, check_values
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.sources.open import open_source
 from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode import Episode
-    from worldline_core.geometry.kinematics import ArmKinematics
-
-
 CONVENTIONS_KEY = "curate.sources[].conventions"
 ADDING = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
+"""Conventions that add up when they are declared and found again."""
 UNDOING = ("extrinsics", "camera_axes", "arms", "gripper")
+"""Conventions that undo themselves when applied twice."""
+OUTPUT_ROOT = Path("artifacts") / "calibration"
+TIME_TOLERANCE_FRAMES = 0.25
 
 
 @dataclass(frozen=True)
@@ -115,27 +115,19 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
         ConfigError: the file has no such section, or a mistake in it.
         DataError: a source cannot be opened.
     """
-    from worldline_core.data.curation.curate_config import CurateConfig
-    from worldline_core.data.sources.open import open_source
-
     values = apply_overrides(read_yaml(path), overrides)
     if not values.get("curate"):
         raise ConfigError("The file configures no source", where=path, expected="a section `curate` with `sources`")
     config = validate(CurateConfig, values["curate"], where=f"{path}: curate")
-    rendering = values.get("render_actions") or {}
-    descriptions = rendering.get("description_paths") or {}
+    descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
     listed: list[ListedEpisode] = []
     for number, source_config in enumerate(config.sources):
         source = open_source(source_config, source_config.path)
         prefix = f"curate.sources[{number}].conventions"
         for episode_id in filter(source_config.includes, source.episode_ids()):
-            load = _loader(source.load, episode_id)
+            load = partial(source.load, episode_id)
             listed.append(ListedEpisode(episode_id, source_config.label, load, prefix, source_config.conventions))
     return listed, {str(name): str(file) for name, file in descriptions.items()}
-
-
-def _loader(load: Callable[[str], LoadedEpisode], episode_id: str) -> Callable[[], LoadedEpisode]:
-    return lambda: load(episode_id)
 
 
 def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
@@ -144,8 +136,6 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
     Raises:
         DataError: the folder holds no readable index.
     """
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-
     episodes = EpisodeSet.open(folder)
 
     def load(position: int) -> LoadedEpisode:
@@ -156,10 +146,7 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
             lambda view: episodes.robot_masks(position, view),
         )
 
-    def loader(position: int) -> Callable[[], LoadedEpisode]:
-        return lambda: load(position)
-
-    return [ListedEpisode(row.episode_id, row.source, loader(i)) for i, row in enumerate(episodes.rows)]
+    return [ListedEpisode(row.episode_id, row.source, partial(load, i)) for i, row in enumerate(episodes.rows)]
 
 
 def chosen_episodes(listed: Sequence[ListedEpisode], wanted: Sequence[str]) -> list[ListedEpisode]:
@@ -179,41 +166,11 @@ def chosen_episodes(listed: Sequence[ListedEpisode], wanted: Sequence[str]) -> l
     return [item for item in listed if not wanted or item.episode_id in wanted]
 
 
-TIME_TOLERANCE_FRAMES = 0.25
-
-
-class _Kinematics:
-    """Kinematics by embodiment, built once; None, with the reason, where there are none."""
-
-    def __init__(self, descriptions: dict[str, str]) -> None:
-        self._descriptions = descriptions
-        self._built: dict[str, tuple[ArmKinematics | None, str]] = {}
-
-    def of(self, episode: Episode) -> tuple[ArmKinematics | None, str]:
-        """Kinematics of an episode's robot, where it has as many arms as the recording."""
-        built, note = self._get(episode.embodiment)
-        poses = episode.T_base_ee
-        if built is None or poses is None or poses.shape[1] == len(built.embodiment.arms):
-            return built, note
-        return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"
-
-    def _get(self, name: str) -> tuple[ArmKinematics | None, str]:
-        from worldline_core.geometry.embodiment import load_embodiment
-        from worldline_core.geometry.kinematics import ArmKinematics
-
-        if name not in self._built:
-            try:
-                self._built[name] = (ArmKinematics(load_embodiment(name, self._descriptions.get(name))), "")
-            except (ConfigError, DataError, UnavailableError) as error:
-                self._built[name] = (None, f"without kinematics of {name}: {error.what}")
-        return self._built[name]
-
-
 def check_calibration(
     listed: Sequence[ListedEpisode],
     output: Path,
     *,
-    descriptions: dict[str, str] | None = None,
+    descriptions: Mapping[str, str] | None = None,
     pictures: bool = True,
 ) -> CalibrationCheck:
     """Diagnose episodes one after another and write what was found.
@@ -225,7 +182,7 @@ def check_calibration(
     """
     if not listed:
         raise DataError("There are no episodes to check", next_step="see the source's path and its `include` patterns")
-    kinematics = _Kinematics(descriptions or {})
+    kinematics = KinematicsByName(descriptions or {})
     findings: list[Finding] = []
     with tqdm(listed, "calibrate check", unit="episode", disable=None) as progress:
         for item in progress:
@@ -237,7 +194,7 @@ def check_calibration(
     return check
 
 
-def _check_one(item: ListedEpisode, output: Path, kinematics: _Kinematics, pictures: bool) -> Finding:
+def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, pictures: bool) -> Finding:
     try:
         loaded = item.load()
         episode = loaded.episode
@@ -246,7 +203,7 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: _Kinematics, pictu
         for camera in episode.cameras.values():
             check_camera(episode, camera)
         frames = {view: _images(loaded, view) for view in loaded.views}
-        arms, note = kinematics.of(episode)
+        arms, note = _kinematics_of(episode, kinematics)
         notes = (note,) if note else ()
         diagnosis = diagnose(episode, frames, arms)
     except RejectedInputError as error:
@@ -265,6 +222,17 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: _Kinematics, pictu
         except DataError as error:
             notes = (*notes, f"no picture: {error.what}")
     return Finding(item.episode_id, item.source, diagnosis, None, "", lines, picture, notes)
+
+
+def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, str]:
+    """Kinematics of an episode's robot where it has as many arms as the recording; else None, and why."""
+    try:
+        built = kinematics.get(episode.embodiment)
+    except (ConfigError, DataError, UnavailableError) as error:
+        return None, f"without kinematics of {episode.embodiment}: {error.what}"
+    if episode.T_base_ee is None or episode.T_base_ee.shape[1] == len(built.embodiment.arms):
+        return built, ""
+    return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"
 
 
 def _images(loaded: LoadedEpisode, view: str) -> np.ndarray:
@@ -313,9 +281,6 @@ def _sum_up(listed: Sequence[ListedEpisode], findings: Sequence[Finding]) -> Ite
         except ConfigError as error:
             notes = (*summed.notes, f"{error.what}: {error.next_step}")
             yield SetFinding(replace(summed, notes=notes), ())
-
-
-OUTPUT_ROOT = Path("artifacts") / "calibration"
 
 
 def check_command(

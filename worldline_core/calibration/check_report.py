@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
 
@@ -20,8 +20,21 @@ from worldline_core.calibration.diagnosis import (
 )
 from worldline_core.pages.page import Table, render, words
 
-ORDER = ("unexplained", "explained", "unreadable", "too_little_evidence", "consistent")
+MEANINGS = {
+    "unexplained": "the recording disagrees with its calibration, and no usual mistake explains how",
+    "explained": "one usual mistake explains what is wrong; the line repairs it",
+    "unreadable": "the episode cannot be read",
+    "too_little_evidence": "too little moves, or too little is calibrated, to judge",
+    "consistent": "the recording agrees with its calibration",
+}
+"""By verdict, the worst first."""
+TONES = {
+    **dict.fromkeys(("unexplained", "explained", "unreadable"), "bad"),
+    "too_little_evidence": "",
+    "consistent": "good",
+}
 MEASURES = ("hand-eye", "camera lag", "image lag", "in view", "flow")
+_READINGS_SHOWN = 6
 
 
 def measures_shown(diagnosis: Diagnosis) -> dict[str, str]:
@@ -48,34 +61,37 @@ def measures_shown(diagnosis: Diagnosis) -> dict[str, str]:
 
 def table_text(check: CalibrationCheck) -> str:
     """The table of episodes, the conclusion over each source, and the lines that repair it."""
-    header = ["episode", "verdict", "best explanation", "score", "as recorded"]
-    rows = [[*header, *MEASURES]]
-    for finding in check.findings:
-        diagnosis = finding.diagnosis
-        if diagnosis is None:
-            rows.append([finding.episode_id, "unreadable", f"{finding.reason}: {finding.detail}"])
-            continue
-        shown = measures_shown(diagnosis)
-        scores = [f"{diagnosis.best.score:.1f}", f"{diagnosis.none.score:.1f}"]
-        verdict = diagnosis.verdict.replace("_", " ")
-        rows.append([finding.episode_id, verdict, diagnosis.best.mistake, *scores, *(shown[name] for name in MEASURES)])
-    widths = [max(len(row[i]) for row in rows if len(row) == len(rows[0])) for i in range(len(rows[0]))]
-    widths[0] = max(len(row[0]) for row in rows)
-    widths[1] = max(len(row[1]) for row in rows)
+    rows = [["episode", "verdict", "best explanation", "score", "as recorded", *MEASURES]]
+    refused: dict[int, str] = {}
+    for number, finding in enumerate(check.findings, 1):
+        rows.append(_table_row(finding))
+        if finding.diagnosis is None:
+            refused[number] = f"{finding.reason}: {finding.detail}"
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = []
-    for row in rows:
-        cells = [
-            text.ljust(w) if i < 3 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=False))
-        ]
+    for number, row in enumerate(rows):
+        cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
+        # The reason of an episode that cannot be read takes the place of all that was not measured.
+        cells[2:] = [refused[number]] if number in refused else cells[2:]
         lines.append("  ".join(cells).rstrip())
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join([*lines, "", *conclusion_lines(check)])
 
 
+def _table_row(finding: Finding) -> list[str]:
+    diagnosis = finding.diagnosis
+    if diagnosis is None:
+        return [finding.episode_id, finding.verdict, *[""] * (3 + len(MEASURES))]
+    scores = [f"{diagnosis.best.score:.1f}", f"{diagnosis.none.score:.1f}"]
+    shown = measures_shown(diagnosis)
+    verdict = words(finding.verdict)
+    return [finding.episode_id, verdict, diagnosis.best.mistake, *scores, *(shown[name] for name in MEASURES)]
+
+
 def conclusion_lines(check: CalibrationCheck) -> list[str]:
     """What all episodes say together."""
     counted = Counter(finding.verdict for finding in check.findings)
-    parts = [f"{counted[name]} {name.replace('_', ' ')}" for name in ORDER if counted[name]]
+    parts = [f"{counted[name]} {words(name)}" for name in MEANINGS if counted[name]]
     lines = [f"{len(check.findings)} episodes: {', '.join(parts)}"]
     for found in check.sets:
         lines += ["", set_headline(found.diagnosis), f"  single episodes say: {votes_text(found.diagnosis)}"]
@@ -100,7 +116,7 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
 def set_headline(found: SetDiagnosis) -> str:
     """The conclusion over a source in one line."""
     asis = next(e.score for e in found.ranked if e.mistake == "none")
-    start = f"source {found.source}, {found.num_episodes} episodes together: {found.verdict.replace('_', ' ')}"
+    start = f"source {found.source}, {found.num_episodes} episodes together: {words(found.verdict)}"
     if found.verdict == "explained":
         return f"{start} by {found.best.mistake} (score {found.best.score:.1f}, as recorded {asis:.1f})"
     return f"{start} (score as recorded {asis:.1f})"
@@ -109,7 +125,7 @@ def set_headline(found: SetDiagnosis) -> str:
 def votes_text(found: SetDiagnosis) -> str:
     """What the episodes say one by one, the most frequent first."""
     ordered = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in ordered) or "nothing"
+    return ", ".join(f"{words(name)} {count}" for name, count in ordered) or "nothing"
 
 
 def cautions(found: SetDiagnosis) -> list[str]:
@@ -194,66 +210,46 @@ def plain(value: Any) -> Any:
     return value
 
 
-MEANING = {
-    "consistent": "the recording agrees with its calibration",
-    "explained": "one usual mistake explains what is wrong; the line repairs it",
-    "unexplained": "the recording disagrees with its calibration, and no usual mistake explains how",
-    "too_little_evidence": "too little moves, or too little is calibrated, to judge",
-    "unreadable": "the episode cannot be read",
-}
-TONES = {"consistent": "good", "explained": "bad", "unexplained": "bad", "unreadable": "bad"}
-RANKED_SHOWN = 6
-
-
 def page(check: CalibrationCheck) -> str:
     """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
+    order = list(MEANINGS)
     counted = Counter(finding.verdict for finding in check.findings)
-    ordered = sorted(check.findings, key=lambda finding: (ORDER.index(finding.verdict), finding.episode_id))
+    findings = sorted(check.findings, key=lambda finding: (order.index(finding.verdict), finding.episode_id))
     return render(
         "calibration/check_page.html",
         title="Calibration check",
         subtitle=f"{len(check.findings)} episodes, judged by what they show.",
-        tiles=[(counted[name], name, MEANING[name]) for name in ORDER if counted[name]],
+        check=check,
+        findings=findings,
+        counted={name: counted[name] for name in order if counted[name]},
+        meanings=MEANINGS,
         tones=TONES,
-        conclusions=[
-            (set_headline(found.diagnosis), votes_text(found.diagnosis), cautions(found.diagnosis), found)
-            for found in check.sets
-        ],
-        episodes=_episode_table(ordered),
-        findings=[(finding, _ranked(finding)) for finding in ordered],
+        headline=set_headline,
+        votes=votes_text,
+        cautions=cautions,
+        readings=_readings,
+        episodes=Table(
+            ("Episode", "Verdict", "Best explanation", "Score", "As recorded", *MEASURES),
+            [_page_row(finding) for finding in findings],
+            numeric=range(3, 5 + len(MEASURES)),
+            caption="Log-likelihood scores: 0 is as a healthy recording, lower is worse.",
+        ),
     )
 
 
-def _tag(verdict: str) -> Markup:
-    return Markup('<span class="tag {}">{}</span>').format(TONES.get(verdict, ""), words(verdict))
-
-
-def _episode_table(findings: Sequence[Finding]) -> Table:
-    rows: list[list[object]] = []
-    for finding in findings:
-        tag = _tag(finding.verdict)
-        if (diagnosis := finding.diagnosis) is None:
-            rows.append([finding.episode_id, tag, finding.reason, None, None, *([None] * len(MEASURES))])
-            continue
-        shown = measures_shown(diagnosis)
-        link = Markup('<a href="#{0}">{0}</a>').format(finding.episode_id)
-        scores = [f"{diagnosis.best.score:.1f}", f"{diagnosis.none.score:.1f}"]
-        rows.append([link, tag, diagnosis.best.mistake, *scores, *(shown[name] for name in MEASURES)])
-    headings = ("Episode", "Verdict", "Best explanation", "Score", "As recorded", *MEASURES)
-    caption = "Log-likelihood scores: 0 is as a healthy recording, lower is worse."
-    return Table(headings, rows, range(3, len(headings)), caption)
-
-
-def _ranked(finding: Finding) -> Table | None:
-    """Readings that were tried, the likeliest first, with what speaks most against each."""
+def _page_row(finding: Finding) -> list[object]:
+    tag = Markup('<span class="tag {}">{}</span>').format(TONES[finding.verdict], words(finding.verdict))
     if finding.diagnosis is None:
-        return None
-    rows = [
-        [
-            e.mistake,
-            f"{e.score:.1f}",
-            ", ".join(f"{name} {value:.1f}" for name, value in sorted(e.evidence.items(), key=lambda i: i[1])[:4]),
-        ]
-        for e in finding.diagnosis.ranked[:RANKED_SHOWN]
-    ]
-    return Table(("Reading", "Score", "What costs it most"), rows, [1])
+        return [finding.episode_id, tag, finding.reason, *[None] * (2 + len(MEASURES))]
+    link = Markup('<a href="#{0}">{0}</a>').format(finding.episode_id)
+    return [link, tag, *_table_row(finding)[2:]]
+
+
+def _readings(diagnosis: Diagnosis) -> Table:
+    """The best readings that were tried, with the terms that cost each the most."""
+    rows = []
+    for explanation in diagnosis.ranked[:_READINGS_SHOWN]:
+        worst = sorted(explanation.evidence.items(), key=lambda item: item[1])[:4]
+        costs = ", ".join(f"{name} {value:.1f}" for name, value in worst)
+        rows.append([explanation.mistake, f"{explanation.score:.1f}", costs])
+    return Table(("Reading", "Score", "What costs it most"), rows, numeric=[1])

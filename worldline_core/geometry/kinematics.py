@@ -19,8 +19,8 @@ from pytorch_kinematics.frame import Frame, Joint, Link
 from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
-from worldline_core.errors import ConfigError, DataError
-from worldline_core.geometry.embodiment import Embodiment, read_description
+from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment, read_description
 from worldline_core.geometry.kinematic_tree import TreeBody, mounted, read_mjcf, read_urdf
 from worldline_core.geometry.transforms import invert
 
@@ -221,6 +221,33 @@ class ArmKinematics:
             if len(path) > 1:
                 parents[name] = path[-2]
         return parents
+
+
+class KinematicsByName:
+    """Kinematics of each embodiment, built once; a failure is remembered, not repeated.
+
+    Args:
+        description_paths: by embodiment, a kinematic description that is the user's own file.
+    """
+
+    def __init__(self, description_paths: Mapping[str, str]) -> None:
+        self._description_paths = description_paths
+        self._built: dict[str, ArmKinematics | WorldLineError] = {}
+
+    def get(self, name: str) -> ArmKinematics:
+        """Kinematics of an embodiment.
+
+        Raises: ConfigError, DataError or UnavailableError, as `load_embodiment` and `ArmKinematics`.
+        """
+        if name not in self._built:
+            try:
+                self._built[name] = ArmKinematics(load_embodiment(name, self._description_paths.get(name)))
+            except (ConfigError, DataError, UnavailableError) as error:
+                self._built[name] = error
+        result = self._built[name]
+        if isinstance(result, WorldLineError):
+            raise result
+        return result
 
 
 def chain_from_tree(tree: TreeBody) -> Chain:
