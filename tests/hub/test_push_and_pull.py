@@ -71,7 +71,7 @@ def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_
 
 
 def test_lerobot_reads_what_was_pulled(hub: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
+    from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 
     push(folder, PLACE)
     pull(PLACE, tmp_path / "back")

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from tools.corrupted import files
-from worldline_core.data.guards.limits import MAX_FRAMES
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError
 from worldline_core.data.video import clip as video_clip
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.encoder import encode_video

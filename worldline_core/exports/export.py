@@ -14,7 +14,7 @@ from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import with_rigid_poses
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
+from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.errors import ArtifactError, ConfigError, DataError

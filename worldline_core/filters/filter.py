@@ -23,13 +23,12 @@ import pyarrow as pa
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.lerobot.v3 import write_table
 from worldline_core.errors import DataError
 from worldline_core.filters.examine import examine
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
 FINDINGS_FILE = "findings.parquet"
 _FINDINGS = pa.schema(
@@ -93,7 +92,7 @@ def filter_episodes(
             got=", ".join(sorted({r.reason for r in rejected})),
             next_step="look at the numbers in quarantine.parquet and at the thresholds in filter",
         )
-    write_table(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=_FINDINGS))
+    write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=_FINDINGS))
     write_quarantine(output, rejected)
     write_index(output, rows)
     return {

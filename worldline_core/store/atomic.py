@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @contextmanager
@@ -36,6 +39,20 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
 def write_json_atomic(path: Path, value: Any) -> None:
     """Write JSON with sorted keys (equal values give equal bytes); NaN and infinities are refused."""
     write_bytes_atomic(path, (json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_table_atomic(path: Path, table: pa.Table, *, rows_per_group: Sequence[int] | None = None) -> None:
+    """Write a Parquet file; rows_per_group cuts it into row groups of these sizes."""
+    import pyarrow.parquet as pq
+
+    with (
+        atomic_path(path) as temporary,
+        pq.ParquetWriter(temporary, table.schema, compression="snappy") as writer,
+    ):
+        start = 0
+        for size in rows_per_group or [len(table)]:
+            writer.write_table(table.slice(start, size), row_group_size=max(size, 1))
+            start += size
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -19,8 +19,9 @@ from worldline_core.data.episodes.episode_index import QuarantineRow, read_index
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
 from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.plain_files import read_json
-from worldline_core.data.guards.rejection import RejectedInputError, check_id, unique_identity
+from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files, watch_run
+from worldline_core.data.sources.ids import check_id, unique_identity
 from worldline_core.data.sources.open import open_source
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.scale.account import InputRow, check_account, write_account

@@ -15,7 +15,7 @@ from worldline_core.data.episodes.episode import EpisodeLabels
 from worldline_core.data.guards.plain_files import read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import is_file
-from worldline_core.data.lerobot.v3 import write_table
+from worldline_core.store.atomic import write_table_atomic
 
 INDEX_FILE = "index.parquet"
 QUARANTINE_FILE = "quarantine.parquet"
@@ -91,7 +91,7 @@ class QuarantineRow:
 def write_index(root: Path, rows: Iterable[EpisodeRow]) -> None:
     """Write index.parquet."""
     listed = [asdict(row) | {"views": list(row.views)} for row in rows]
-    write_table(root / INDEX_FILE, pa.Table.from_pylist(listed, schema=_INDEX))
+    write_table_atomic(root / INDEX_FILE, pa.Table.from_pylist(listed, schema=_INDEX))
 
 
 def read_index(root: Path) -> list[EpisodeRow]:
@@ -141,7 +141,9 @@ def _shared_values(column: pa.ChunkedArray) -> list[Any]:
 def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:
     """Write quarantine.parquet, ordered by episode and reason."""
     ordered = sorted(rows, key=lambda row: (row.episode_id, row.source, row.reason))
-    write_table(root / QUARANTINE_FILE, pa.Table.from_pylist([asdict(row) for row in ordered], schema=_QUARANTINE))
+    write_table_atomic(
+        root / QUARANTINE_FILE, pa.Table.from_pylist([asdict(row) for row in ordered], schema=_QUARANTINE)
+    )
 
 
 def read_quarantine(root: Path) -> list[QuarantineRow]:

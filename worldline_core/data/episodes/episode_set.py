@@ -15,7 +15,7 @@ from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.sidecar import Sidecar
 from worldline_core.data.guards.plain_files import parse_json
 from worldline_core.data.guards.source_paths import inside
-from worldline_core.data.lerobot.v3 import IMAGE_PREFIX, LeRobotV3Dataset
+from worldline_core.data.lerobot.dataset import IMAGE_PREFIX, LeRobotV3Dataset
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
@@ -185,8 +185,8 @@ class EpisodeSet:
         """
         row = self._row_with(i, view)
         dataset, _ = self._open(i)
-        place = dataset.video(row.episode_index, IMAGE_PREFIX + view)
-        return VideoClip(place.path, row.video_frames, dataset.fps, place.from_time, row.start)
+        whole = dataset.clip(row.episode_index, IMAGE_PREFIX + view)
+        return replace(whole, num_frames=row.video_frames, skip=row.start)
 
     def thumbnails(self, i: int, view: str) -> ViewThumbnails:
         """Small grey images of a view of row i: those that curation left beside the set, else made from its video. They are

@@ -12,13 +12,11 @@ import pyarrow as pa
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
-from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, check_image_size, too_large
 from worldline_core.data.guards.plain_files import read_json, read_table, well_formed
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import is_file
-from worldline_core.data.lerobot.v3 import write_table
 from worldline_core.errors import DataError
-from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
 FOLDER = Path("meta") / "worldline"
 CONTRACT_VERSION = 1
@@ -80,11 +78,11 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
         if arms or part["video_frames"] != part["num_frames"]:
             values = {name: part.arrays[name].reshape(-1).tolist() for name in ARRAYS if name in part.arrays}
             trajectories.append({"episode_index": index, "num_frames": part["num_frames"], "num_arms": arms, **values})
-    write_table(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
+    write_table_atomic(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
     if masks:
-        write_table(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
+        write_table_atomic(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
     if trajectories:
-        write_table(folder / "trajectories.parquet", pa.Table.from_pylist(trajectories, schema=_TRAJECTORIES))
+        write_table_atomic(folder / "trajectories.parquet", pa.Table.from_pylist(trajectories, schema=_TRAJECTORIES))
     write_json_atomic(folder / "contract.json", contract(parts[0]))
 
 

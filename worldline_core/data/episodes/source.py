@@ -201,3 +201,11 @@ class GripperRange(StrictModel):
 def says_droid(*names: str) -> bool:
     """Whether one of the names of a dataset, its folder or its robot says that it is DROID, which is for evaluation only."""
     return any(_DROID.search(name) for name in names)
+
+
+def joint_names(arms: Mapping[str, int], *, gripper: bool = True) -> tuple[str, ...]:
+    """Names of state columns, from arm -> number of its joints: left/joint_1, ..., left/gripper, right/joint_1, ..."""
+    last = ["gripper"] if gripper else []
+    return tuple(
+        f"{arm}/{name}" for arm, joints in arms.items() for name in (*(f"joint_{j + 1}" for j in range(joints)), *last)
+    )

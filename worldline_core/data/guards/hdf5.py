@@ -19,9 +19,8 @@ import numpy as np
 
 from worldline_core.data.guards.hdf5_heap import check_entries
 from worldline_core.data.guards.images import decode_image
-from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, MAX_FRAMES, check_shape, regular_file, too_large
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, MAX_FRAMES, RejectedInputError, check_shape, too_large
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import UnavailableError
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)

@@ -13,8 +13,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from worldline_core.data.guards.limits import MAX_ARRAY_BYTES, too_large
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, RejectedInputError, too_large
 
 _LARGEST_OFFSET = 2**62
 _ENTRY = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")])

@@ -7,9 +7,8 @@ import struct
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.limits import MAX_PIXELS, check_image_size, regular_file, too_large
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
@@ -19,7 +18,7 @@ _LAST_BYTES = 256
 # Start-of-frame markers; C4, C8 and CC in their midst are tables and reserved.
 _START_OF_FRAME = {0xC0 + n for n in range(16)} - {0xC4, 0xC8, 0xCC}
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
-# An image takes at least a few bits a block: more is no image file.
+# An encoded image is never much larger than its pixels.
 _MAX_FILE_BYTES = 4 * MAX_PIXELS
 
 
@@ -102,11 +101,8 @@ def read_image(path: AnyPath) -> np.ndarray:
 
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
     """
-    file = regular_file(path, "Image")
+    file = regular_file(path, "Image", max_bytes=_MAX_FILE_BYTES)
     try:
-        size = file.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise too_large("Image file is too large", where=str(path), limit=_MAX_FILE_BYTES, got=size, unit="bytes")
         content = file.read_bytes()
     except OSError as error:
         raise RejectedInputError("unreadable", "Image cannot be read", where=str(path), got=str(error)) from error

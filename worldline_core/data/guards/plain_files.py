@@ -1,10 +1,7 @@
-"""JSON and JSON lines that are not to be trusted: bounded in size, no repeated keys, every fault named.
+"""Text, JSON, NumPy and Parquet files that are not to be trusted: bounded in size, and every fault is named.
 
-NaN and infinities are read as what they are: recorders write them, and the checks of values say where they stand.
-
-NumPy arrays in .npy files that are not to be trusted: what the header declares must be what the file holds.
-
-Parquet tables that are not to be trusted: rows and bytes are bounded, and every fault is named.
+JSON may repeat no key; NaN and infinities are read as what they are: recorders write them, and the checks of values say
+where they stand. A .npy file must hold what its header declares. Of Parquet tables rows and bytes are bounded.
 """
 
 from __future__ import annotations
@@ -21,16 +18,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.lib import format as npy
 
-from worldline_core.data.guards.limits import (
+from worldline_core.data.guards.rejection import (
     MAX_ARRAY_BYTES,
     MAX_ROWS,
     MAX_TABLE_BYTES,
     MAX_TEXT_BYTES,
-    regular_file,
+    RejectedInputError,
     too_large,
 )
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 
 def read_json(path: AnyPath) -> Any:
@@ -62,7 +58,7 @@ def parse_json(text: str | bytes, where: object) -> Any:
 
 
 def read_json_lines(path: AnyPath) -> Iterator[Any]:
-    """The values of a file with one JSON value a line; empty lines are skipped.
+    """The values of a file with one JSON value per line; empty lines are skipped.
 
     Raises: RejectedInputError as `read_json`, naming the line.
     """
@@ -71,17 +67,14 @@ def read_json_lines(path: AnyPath) -> Iterator[Any]:
             yield parse_json(line, f"{path}, line {number}")
 
 
-def read_text(path: AnyPath) -> str:
+def read_text(path: AnyPath, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
     """The text of a file.
 
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8).
     """
-    file = regular_file(path)
+    file = regular_file(path, "Text file", max_bytes=max_bytes)
     try:
-        size = file.stat().st_size
-        if size > MAX_TEXT_BYTES:
-            raise too_large("Text file is too large", where=str(path), limit=MAX_TEXT_BYTES, got=size, unit="bytes")
-        return file.read_text(encoding="utf-8")
+        return file.read_text(encoding=encoding)
     except (OSError, UnicodeDecodeError) as error:
         raise RejectedInputError(
             "unreadable", "File cannot be read as text", where=str(path), got=str(error)
@@ -144,8 +137,8 @@ def read_npy(path: AnyPath) -> np.ndarray:
         raise RejectedInputError("unreadable", "Array cannot be read", where=str(path), got=str(error)) from error
 
 
-# A dictionary of long texts unpacks to far more than the file says. No text is longer than its column chunk, so that
-# so many rows at a time are the largest surprise.
+# A dictionary of long texts unpacks to far more than the footer says. No text is longer than its column chunk, so tables
+# with texts are read in batches of so many rows that no batch exceeds the limit by much.
 _BATCH_BYTES = 256 << 20
 _BATCH_ROWS = (64, 65_536)
 _FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError, MemoryError)
@@ -195,7 +188,7 @@ def column_names(path: AnyPath) -> list[str]:
 
 
 def _check_size(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> None:
-    """By the footer: 8 bytes a value, which is what Arrow takes for numbers."""
+    """By the footer: 8 bytes per value, which is what Arrow takes for numbers."""
     footer = file.metadata
     if footer.num_rows > MAX_ROWS:
         raise too_large("Table has too many rows", where=str(path), limit=MAX_ROWS, got=footer.num_rows, unit="rows")

@@ -1,11 +1,13 @@
-"""Reasons why an input does not get through, as codes that are counted in the quarantine.
+"""Why an input is refused: the reasons, as codes that are counted in the quarantine, and how much it may declare.
 
-The ids that sources list, made unique and storable: they come from file names and metadata that nobody has checked.
+A header of some bytes can claim 30,000 x 30,000 pixels, 10^9 frames or 10^12 numbers. Readers compare what a file declares
+with these limits before they decode or allocate; none of them stands in the way of a real recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal, get_args
 
 from worldline_core.errors import DataError
@@ -48,6 +50,22 @@ Reason = Literal[
 ]
 REASONS: tuple[str, ...] = get_args(Reason)
 
+MAX_SIDE_PX = 16_384
+MAX_PIXELS = 40_000_000
+"""One image; 8K video has 33 million pixels."""
+MAX_FRAMES = 4_000_000
+"""One video file: 18 hours at 60 Hz. LeRobot joins episodes into files of some 100 MB, far below."""
+MAX_ROWS = 50_000_000
+"""One table."""
+MAX_TABLE_BYTES = 4 << 30
+"""One table in memory."""
+MAX_ARRAY_BYTES = 1 << 30
+"""One array: an hour at 30 Hz of 100 float64 columns is 0.1 GB."""
+MAX_TEXT_BYTES = 512 << 20
+"""One JSON or JSON lines file; 10^6 episodes of LeRobot v2.1 are about 150 MB."""
+MAX_CHUNK_BYTES = 256 << 20
+"""One compressed chunk of an MCAP file once unpacked; recorders write 1 to 10 MB."""
+
 
 class RejectedInputError(DataError):
     """A DataError that names the quarantine reason and carries the numbers that show it."""
@@ -68,64 +86,74 @@ class RejectedInputError(DataError):
         self.evidence: dict[str, Any] = dict(evidence or {})
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuild, (
-            self.reason,
-            self.what,
-            self.where,
-            self.expected,
-            self.got,
-            self.next_step,
-            self.evidence,
-        )
+        shown = {name: getattr(self, name) for name in ("where", "expected", "got", "next_step", "evidence")}
+        return partial(RejectedInputError, self.reason, self.what, **shown), ()
 
 
-def _rebuild(
-    reason: Reason,
-    what: str,
-    where: object,
-    expected: object,
-    got: object,
-    next_step: str | None,
-    evidence: dict[str, Any],
-) -> RejectedInputError:
+def too_large(what: str, *, where: object, limit: int, got: int, unit: str) -> RejectedInputError:
+    """The rejection of something that declares more than a limit."""
     return RejectedInputError(
-        reason, what, where=where, expected=expected, got=got, next_step=next_step, evidence=evidence
+        "too_large",
+        what,
+        where=where,
+        expected=f"at most {limit:,} {unit}",
+        got=f"{got:,} {unit}",
+        next_step="the file is damaged or hostile; if it is neither, cut the recording into shorter ones",
+        evidence={"declared": int(got), "limit": int(limit), "unit": unit},
     )
 
 
-MAX_LENGTH = 512
-
-
-def storable(episode_id: str) -> str:
-    """The id as text that every table and terminal can hold; one that already is stays as it is.
-
-    Bytes that are no UTF-8 and control characters are written as escapes, and the middle of a very long id is left out.
-    """
-    text = episode_id.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-    half = MAX_LENGTH // 2 - 2
-    return text if len(text) <= MAX_LENGTH else f"{text[:half]}...{text[-half:]}"
-
-
-def unique_identity(episode_id: str, source: int, taken: set[str]) -> str:
-    """A storable id that is not taken yet: a repeated one gets the number of its source, and of its repetition there."""
-    plain = identity = storable(episode_id) or f"unnamed#source.{source}"
-    count = 0
-    while identity in taken:
-        count += 1
-        identity = f"{plain}#source.{source}" + (f".{count}" if count > 1 else "")
-    return identity
-
-
-def check_id(episode_id: str, source: str) -> None:
-    """Raises: RejectedInputError (invalid_id) for an id that cannot be stored as it is."""
-    if storable(episode_id) != episode_id or not episode_id:
+def check_shape(what: str, where: object, found: Sequence[int], wanted: Sequence[int | None]) -> None:
+    """Raises: RejectedInputError (length_mismatch) for an array of another shape; None stands for any size but 0."""
+    fits = len(found) == len(wanted) and all(
+        size > 0 if want is None else size == want for size, want in zip(found, wanted, strict=True)
+    )
+    if not fits:
         raise RejectedInputError(
-            "invalid_id",
-            "Episode id cannot be stored",
-            where=source,
-            expected=f"1 to {MAX_LENGTH} printable characters of valid UTF-8",
-            got=ascii(episode_id[:200]),
-            next_step="rename the file or folder, or correct the metadata",
-            evidence={"characters": len(episode_id)},
+            "length_mismatch",
+            f"{what} has a wrong shape",
+            where=where,
+            expected=tuple("N" if want is None else want for want in wanted),
+            got=tuple(found),
+            evidence={"shape": list(found)},
+        )
+
+
+def check_image_size(width: int, height: int, where: object) -> None:
+    """Raises: RejectedInputError: too_large, or unreadable for an image without pixels."""
+    if width < 1 or height < 1:
+        raise RejectedInputError(
+            "unreadable", "Image has no pixels", where=where, expected="at least 1x1", got=f"{width}x{height}"
+        )
+    if max(width, height) > MAX_SIDE_PX:
+        raise too_large(
+            "Image side is too long", where=where, limit=MAX_SIDE_PX, got=max(width, height), unit="pixels a side"
+        )
+    if width * height > MAX_PIXELS:
+        raise too_large("Image has too many pixels", where=where, limit=MAX_PIXELS, got=width * height, unit="pixels")
+
+
+def check_length(what: str, where: object, *, states: int, unit: str, found: int) -> None:
+    """Raises: RejectedInputError (length_mismatch) where there are not as many (images, rows, ...) as states."""
+    if found != states:
+        raise RejectedInputError(
+            "length_mismatch",
+            f"{what} and states differ in length",
+            where=where,
+            expected=f"{states} {unit}",
+            got=f"{found} {unit}",
+            evidence={"states": states, unit: found},
+        )
+
+
+def check_rate(rate: float, wanted: float, where: object, *, tolerance: float) -> None:
+    """Raises: RejectedInputError (wrong_fps) where a video's rate is further than `tolerance` [fps] from the wanted one."""
+    if not abs(rate - wanted) <= tolerance:
+        raise RejectedInputError(
+            "wrong_fps",
+            "Video has another frame rate than its recording",
+            where=where,
+            expected=f"{wanted} fps",
+            got=f"{rate} fps",
+            evidence={"expected_fps": wanted, "found_fps": rate},
         )

@@ -14,6 +14,7 @@ and identity are compared with what they were when this process first opened the
 from __future__ import annotations
 
 import re
+import stat
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from upath import UPath
 
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, too_large
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.remote import AnyPath, list_files, matching, parse_location, process_cache, remote_kind
 
@@ -126,6 +127,13 @@ SourceFolder = Annotated[
 ]
 """Field type of a configuration: a folder, or a URL such as `s3://bucket/folder`."""
 
+_FILE_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index|episode_chunk|episode_index)(?::0?(\d{1,2})d)?\}")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
@@ -181,6 +189,36 @@ def local_file(path: AnyPath) -> Path:
         raise RejectedInputError("missing_file", "File is missing", where=str(path)) from error
     except PermissionError as error:
         raise _not_allowed(path) from error
+
+
+def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = None) -> Path:
+    """The file to open for `path` (see `local_file`), when it can be read to an end: a pipe would block for ever, a device
+    never ends.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, and what `local_file` raises.
+    """
+    try:
+        local = local_file(path)
+        found = local.stat()
+    except (OSError, ValueError) as error:  # ValueError: a name with a null byte
+        raise RejectedInputError(
+            "missing_file",
+            f"{what} is missing",
+            where=str(path),
+            got=None if isinstance(error, FileNotFoundError) else str(error),
+            next_step="restore the file or drop the episode",
+        ) from error
+    if not stat.S_ISREG(found.st_mode):
+        raise RejectedInputError(
+            "special_file",
+            f"{what} is no regular file",
+            where=str(path),
+            expected="a regular file",
+            got=_FILE_KINDS.get(stat.S_IFMT(found.st_mode), "something else"),
+        )
+    if max_bytes is not None and found.st_size > max_bytes:
+        raise too_large(f"{what} is too large", where=str(path), limit=max_bytes, got=found.st_size, unit="bytes")
+    return local
 
 
 def is_file(path: AnyPath) -> bool:

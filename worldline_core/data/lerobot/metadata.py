@@ -1,6 +1,6 @@
-"""meta/info.json of a LeRobot dataset, checked once so that readers may rely on it.
+"""Metadata of a LeRobot dataset: `info.json`, checked once so that readers may rely on it, and the list of episodes.
 
-The list of a LeRobot dataset's episodes, kept as columns: 10^6 episodes are 10^6 rows of Arrow, not of Python objects.
+The list is kept as columns: 10^6 episodes are 10^6 rows of Arrow, not of Python objects.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.json
 
-from worldline_core.data.guards.limits import MAX_TEXT_BYTES, regular_file, too_large
 from worldline_core.data.guards.plain_files import column_names, read_json, read_table
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, note_file
+from worldline_core.data.guards.rejection import MAX_TEXT_BYTES, RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, note_file, regular_file
 from worldline_core.errors import DataError
 
 
@@ -37,7 +36,7 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> dict[str
         raise DataError("meta/info.json lacks a key", where=str(root), expected=", ".join(missing), got=", ".join(info))
     fps = info["fps"]
     if not isinstance(fps, int | float) or isinstance(fps, bool) or not (math.isfinite(fps) and 0 < fps <= 10_000):
-        raise DataError("Frame rate is no rate", where=where, expected="a number of frames a second", got=repr(fps))
+        raise DataError("Frame rate is no rate", where=where, expected="a number of frames per second", got=repr(fps))
     features = info["features"]
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
         raise DataError("Features are no mapping of mappings", where=where, got=str(features)[:200])
@@ -48,28 +47,6 @@ def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> dict[str
     if not isinstance(size, int) or isinstance(size, bool) or size < 1:
         raise DataError("Chunk size is no count", where=where, expected="a whole number from 1 on", got=repr(size))
     return info
-
-
-class DescribedDataset:
-    """What `info.json` says of a dataset, whatever its version.
-
-    Attributes:
-        info: its content, checked by `read_info`.
-    """
-
-    info: dict[str, Any]
-
-    @property
-    def fps(self) -> float:
-        return float(self.info["fps"])
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        return self.info["features"]
-
-    @property
-    def video_keys(self) -> list[str]:
-        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
 
 INDEX = "episode_index"
@@ -116,7 +93,7 @@ class EpisodeTable:
         order = np.argsort(numbers, kind="stable")
         self.indices: np.ndarray = numbers[order].astype(np.int64)
         in_order = bool((order[1:] > order[:-1]).all())
-        # One piece a column: looking up a row among a hundred pieces takes a millisecond.
+        # One chunk per column: looking up a row among a hundred chunks takes a millisecond.
         self._table = (table if in_order else table.take(pa.array(order))).combine_chunks()
 
     @classmethod
@@ -140,10 +117,7 @@ class EpisodeTable:
 
         Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
         """
-        file = regular_file(path)
-        size = file.stat().st_size
-        if size > MAX_TEXT_BYTES:
-            raise too_large("Episode list is too large", where=str(path), limit=MAX_TEXT_BYTES, got=size, unit="bytes")
+        file = regular_file(path, "Episode list", max_bytes=MAX_TEXT_BYTES)
         schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
         try:
             table = pyarrow.json.read_json(
@@ -179,7 +153,7 @@ class EpisodeTable:
                 "duplicate_id",
                 "Episode is listed more than once",
                 where=self._where,
-                expected="one row an episode",
+                expected="one row per episode",
                 got=f"{last - first} rows of {INDEX} {episode_index}",
                 evidence={"rows": last - first, INDEX: int(episode_index)},
             )
@@ -190,7 +164,7 @@ class EpisodeTable:
 
 
 def whole_number(row: dict[str, Any], key: str, where: object) -> int:
-    """A count or a place out of a row of metadata.
+    """A count or a position out of a row of metadata.
 
     Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
     """

@@ -12,20 +12,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from worldline_core.data.lerobot.dataset import DATA_PATH, IMAGE_PREFIX, VERSION, VIDEO_PATH
 from worldline_core.data.lerobot.statistics import as_json, image_statistics, vector_statistics
-from worldline_core.data.lerobot.v3 import (
-    DATA_PATH,
-    EPISODES_PATH,
-    IMAGE_PREFIX,
-    VERSION,
-    VIDEO_PATH,
-    write_table,
-)
 from worldline_core.data.video.encoder import concatenate_videos
 from worldline_core.data.video.thumbnails import cache_path
-from worldline_core.store.atomic import atomic_path, write_json_atomic
+from worldline_core.store.atomic import atomic_path, write_json_atomic, write_table_atomic
 
 _CHUNK_SIZE = 1000
+_EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 _DATA_MEGABYTES = 100
 _VIDEO_MEGABYTES = 200
 
@@ -91,7 +85,7 @@ def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megab
         members = [index for index, other in enumerate(data_files) if other == file]
         begin, end = int(starts[members[0]]), int(starts[members[-1] + 1])
         path = root / DATA_PATH.format(chunk_index=file // _CHUNK_SIZE, file_index=file % _CHUNK_SIZE)
-        write_table(path, table.slice(begin, end - begin), rows_per_group=[lengths[index] for index in members])
+        write_table_atomic(path, table.slice(begin, end - begin), rows_per_group=[lengths[index] for index in members])
     for index, episode in enumerate(episodes):
         statistics = _episode_statistics(episode, table.slice(int(starts[index]), lengths[index]))
         row: dict[str, Any] = {
@@ -109,8 +103,8 @@ def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megab
             row |= {f"stats/{key}/{name}": value.tolist() for name, value in feature.items()}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         rows.append(row)
-    write_table(root / EPISODES_PATH.format(chunk_index=0, file_index=0), pa.Table.from_pylist(rows))
-    write_table(root / "meta" / "tasks.parquet", _tasks_table(instructions))
+    write_table_atomic(root / _EPISODES_PATH, pa.Table.from_pylist(rows))
+    write_table_atomic(root / "meta" / "tasks.parquet", _tasks_table(instructions))
     write_json_atomic(root / "meta" / "stats.json", as_json(_dataset_statistics(episodes, table)))
     write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions), video_megabytes, fps))
 

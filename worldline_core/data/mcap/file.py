@@ -22,9 +22,8 @@ from mcap.records import Channel, Schema
 from mcap.records import Message as Record
 from mcap.summary import Summary
 
-from worldline_core.data.guards.limits import MAX_CHUNK_BYTES, regular_file, too_large
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, too_large
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, MessageDecoder
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.

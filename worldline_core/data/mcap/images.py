@@ -17,8 +17,7 @@ from av.video.codeccontext import VideoCodecContext
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.guards.images import decode_image
-from worldline_core.data.guards.limits import check_image_size
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.messages import EncodedImage, Kind, RawImage
 

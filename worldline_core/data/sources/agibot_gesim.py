@@ -20,13 +20,17 @@ from pydantic import Field
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
-from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode
+from worldline_core.data.episodes.source import (
+    ForeignSourceConfig,
+    GripperRange,
+    LensConfig,
+    LoadedEpisode,
+    joint_names,
+)
 from worldline_core.data.guards.images import read_image
-from worldline_core.data.guards.limits import check_shape
 from worldline_core.data.guards.plain_files import read_npy, read_text
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
-from worldline_core.data.sources.reading import joint_names
 from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 

@@ -25,7 +25,7 @@ from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_
 from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode
 from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.guards.plain_files import read_json
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, find_folders, inside
 from worldline_core.data.sources.agibot_gesim import (
     AGIBOT_CAMERAS,
@@ -34,7 +34,6 @@ from worldline_core.data.sources.agibot_gesim import (
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
-from worldline_core.data.sources.reading import check_rate
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import video_size
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw

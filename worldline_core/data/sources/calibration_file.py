@@ -28,10 +28,9 @@ from worldline_core.config import StrictModel, read_yaml
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
 from worldline_core.data.episodes.source import LensConfig
-from worldline_core.data.guards.limits import check_shape, regular_file, too_large
 from worldline_core.data.guards.plain_files import read_json
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.rejection import RejectedInputError, check_shape
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
@@ -114,10 +113,7 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
 
 
 def _yaml(path: AnyPath) -> Any:
-    file = regular_file(path, "Calibration file")
-    size = file.stat().st_size
-    if size > MAX_YAML_BYTES:
-        raise too_large("Calibration file is too large", where=str(path), limit=MAX_YAML_BYTES, got=size, unit="bytes")
+    file = regular_file(path, "Calibration file", max_bytes=MAX_YAML_BYTES)
     try:
         return read_yaml(file)
     except (ConfigError, OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:

@@ -14,12 +14,17 @@ from pydantic import Field
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.instructions import one_annotation
-from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EvaluationSourceConfig, GripperRange, LoadedEpisode
-from worldline_core.data.guards.limits import check_shape
+from worldline_core.data.episodes.source import (
+    EVALUATION_LAYOUTS,
+    EvaluationSourceConfig,
+    GripperRange,
+    LoadedEpisode,
+    joint_names,
+)
 from worldline_core.data.guards.plain_files import read_json, well_formed
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_length, check_rate, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
-from worldline_core.data.sources.reading import by_number, check_length, check_rate, file_ids, joint_names
+from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz

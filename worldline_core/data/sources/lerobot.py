@@ -15,10 +15,9 @@ import numpy as np
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import repair_notes
 from worldline_core.data.episodes.source import EVALUATION_ONLY, EpisodeSource, LoadedEpisode, says_droid
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
-from worldline_core.data.lerobot.v3 import LeRobotV3Dataset
-from worldline_core.data.lerobot.v21 import LeRobotV21Dataset
+from worldline_core.data.lerobot.dataset import LeRobotV3Dataset, LeRobotV21Dataset
 from worldline_core.data.sources.calibration_file import (
     CalibratedView,
     CalibrationFile,
@@ -26,7 +25,6 @@ from worldline_core.data.sources.calibration_file import (
     read_calibration,
 )
 from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, WholeVectors, flat_names
-from worldline_core.data.sources.reading import check_rate
 from worldline_core.errors import ConfigError, DataError
 
 _RATE_TOLERANCE = 1e-2
@@ -44,7 +42,7 @@ class LeRobotSource:
         self._config = config
         self._root = root
         self._label = label or config.label
-        self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)  # pyright: ignore[reportArgumentType]
+        self._dataset = LeRobotV21Dataset(root) if config.kind == "lerobot_v21" else LeRobotV3Dataset(root)
         features = self._dataset.features
         self._evaluation_only = config.evaluation_only or _is_droid(config, root, self._dataset.info)
         if self._evaluation_only and config.split in TRAINING_SPLITS:

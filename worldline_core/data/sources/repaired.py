@@ -13,8 +13,7 @@ import numpy as np
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.reading import check_length
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 
 
 def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpisode:

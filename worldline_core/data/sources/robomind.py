@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LoadedEpisode
+from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LoadedEpisode, joint_names
 from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
-from worldline_core.data.sources.reading import file_ids, joint_names, printable
+from worldline_core.data.sources.ids import file_ids, printable
 from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS, RobomindLayout, Track
 from worldline_core.data.sources.video_folder import caption_table
 

@@ -1,12 +1,10 @@
 """A folder of plain videos, with or without captions: one view, no states and no actions, for Stage I alone.
 
     <any folders>/<name>.mp4
-    <any folders>/<name>.txt        the video's caption (the default), or one table for all: JSON, JSONL or CSV
+    <any folders>/<name>.txt        the video's caption (the default), or one table for all videos: JSON, JSONL or CSV
 
 The rate is the container's, and frames must keep to it: a video with a variable rate is quarantined (wrong_fps). Videos
 of one folder share a scene: they may be cuts of one recording, and a split by video would test on what was trained on.
-
-Captions of videos that are kept beside them: a text file a video, or one table for all.
 """
 
 from __future__ import annotations
@@ -23,11 +21,10 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode
-from worldline_core.data.guards.limits import MAX_TEXT_BYTES, regular_file, too_large
-from worldline_core.data.guards.plain_files import read_json, read_json_lines
+from worldline_core.data.guards.plain_files import read_json, read_json_lines, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
-from worldline_core.data.sources.reading import file_ids, printable
+from worldline_core.data.sources.ids import file_ids, printable
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.decode import frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
@@ -41,7 +38,9 @@ def caption_of(path: AnyPath) -> str | None:
 
     Raises: RejectedInputError: unreadable (no UTF-8 text), too_large.
     """
-    return " ".join(_text(path, MAX_CAPTION_BYTES).split()) if is_file(path) else None
+    return (
+        " ".join(read_text(path, max_bytes=MAX_CAPTION_BYTES, encoding="utf-8-sig").split()) if is_file(path) else None
+    )
 
 
 def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, str]:
@@ -73,7 +72,9 @@ def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, 
 def _rows(path: AnyPath, suffix: str, video_key: str, caption_key: str) -> Iterable[tuple[str, str]]:
     if suffix == ".csv":
         try:
-            listed: Any = list(csv.DictReader(io.StringIO(_text(path, MAX_TEXT_BYTES), newline=""), strict=True))
+            listed: Any = list(
+                csv.DictReader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline=""), strict=True)
+            )
         except csv.Error as error:
             raise DataError("Table of captions is no CSV", where=str(path), got=str(error)) from error
     elif suffix == ".jsonl":
@@ -90,17 +91,6 @@ def _rows(path: AnyPath, suffix: str, video_key: str, caption_key: str) -> Itera
         (_field(row, video_key, number, path), _field(row, caption_key, number, path))
         for number, row in enumerate(listed, start=1)
     ]
-
-
-def _text(path: AnyPath, limit: int) -> str:
-    file = regular_file(path)
-    size = file.stat().st_size
-    if size > limit:
-        raise too_large("Text is too long", where=str(path), limit=limit, got=size, unit="bytes")
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RejectedInputError("unreadable", "Text cannot be read", where=str(path), got=str(error)) from error
 
 
 def _field(row: Any, key: str, number: int, path: AnyPath) -> str:

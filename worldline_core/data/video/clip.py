@@ -18,8 +18,7 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.limits import MAX_PIXELS, check_image_size
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import AnyPath, local_file
 from worldline_core.data.video.header import check_video_header
 

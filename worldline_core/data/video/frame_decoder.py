@@ -20,8 +20,7 @@ import av
 import av.error
 import numpy as np
 
-from worldline_core.data.guards.limits import check_image_size
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import local_file
 from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, undecodable, wrong_count
 from worldline_core.data.video.header import check_video_header

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from worldline_core.data.guards.limits import MAX_FRAMES, check_image_size, regular_file, too_large
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath
+from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
+from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 _QUICKTIME = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp")
 _MATROSKA = b"\x1aE\xdf\xa3"

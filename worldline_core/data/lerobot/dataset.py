@@ -1,0 +1,298 @@
+"""LeRobot datasets on disk, read without trusting what their metadata say.
+
+v3.0 (LeRobot 0.6): meta/info.json, meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet,
+data/chunk-*/file-*.parquet (one row group per episode), videos/<key>/chunk-*/file-*.mp4 (episodes joined; each
+episode's place is given by from_timestamp and to_timestamp in the episodes table).
+v2.1: meta/info.json, meta/tasks.jsonl, meta/episodes.jsonl, and per episode one Parquet file and one mp4 per view.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from worldline_core.data.guards.plain_files import read_json_lines, read_table
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file
+from worldline_core.data.lerobot.metadata import INDEX, EpisodeTable, read_info, whole_number
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.decode import decode_segment, video_size
+from worldline_core.errors import DataError
+
+VERSION = "v3.0"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+IMAGE_PREFIX = "observation.images."
+
+
+class LeRobotDataset(ABC):
+    """Read access to one dataset folder.
+
+    Attributes:
+        info: content of `info.json`, checked by `read_info`.
+
+    Raises: DataError on opening when the folder is not a LeRobotDataset of this version.
+    """
+
+    version: str
+    needed_keys: tuple[str, ...] = ()
+
+    def __init__(self, root: AnyPath) -> None:
+        self.root = root
+        self.info: dict[str, Any] = read_info(root, self.version, self.needed_keys)
+
+    @property
+    def fps(self) -> float:
+        return float(self.info["fps"])
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        return self.info["features"]
+
+    @property
+    def video_keys(self) -> list[str]:
+        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
+
+    @cached_property
+    def episodes(self) -> EpisodeTable:
+        """The list of episodes, without statistics."""
+        return self._read_episodes()
+
+    @cached_property
+    def tasks(self) -> dict[int, str]:
+        """Instruction by task_index."""
+        return self._read_tasks()
+
+    @abstractmethod
+    def _read_episodes(self) -> EpisodeTable: ...
+
+    @abstractmethod
+    def _read_tasks(self) -> dict[int, str]: ...
+
+    @abstractmethod
+    def column(self, episode_index: int, name: str) -> np.ndarray:
+        """One data column of an episode: (N,) or (N, D).
+
+        Raises: DataError when the file or column is missing, or another length than listed.
+        """
+
+    @abstractmethod
+    def clip(self, episode_index: int, key: str) -> VideoClip:
+        """One episode's video as it is encoded.
+
+        Raises: DataError when the metadata lack the key.
+        """
+
+    def row(self, episode_index: int) -> dict[str, Any]:
+        """Metadata row of one episode.
+
+        Raises: DataError when the episode is not listed, or listed twice.
+        """
+        return self.episodes.row(episode_index)
+
+    def video_rate(self, episode_index: int, key: str) -> float:
+        """Frames per second that the container states."""
+        return video_size(self.clip(episode_index, key).path)[2]
+
+    def image_size(self, episode_index: int, key: str) -> tuple[int, int]:
+        """(height, width) that the container states."""
+        return video_size(self.clip(episode_index, key).path)[:2]
+
+    def _number(self, row: dict[str, Any], key: str) -> int:
+        return whole_number(row, key, f"{self.root}, episode {row[INDEX]}")
+
+    def _path(self, template: str, **values: int | str) -> AnyPath:
+        return inside(self.root, fill_template(template, **values))
+
+
+class LeRobotV3Dataset(LeRobotDataset):
+    """LeRobotDataset v3.0."""
+
+    version = VERSION
+
+    def __init__(self, root: AnyPath) -> None:
+        super().__init__(root)
+        self._data: dict[AnyPath, pa.Table] = {}
+
+    def _read_episodes(self) -> EpisodeTable:
+        folder = self.root / "meta" / "episodes"
+        files = find_files(folder, "*/*.parquet")
+        if not files:
+            raise DataError("Dataset lists no episodes", where=str(folder), expected="chunk-*/file-*.parquet")
+        return EpisodeTable.from_parquet(files, folder)
+
+    def _read_tasks(self) -> dict[int, str]:
+        table = read_table(self.root / "meta" / "tasks.parquet")
+        label = "task" if "task" in table.column_names else "__index_level_0__"
+        missing = {"task_index", label} - set(table.column_names)
+        if missing:
+            raise DataError(
+                "meta/tasks.parquet lacks a column",
+                where=str(self.root),
+                expected="task_index, task",
+                got=", ".join(table.column_names),
+            )
+        try:
+            texts = [str(text) for text in table[label].to_pylist()]
+        except UnicodeDecodeError as error:  # Parquet declares UTF-8 and checks nothing
+            raise DataError(
+                "meta/tasks.parquet holds text that is no UTF-8", where=str(self.root), got=str(error)
+            ) from error
+        return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
+
+    def column(self, episode_index: int, name: str) -> np.ndarray:
+        row = self.row(episode_index)
+        path = self._path(
+            str(self.info.get("data_path", DATA_PATH)),
+            chunk_index=self._number(row, "data/chunk_index"),
+            file_index=self._number(row, "data/file_index"),
+        )
+        if path not in self._data:
+            self._data = {path: read_table(path)}  # one file at a time: episodes are read in the order of files
+        note_file(path)
+        table = self._data[path]
+        for needed in (name, "index"):
+            if needed not in table.column_names:
+                raise RejectedInputError(
+                    "missing_column",
+                    "Data file lacks a column",
+                    where=str(path),
+                    expected=needed,
+                    got=", ".join(table.column_names),
+                )
+        begin = self._number(row, "dataset_from_index")
+        length = self._number(row, "dataset_to_index") - begin
+        first = table["index"][0].as_py() if len(table) else begin
+        offset = begin - int(first) if isinstance(first, int) else -1
+        rows = table[name].slice(offset, length) if offset >= 0 and length >= 0 else table[name].slice(0, 0)
+        return _numbers_of(rows, length, f"{path}, episode {episode_index}, column {name}")
+
+    def clip(self, episode_index: int, key: str) -> VideoClip:
+        row = self.row(episode_index)
+        chunk, file, start = (f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
+        if any(row.get(name) is None for name in (chunk, file, start)):
+            raise RejectedInputError(
+                "missing_view",
+                "Episode has no such video",
+                where=str(self.root),
+                expected=key,
+                got=", ".join(self.video_keys),
+            )
+        path = self._path(
+            str(self.info.get("video_path", VIDEO_PATH)),
+            video_key=key,
+            chunk_index=self._number(row, chunk),
+            file_index=self._number(row, file),
+        )
+        from_time = row[start]
+        if not isinstance(from_time, int | float) or not 0 <= from_time < math.inf:
+            raise RejectedInputError(
+                "unreadable",
+                "Video has no usable start time",
+                where=f"{self.root}, episode {episode_index}, {start}",
+                expected="seconds",
+                got=repr(from_time),
+            )
+        return VideoClip(path, self._number(row, "length"), self.fps, from_time=float(from_time))
+
+    def frames(self, episode_index: int, key: str, indices: Sequence[int] | None = None) -> np.ndarray:
+        """uint8 (len, H, W, 3) frames of one episode.
+
+        Raises: DataError when the video is missing, truncated or too short.
+        """
+        clip = self.clip(episode_index, key)
+        return decode_segment(clip.path, clip.start_time, clip.num_frames, self.fps, indices)
+
+
+class LeRobotV21Dataset(LeRobotDataset):
+    """LeRobotDataset v2.1."""
+
+    version = "v2.1"
+    needed_keys = ("data_path", "video_path", "chunks_size")
+
+    def _read_episodes(self) -> EpisodeTable:
+        return EpisodeTable.from_json_lines(self.root / "meta" / "episodes.jsonl")
+
+    def _read_tasks(self) -> dict[int, str]:
+        path = self.root / "meta" / "tasks.jsonl"
+        tasks: dict[int, str] = {}
+        for row in read_json_lines(path):
+            if not isinstance(row, dict) or not isinstance(row.get("task_index"), int) or "task" not in row:
+                raise DataError(
+                    "Row of the task list is not understood",
+                    where=str(path),
+                    expected='{"task_index": 0, "task": "..."}',
+                    got=str(row)[:200],
+                )
+            tasks[row["task_index"]] = str(row["task"])
+        return tasks
+
+    def _episode_path(self, template: str, episode_index: int, **values: str) -> AnyPath:
+        chunk = episode_index // int(self.info["chunks_size"])
+        return self._path(str(self.info[template]), episode_chunk=chunk, episode_index=episode_index, **values)
+
+    def column(self, episode_index: int, name: str) -> np.ndarray:
+        path = self._episode_path("data_path", episode_index)
+        return _numbers_of(
+            read_table(path, [name])[name], self._number(self.row(episode_index), "length"), f"{path}, column {name}"
+        )
+
+    def clip(self, episode_index: int, key: str) -> VideoClip:
+        path = self._episode_path("video_path", episode_index, video_key=key)
+        return VideoClip.whole_file(path, self._number(self.row(episode_index), "length"), self.fps)
+
+
+def _numbers_of(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
+    """(N,) or, for lists of equal length, (N, D).
+
+    Raises: RejectedInputError (length_mismatch, nan_state, unreadable) for another number of rows than listed, empty rows,
+        rows of different length, or values that are no numbers.
+    """
+    if len(column) != length:
+        raise RejectedInputError(
+            "length_mismatch",
+            "Data file has another length than listed",
+            where=where,
+            expected=f"{length} rows",
+            got=f"{len(column)} rows",
+            evidence={"listed": length, "rows": len(column)},
+        )
+    values = column.combine_chunks()
+    if isinstance(values, pa.ChunkedArray):
+        values = pa.concat_arrays(values.chunks)
+    nested = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    if not any(is_kind(values.type) for is_kind in nested):
+        return _numeric(values, where)
+    if values.null_count:
+        raise RejectedInputError(
+            "nan_state",
+            "Data column holds empty rows",
+            where=where,
+            expected="a value in each row",
+            got=f"{values.null_count} nulls",
+        )
+    lengths = pc.min_max(pc.list_value_length(values)).as_py()  # pyright: ignore[reportAttributeAccessIssue]
+    if len(values) == 0 or lengths["min"] != lengths["max"]:
+        raise RejectedInputError(
+            "length_mismatch",
+            "Rows of a data column differ in length",
+            where=where,
+            expected="rows of one length",
+            got=f"{lengths['min']} to {lengths['max']} values",
+        )
+    return _numeric(values.flatten(), where).reshape(len(values), -1)
+
+
+def _numeric(values: pa.Array, where: str) -> np.ndarray:
+    if not any(is_kind(values.type) for is_kind in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)):
+        raise RejectedInputError(
+            "unreadable", "Data column is not numeric", where=where, expected="numbers", got=str(values.type)
+        )
+    return values.to_numpy(zero_copy_only=False)

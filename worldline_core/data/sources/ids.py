@@ -1,0 +1,71 @@
+"""Ids of episodes: made from file names and metadata that nobody has checked, unique and storable."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from worldline_core.data.guards.rejection import RejectedInputError
+
+MAX_LENGTH = 512
+_DIGITS = re.compile(r"(\d+)")
+
+
+def file_ids(label: str, files: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Id -> file, from file -> the parts of its path that name the episode.
+
+    An id is the label and the parts, joined by "-". Files that would share one (a-b/c and a/b-c both give a-b-c) get a
+    digest of their path behind it.
+    """
+    wanted = {file: "-".join([label, *map(printable, parts)]) for file, parts in files.items()}
+    count = Counter(wanted.values())
+    return {
+        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(file).encode()).hexdigest()[:8]}": file
+        for file, name in wanted.items()
+    }
+
+
+def printable(name: str) -> str:
+    """A path whose bytes are no UTF-8 as text that can be stored."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def by_number(episode_id: str) -> list[int | str]:
+    """Sorting key: episode2 before episode10."""
+    return [int(text) if text.isdigit() else text for text in _DIGITS.split(episode_id)]
+
+
+def storable(episode_id: str) -> str:
+    """The id as text that every table and terminal can hold; one that already is stays as it is.
+
+    Bytes that are no UTF-8 and control characters are written as escapes, and the middle of a very long id is left out.
+    """
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in printable(episode_id))
+    half = MAX_LENGTH // 2 - 2
+    return text if len(text) <= MAX_LENGTH else f"{text[:half]}...{text[-half:]}"
+
+
+def unique_identity(episode_id: str, source: int, taken: set[str]) -> str:
+    """A storable id that is not taken yet: a repeated one gets the number of its source, and of its repetition there."""
+    plain = identity = storable(episode_id) or f"unnamed#source.{source}"
+    count = 0
+    while identity in taken:
+        count += 1
+        identity = f"{plain}#source.{source}" + (f".{count}" if count > 1 else "")
+    return identity
+
+
+def check_id(episode_id: str, source: str) -> None:
+    """Raises: RejectedInputError (invalid_id) for an id that cannot be stored as it is."""
+    if storable(episode_id) != episode_id or not episode_id:
+        raise RejectedInputError(
+            "invalid_id",
+            "Episode id cannot be stored",
+            where=source,
+            expected=f"1 to {MAX_LENGTH} printable characters of valid UTF-8",
+            got=ascii(episode_id[:200]),
+            next_step="rename the file or folder, or correct the metadata",
+            evidence={"characters": len(episode_id)},
+        )
