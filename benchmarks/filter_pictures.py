@@ -19,9 +19,10 @@ from worldline_core.actions.overlays import draw_overlay
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import view_thumbnails
-from worldline_core.filters.examine import Finding, inspect
+from worldline_core.filters.examine import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
+from worldline_core.filters.verdict import Finding
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.pictures.clip_strip import ClipStrip, clip_strip

@@ -31,9 +31,10 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.thumbnails import view_thumbnails
-from worldline_core.filters.examine import Finding, inspect
+from worldline_core.filters.examine import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
+from worldline_core.filters.verdict import Finding
 from worldline_core.store.atomic import write_json_atomic
 
 RECORDINGS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "recordings"

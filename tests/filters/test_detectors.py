@@ -7,33 +7,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from worldline_core.filters.alignment import (
-    ProjectionConfig,
-    TimeAlignmentConfig,
     detect_image_lag,
     detect_pose_lag,
     detect_projection,
     lag_by_correlation,
 )
-from worldline_core.filters.base_motion import BaseMotionConfig, changed_area, detect_base_motion
-from worldline_core.filters.calibration import (
+from worldline_core.filters.base_motion import changed_area, detect_base_motion
+from worldline_core.filters.calibration import detect_camera, detect_fixed_camera, detect_hand_eye
+from worldline_core.filters.filter_config import (
+    BaseMotionConfig,
+    BlurConfig,
     CalibrationConfig,
-    detect_camera,
-    detect_fixed_camera,
-    detect_hand_eye,
-)
-from worldline_core.filters.corrupted import CorruptedConfig, detect_corrupted
-from worldline_core.filters.exposure import BlurConfig, ExposureConfig, detect_blur, detect_dark, detect_overexposed
-from worldline_core.filters.motion import (
+    CorruptedConfig,
+    ExposureConfig,
     JointMotionConfig,
+    ProjectionConfig,
     ResetConfig,
     StaticConfig,
-    detect_joint_jump,
-    detect_joint_speed,
-    detect_reset,
-    detect_static,
-    range_speed,
+    TimeAlignmentConfig,
 )
-from worldline_core.filters.signals import picture_statistics
+from worldline_core.filters.motion import detect_joint_jump, detect_joint_speed, detect_reset, detect_static
+from worldline_core.filters.pictures import detect_blur, detect_corrupted, detect_dark, detect_overexposed
+from worldline_core.filters.signals import picture_statistics, range_speed
 from worldline_core.filters.verdict import long_runs, runs
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.transforms import hand_eye_residual, mean_pose, rigid_inverse

@@ -13,9 +13,9 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails
-from worldline_core.filters.calibration import FilterDoctorConfig, detect_mistake, kinematics_of
+from worldline_core.filters.calibration import detect_mistake, kinematics_of
 from worldline_core.filters.examine import inspect
-from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.filters.filter_config import FilterConfig, FilterDoctorConfig
 from worldline_core.filters.signals import Signals, measure
 
 CONFIG = FilterDoctorConfig()

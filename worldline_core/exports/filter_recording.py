@@ -24,7 +24,7 @@ from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
-    from worldline_core.filters.examine import Finding
+    from worldline_core.filters.verdict import Finding
 
 _LARGEST_RATIO = 5.0
 """Curves are clipped there, or one outlier would flatten all others."""

@@ -1,5 +1,5 @@
 """Filters: which episodes, and which of their frames, are fit for training.
 
-Each module holds one detector, a pure function of arrays; `filter` applies them all.
+`examine` lists the detectors, `filter_config` has their thresholds, `filter` applies them to a set.
 Axis legend: n frames, h w image, a arms.
 """

@@ -1,37 +1,25 @@
-"""Time alignment: do images, camera poses and states show the same instant?
+"""Time alignment and projection: do images, camera poses and states show the same instant, in the same place?
 
-Two independent measurements. Images: the lag at which tool speed and image change correlate best. Camera poses: the shift
-at which a wrist camera is most rigidly fixed to its tool (exact where poses are recorded, even below one frame).
-
-Projection: the tool lies in the picture, and where it is said to move, the picture changes.
+Lags are measured in two independent ways. Images: the lag at which tool speed and image change correlate best. Camera
+poses: the shift at which a wrist camera is most rigidly fixed to its tool (exact where poses are recorded, even below
+one frame). Projection: tools lie inside the image, and where one moves, the image changes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from pydantic import Field
 
-from worldline_core.config import StrictModel
-from worldline_core.filters.verdict import Verdict
-from worldline_core.geometry.transforms import hand_eye_residual
+from worldline_core.filters.filter_config import FilterConfig, ProjectionConfig, TimeAlignmentConfig
+from worldline_core.filters.signals import Signals
+from worldline_core.filters.verdict import Finding, Verdict
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
 
-
-class TimeAlignmentConfig(StrictModel):
-    """Lags in seconds; positive means that the images come after the states."""
-
-    max_lag_s: float = Field(default=0.19, gt=0, description="a larger lag condemns")
-    search_s: float = Field(default=0.8, gt=0)
-    min_correlation: float = Field(default=0.75, gt=0, lt=1, description="at the best lag; less proves nothing")
-    min_gain: float = Field(default=0.12, ge=0, description="of the correlation at the best lag over that at lag 0")
-    max_pose_lag_s: float = Field(
-        default=0.1, gt=0, description="larger shift between camera poses and states condemns"
-    )
-    min_pose_gain_m: float = Field(
-        default=0.004, ge=0, description="smaller gains of the hand-eye residual prove no shift"
-    )
-    max_rigid_residual_m: float = Field(
-        default=0.012, gt=0, description="hand-eye residual at the best shift, to trust it"
-    )
+# A turn of a wrist camera by one radian changes its image about as much as a motion of this length.
+_METRES_PER_RADIAN = 0.15
 
 
 def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> tuple[float, float, float]:
@@ -61,7 +49,7 @@ def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> 
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Pearson's of the columns of (n, s) and (n, s) that vary in both; none from fewer than eight rows."""
+    """Pearson's correlation of the columns of two (n, s) that vary in both; none for fewer than eight rows."""
     if len(a) < 8:
         return np.zeros(0)
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
@@ -95,7 +83,7 @@ def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config:
 def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -> tuple[int, float, float]:
     """Shift of a wrist camera's poses after its tool's that makes the pair most rigid.
 
-    A shift is looked for coarsely first, then around the best: the residual falls towards it over many frames.
+    The search is coarse first, then fine around the best: the residual falls towards it over many frames.
 
     Returns: (lag in frames, hand-eye residual [m] there, residual at 0), residuals as root mean squares.
     """
@@ -137,24 +125,10 @@ def detect_pose_lag(
     )
 
 
-class ProjectionConfig(StrictModel):
-    """Lengths in shares of the image width, so that they hold at any resolution."""
-
-    min_inside_share: float = Field(
-        default=0.5, gt=0, le=1, description="frames in which some arm's tool is in the task-facing view"
-    )
-    radius: float = Field(default=0.07, gt=0, description="disc around the tool in which change is looked for")
-    min_step: float = Field(default=0.012, gt=0, description="projected motion a frame that must be visible")
-    min_moving_frames: int = Field(default=5, ge=1, description="fewer prove nothing")
-    min_contrast: float = Field(
-        default=1.6, gt=0, description="change near the tool over change in the whole picture (median)"
-    )
-
-
 def local_contrast(
     gray: np.ndarray, uv: np.ndarray, inside: np.ndarray, radius_px: float, min_step_px: float
 ) -> np.ndarray:
-    """Change near a projected point relative to the change of the whole image, for frames in which the point moves.
+    """Change near a projected point relative to that of the whole image, for frames in which the point moves.
 
     Args:
         gray: uint8 (n, h, w). uv: (n, 2). inside: bool (n,).
@@ -202,3 +176,44 @@ def detect_projection(gray: np.ndarray, uv: np.ndarray, inside: np.ndarray, conf
             "threshold_contrast": config.min_contrast,
         },
     )
+
+
+def find_lags(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """Lags of the images of all views against the tools, and of the poses of each moving wrist camera."""
+    tools = signals.calibrated_tools
+    if tools is None:
+        return []
+    fps, thresholds = signals.episode.fps, config.time_alignment
+    relative = rigid_inverse(tools[:-1]) @ tools[1:]
+    motion = np.linalg.norm(relative[..., :3, 3], axis=-1)
+    motion = motion + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
+    findings: list[Finding] = []
+    if signals.arms:
+        streams = [motion[:, list(signals.arms_in(view))].max(axis=1) for view in signals.pictures]
+        changes = [pictures.change[1:] for pictures in signals.pictures.values()]
+        verdict = detect_image_lag(np.stack(streams, axis=1), np.stack(changes, axis=1), fps, thresholds)
+        findings.append(Finding("image_lag", None, 2, verdict))
+    for arm, camera in signals.wrist_cameras:
+        if camera.moving and np.isfinite(camera.T_base_camera).all():
+            verdict = detect_pose_lag(tools[:, arm], camera.poses(np.arange(len(tools))), fps, thresholds)
+            findings.append(Finding("pose_lag", camera.view, 2, verdict))
+    return findings
+
+
+def find_projection(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """In the episode's primary view, where its camera is known."""
+    view = signals.episode.primary_view
+    camera = signals.episode.cameras.get(view)
+    tools = signals.calibrated_tools
+    if tools is None or camera is None or view not in signals.gray or not np.isfinite(camera.K).all():
+        return []
+    gray = signals.gray[view]
+    camera = camera.resized(gray.shape[2], gray.shape[1])
+    poses = camera.poses(np.arange(len(gray)))
+    uvs, insides = [], []
+    for arm in range(tools.shape[1]):
+        uv, depth = project_points(tools[:, arm, :3, 3], camera.K, poses)
+        uvs.append(uv)
+        insides.append((depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width)))
+    verdict = detect_projection(gray, np.stack(uvs, axis=1), np.stack(insides, axis=1), config.projection)
+    return [Finding("projection", view, 2, verdict)]

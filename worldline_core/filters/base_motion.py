@@ -7,31 +7,20 @@ area), the changed area alone keeps the two apart where the arms carry most of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
-from pydantic import Field
 
-from worldline_core.config import StrictModel
-from worldline_core.filters.verdict import Curve, Verdict, long_runs
+from worldline_core.filters.filter_config import BaseMotionConfig, FilterConfig
+from worldline_core.filters.pictures import PICTURE_FAULTS
+from worldline_core.filters.signals import Signals
+from worldline_core.filters.verdict import Curve, Finding, Verdict, bad_frames, long_runs
 
 _CELL = 8
-# A cell has changed when this share of its pixels has.
 _CELL_SHARE = 0.1
+"""A cell has changed when this share of its pixels has."""
 _SAMPLE_S = 0.12
-
-
-class BaseMotionConfig(StrictModel):
-    """Measured on images 96 pixels wide, in cells of 8 x 8 pixels."""
-
-    lag_s: float = Field(default=0.5, gt=0, description="time between the two compared frames")
-    min_level_change: float = Field(default=6.0, gt=0, lt=255, description="grey levels; smaller is noise")
-    min_changed_area: float = Field(
-        default=0.64, gt=0, le=1, description="share of cells that change within the lag in base motion"
-    )
-    min_run_s: float = Field(default=1.0, gt=0, description="shorter stretches are a passer-by or a quick arm")
-    max_moving_share: float = Field(
-        default=0.8, gt=0, le=1, description="share of frames with base motion that condemns the episode"
-    )
 
 
 def changed_area(gray: np.ndarray, usable: np.ndarray, fps: float, config: BaseMotionConfig) -> np.ndarray:
@@ -93,3 +82,15 @@ def detect_base_motion(area: np.ndarray, fps: float, config: BaseMotionConfig) -
         bad,
         {"changed_area": Curve(area, config.min_changed_area)},
     )
+
+
+def find_base_motion(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
+    """In the primary view, unless its camera is known to move."""
+    view = signals.primary_view
+    camera = signals.episode.cameras.get(view)
+    if camera is not None and camera.moving:
+        return []
+    unusable = bad_frames(found, len(signals.gray[view]), *PICTURE_FAULTS, view=view)
+    area = changed_area(signals.gray[view], ~unusable, signals.episode.fps, config.base_motion)
+    verdict = detect_base_motion(area, signals.episode.fps, config.base_motion)
+    return [Finding("base_motion", view, 1, verdict)]

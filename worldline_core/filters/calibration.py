@@ -1,8 +1,7 @@
-"""Calibration: K is sane, camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay fixed.
+"""Calibration: K is plausible, camera poses are rigid, wrist cameras are fixed to their arm, fixed cameras stay fixed.
 
-The calibration doctor as a detector: no usual mistake explains the recording better than what it says of itself.
-
-An explained mistake condemns the episode for Stage II as well: its evidence names the configuration line that repairs
+The calibration doctor is a detector as well: no usual mistake explains the recording better than its own calibration
+does. An explained mistake also excludes the episode from Stage II: its evidence names the configuration line that repairs
 the source, and nothing is repaired silently.
 """
 
@@ -10,39 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from worldline_core.calibration.calibration_doctor import bad_terms, diagnose
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import UnavailableError
-from worldline_core.filters.verdict import Verdict, runs
+from worldline_core.filters.filter_config import CalibrationConfig, FilterConfig, FilterDoctorConfig
+from worldline_core.filters.signals import Signals
+from worldline_core.filters.verdict import Finding, Numbers, Verdict, bad_frames, runs
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import hand_eye_residual
-
-
-class CalibrationConfig(StrictModel):
-    """Lengths in metres, angles in degrees."""
-
-    min_field_of_view_deg: float = Field(default=15.0, gt=0)
-    max_field_of_view_deg: float = Field(default=150.0, lt=180)
-    max_principal_point_offset: float = Field(
-        default=0.25, gt=0, description="from the image centre, share of the image side"
-    )
-    max_rotation_residual: float = Field(default=1e-3, gt=0, description="largest entry of R R^T - I")
-    max_hand_eye_m: float = Field(
-        default=0.012, gt=0, description="deviation of a wrist camera from its mount (95th percentile)"
-    )
-    max_hand_eye_deg: float = Field(default=6.0, gt=0)
-    max_mount_offset_m: float = Field(default=0.08, gt=0, description="from the mount that the embodiment states")
-    max_mount_offset_deg: float = Field(default=20.0, gt=0)
 
 
 def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
@@ -56,8 +36,8 @@ def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, f
 def detect_camera(
     K: np.ndarray, T_base_camera: np.ndarray, width: int, height: int, config: CalibrationConfig
 ) -> Verdict:
-    """Whether K and the poses (n, 4, 4) can be those of a camera with this image size."""
-    numbers: dict[str, float | int | str | None] = {}
+    """Whether K and the poses (n, 4, 4) are plausible for a camera with this image size."""
+    numbers: Numbers = {}
     sane = bool(np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and abs(np.linalg.det(K)) > 1e-9)
     if sane:
         for name, angle in zip(("horizontal", "vertical"), fields_of_view_deg(K, width, height), strict=True):
@@ -87,7 +67,7 @@ def detect_hand_eye(
     mount, metres, degrees = hand_eye_residual(T_base_tool, T_base_camera)
     metres_95, degrees_95 = float(np.percentile(metres, 95)), float(np.percentile(degrees, 95))
     passed = metres_95 <= config.max_hand_eye_m and degrees_95 <= config.max_hand_eye_deg
-    numbers: dict[str, float | int | str | None] = {
+    numbers: Numbers = {
         "hand_eye_m": metres_95,
         "hand_eye_deg": degrees_95,
         "threshold_m": config.max_hand_eye_m,
@@ -112,25 +92,9 @@ def detect_fixed_camera(T_base_camera: np.ndarray, config: CalibrationConfig) ->
     )
 
 
-class FilterDoctorConfig(CalibrationDoctorConfig):
-    """As the doctor's, but other readings are tried only where the recorded one looks bad, and of long or fast
-    recordings a part is looked at."""
-
-    search: Literal["always", "when_suspicious"] = "when_suspicious"
-    rate_hz: float = Field(
-        default=8.0,
-        gt=0,
-        description="frames a second that are compared: at the recorded 30 Hz an arm moves by less than a small image's pixel "
-        "from frame to frame, and a lag of a tenth of a second is more frames than are tried",
-    )
-    max_frames: int = Field(
-        default=40, ge=17, description="at that rate; of longer stretches the part with most motion"
-    )
-
-
 _UNEXPLAINED = "calibration_unexplained"
-# Of fewer frames in a row nothing can be said.
 _MIN_FRAMES = 4
+"""Fewer frames in a row are too little evidence."""
 
 
 def detect_mistake(
@@ -162,7 +126,7 @@ def detect_mistake(
 
 
 def _liveliest(episode: Episode, start: int, stop: int, length: int) -> tuple[int, int]:
-    """Of frames start..stop the `length` in a row whose states change most; all where there are no more."""
+    """Of frames start..stop the `length` consecutive ones whose states change most; all of a shorter stretch."""
     if stop - start <= length:
         return start, stop
     change = np.abs(np.diff(episode.state[start:stop].astype(np.float64), axis=0)).sum(axis=1)
@@ -178,8 +142,8 @@ def _reason(diagnosis: Diagnosis) -> str:
     return "time_alignment" if lags else "calibration"
 
 
-def _numbers(diagnosis: Diagnosis, config: CalibrationDoctorConfig, step: int) -> dict[str, float | int | str | None]:
-    numbers: dict[str, float | int | str | None] = {
+def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Numbers:
+    numbers: Numbers = {
         "verdict": diagnosis.verdict,
         "mistake": diagnosis.best.mistake,
         "score_as_recorded": diagnosis.none.score,
@@ -200,7 +164,7 @@ def _config_lines(best: Explanation, step: int) -> Sequence[str]:
 
 
 def kinematics_of(episode: Episode) -> ArmKinematics | None:
-    """Of the episode's embodiment; None where it is unknown, its description is not here, or it is of another layout."""
+    """Of the episode's embodiment; None where it or its description is not known, or the recording has another layout."""
     kinematics = _load(episode.embodiment) if episode.embodiment in embodiment_names() else None
     if kinematics is None:
         return None
@@ -217,3 +181,35 @@ def _load(name: str) -> ArmKinematics | None:
         return ArmKinematics(load_embodiment(name))
     except UnavailableError:  # the doctor then judges recorded tool poses without a stated mount
         return None
+
+
+def find_calibration_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """Of each camera alone, then of wrist cameras against their tools, then of cameras that should stand still."""
+    tools = signals.calibrated_tools
+    if tools is None:
+        return []
+    thresholds, frames = config.calibration, np.arange(len(tools))
+    cameras = signals.episode.cameras
+    findings: list[Finding] = []
+    for view, camera in cameras.items():
+        verdict = detect_camera(camera.K, camera.T_base_camera, camera.width, camera.height, thresholds)
+        findings.append(Finding("camera", view, 2, verdict))
+    for arm, camera in signals.wrist_cameras:
+        poses = camera.poses(frames)
+        if camera.moving and np.isfinite(poses).all():
+            verdict = detect_hand_eye(tools[:, arm], poses, signals.arms[arm].T_tool_mount, thresholds)
+            findings.append(Finding("hand_eye", camera.view, 2, verdict))
+    wrists = {arm.wrist_view for arm in signals.arms}
+    for view, camera in cameras.items():
+        if view not in wrists and camera.moving and np.isfinite(camera.T_base_camera).all():
+            verdict = detect_fixed_camera(camera.T_base_camera[: len(frames)], thresholds)
+            findings.append(Finding("fixed_camera", view, 2, verdict))
+    return findings
+
+
+def find_mistake(signals: Signals, config: FilterConfig, found: Sequence[Finding]) -> list[Finding]:
+    """Of an episode that Stage I keeps; of any other the calibration does not matter."""
+    if signals.calibrated_tools is None or any(f.stage == 1 and not f.verdict.passed for f in found):
+        return []
+    bad = bad_frames(found, len(signals.gray[signals.primary_view]))
+    return [Finding("doctor", None, 2, detect_mistake(signals.episode, signals.gray, bad, config.doctor))]

@@ -1,164 +1,39 @@
-"""Everything the detectors say about one episode, as JSON: which of its frames may be used, or why none.
+"""All detectors, applied to one episode: which of its frames may be used, or why none.
 
-Apply every detector to one episode's signals.
+A detector is a function of the episode's signals, the thresholds and what was found before it; it gives its findings.
+To add one, see docs/filters.md.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.filters.alignment import detect_image_lag, detect_pose_lag, detect_projection
-from worldline_core.filters.base_motion import changed_area, detect_base_motion
-from worldline_core.filters.calibration import detect_camera, detect_fixed_camera, detect_hand_eye, detect_mistake
-from worldline_core.filters.corrupted import detect_corrupted, without_signal
-from worldline_core.filters.exposure import detect_blur, detect_dark, detect_overexposed
+from worldline_core.filters.alignment import find_lags, find_projection
+from worldline_core.filters.base_motion import find_base_motion
+from worldline_core.filters.calibration import find_calibration_faults, find_mistake
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.filters.motion import detect_joint_jump, detect_joint_speed, detect_reset, detect_static
+from worldline_core.filters.motion import find_joint_faults, find_static
+from worldline_core.filters.pictures import find_picture_faults
 from worldline_core.filters.signals import Signals, measure
-from worldline_core.filters.verdict import Verdict, runs
-from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
-from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import rigid_inverse
+from worldline_core.filters.verdict import Finding, Verdict, runs
 
-if TYPE_CHECKING:
-    from worldline_core.filters.filter_config import FilterConfig
+type Detector = Callable[[Signals, FilterConfig, Sequence[Finding]], list[Finding]]
 
 
-# A wrist camera swings: turning by one radian shows about as much change as travelling this far.
-_METRES_PER_RADIAN = 0.15
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A detector's verdict. `stage`: 1 when a failure drops the episode, 2 when it only excludes it from Stage II."""
-
-    detector: str
-    view: str | None
-    stage: int
-    verdict: Verdict
-
-
-def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
-    """All findings about an episode, Stage I detectors first."""
-    findings = _stage1(config, signals)
+def find_missing_inputs(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """What Stage II needs besides clean frames: actions, required views with calibration, known tool poses."""
     if signals.episode.state_kind == "none":
-        return [*findings, Finding("required_views", None, 2, Verdict("missing_actions", False))]
-    findings += _required(config, signals)
-    if signals.T_base_tool is not None and signals.episode.cameras:
-        # Clocks first: a lag also disturbs the hand-eye check, and is the better explanation.
-        findings += _time_alignment(config, signals, signals.T_base_tool)
-        findings += _calibration(config, signals, signals.T_base_tool)
-        findings += _projection(config, signals, signals.T_base_tool)
-        findings = _with_mistake(config, signals, findings)
-    return findings
-
-
-def _with_mistake(config: FilterConfig, signals: Signals, findings: list[Finding]) -> list[Finding]:
-    """The findings with the calibration doctor's: before the other Stage II findings where it explains them."""
-    num_frames = len(next(iter(signals.gray.values())))
-    bad = np.zeros(num_frames, dtype=bool)
-    for finding in findings:
-        if finding.stage == 1 and not finding.verdict.passed:
-            return findings  # the episode is dropped whole: its calibration is nobody's concern
-        if finding.verdict.bad_frames is not None:
-            bad |= finding.verdict.bad_frames
-    verdict = detect_mistake(signals.episode, signals.gray, bad, config.doctor)
-    found = Finding("doctor", None, 2, verdict)
-    if verdict.numbers["verdict"] != "explained":
-        return [*findings, found]
-    first = next((i for i, f in enumerate(findings) if f.stage == 2 and f.detector != "required_views"), len(findings))
-    return [*findings[:first], found, *findings[first:]]
-
-
-def _arms_of(signals: Signals, view: str) -> tuple[int, ...]:
-    """Arms whose motion a view must show: its own for a wrist view, all for any other."""
-    own = tuple(i for i, arm in enumerate(signals.arms) if arm.wrist_view == view)
-    return own or tuple(range(len(signals.arms)))
-
-
-def _stage1(config: FilterConfig, signals: Signals) -> list[Finding]:
-    episode = signals.episode
-    primary = episode.primary_view if episode.primary_view in signals.gray else next(iter(signals.gray))
-    findings: list[Finding] = []
-    if signals.joints is not None and signals.joints.shape[1]:
-        findings += _joint_findings(config, signals.joints, episode.fps)
-    spoilt = np.zeros(len(signals.gray[primary]), dtype=bool)
-    unreliable = np.logical_or.reduce([spoilt, *(_bad(f) for f in findings if f.detector != "reset")])
-    for view in [primary, *(v for v in signals.gray if v != primary)]:
-        found = _picture_findings(config, signals, view, 1 if view == primary else 2, unreliable)
-        findings += found
-        if view == primary:
-            for finding in found:
-                spoilt |= _bad(finding)
-    pictures = signals.pictures[primary]
-    static = detect_static(
-        signals.joint_speed, signals.gripper_speed, pictures.coarse_change, episode.fps, config.static
-    )
-    findings.append(Finding("static", primary, 1, static))
-    camera = episode.cameras.get(primary)
-    if camera is None or not camera.moving:
-        area = changed_area(signals.gray[primary], ~spoilt, episode.fps, config.base_motion)
-        findings.append(Finding("base_motion", primary, 1, detect_base_motion(area, episode.fps, config.base_motion)))
-    return findings
-
-
-def _joint_findings(config: FilterConfig, joints: np.ndarray, fps: float) -> list[Finding]:
-    """Resets first: what follows one is dropped, so its jump is not counted again."""
-    reset = detect_reset(joints, fps, config.reset)
-    frame = reset.numbers["reset_frame"]
-    before = joints if frame is None else joints[: int(frame)]
-    findings = [Finding("reset", None, 1, reset)]
-    for name, verdict in (
-        ("joint_jump", detect_joint_jump(before, config.joint_motion)),
-        ("joint_speed", detect_joint_speed(before, fps, config.joint_motion)),
-    ):
-        missing = len(joints) - len(before)
-        bad = np.concatenate([verdict.bad_frames, np.zeros(missing, bool)]) if verdict.bad_frames is not None else None
-        findings.append(Finding(name, None, 1, replace(verdict, bad_frames=bad)))
-    return findings
-
-
-def _picture_findings(
-    config: FilterConfig, signals: Signals, view: str, stage: int, unreliable: np.ndarray
-) -> list[Finding]:
-    """What is wrong with the pictures of one view; a frame is counted for the first reason only.
-
-    `unreliable`: bool (n,) frames whose joint readings are wrong.
-    """
-    pictures, wrist = signals.pictures[view], view.endswith("wrist")
-    dark = detect_dark(pictures, config.exposure, wrist=wrist)
-    white = detect_overexposed(pictures, config.exposure, wrist=wrist)
-    findings = [Finding("too_dark", view, stage, dark), Finding("overexposed", view, stage, white)]
-    lost = _bad(findings[0]) | _bad(findings[1])
-    blank, noise = without_signal(pictures, config.corrupted)
-    fps = signals.episode.fps
-    blur = detect_blur(signals.sharpness[view], pictures, lost | blank | noise, fps, config.blur, wrist=wrist)
-    findings.append(Finding("blur", view, stage, blur))
-    tracks = signals.tracks(_arms_of(signals, view))
-    lost |= _bad(findings[-1])
-    corrupted = detect_corrupted(pictures, tracks, lost, unreliable, fps, config.corrupted, wrist=wrist)
-    return [*findings, Finding("corrupted", view, stage, corrupted)]
-
-
-def _bad(finding: Finding) -> np.ndarray:
-    bad = finding.verdict.bad_frames
-    return np.zeros(0, dtype=bool) if bad is None else bad
-
-
-def _required(config: FilterConfig, signals: Signals) -> list[Finding]:
-    """Required views, their calibration, and known tool poses."""
+        return [Finding("required_views", None, 2, Verdict("missing_actions", False))]
     arms = [arm.wrist_view for arm in signals.arms] or ["right_wrist"]
-    required = config.required_views or ("head", *arms)
-    findings = []
-    for view in required:
-        reason = "missing_view" if view not in signals.gray else "missing_calibration"
+    findings: list[Finding] = []
+    for view in config.required_views or ("head", *arms):
+        reason = "missing_calibration" if view in signals.gray else "missing_view"
         passed = view in signals.gray and view in signals.episode.cameras
         findings.append(Finding("required_views", view, 2, Verdict(reason, passed)))
     if signals.T_base_tool is None:
@@ -166,69 +41,30 @@ def _required(config: FilterConfig, signals: Signals) -> list[Finding]:
     return findings
 
 
-def _wrist_cameras(signals: Signals) -> list[tuple[int, CameraTrack]]:
-    cameras = signals.episode.cameras
-    return [(i, cameras[arm.wrist_view]) for i, arm in enumerate(signals.arms) if arm.wrist_view in cameras]
+DETECTORS: tuple[Detector, ...] = (
+    find_joint_faults,  # reset, joint_jump, joint_speed
+    find_picture_faults,  # too_dark, overexposed, blur, corrupted, in each view
+    find_static,
+    find_base_motion,
+    find_missing_inputs,  # required_views
+    find_lags,  # image_lag, pose_lag: before calibration, since a lag also disturbs the hand-eye check
+    find_calibration_faults,  # camera, hand_eye, fixed_camera
+    find_projection,
+    find_mistake,  # doctor
+)
+"""In this order: Stage I first. Of several findings that drop an episode the first one is its reason."""
 
 
-def _calibration(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
-    findings = []
-    num_frames = len(T_base_tool)
-    for view, camera in signals.episode.cameras.items():
-        verdict = detect_camera(camera.K, camera.T_base_camera, camera.width, camera.height, config.calibration)
-        findings.append(Finding("camera", view, 2, verdict))
-    for i, camera in _wrist_cameras(signals):
-        poses = camera.poses(np.arange(num_frames))
-        if not camera.moving or not np.isfinite(poses).all():
-            continue
-        verdict = detect_hand_eye(T_base_tool[:, i], poses, signals.arms[i].T_tool_mount, config.calibration)
-        findings.append(Finding("hand_eye", camera.view, 2, verdict))
-    wrists = {arm.wrist_view for arm in signals.arms}
-    for view, camera in signals.episode.cameras.items():
-        if view not in wrists and camera.moving and np.isfinite(camera.T_base_camera).all():
-            verdict = detect_fixed_camera(camera.T_base_camera[:num_frames], config.calibration)
-            findings.append(Finding("fixed_camera", view, 2, verdict))
+def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
+    """All findings about an episode. A mistake that the calibration doctor explains comes before what it explains."""
+    findings: list[Finding] = []
+    for detect in DETECTORS:
+        findings += detect(signals, config, findings)
+    doctor = findings[-1]
+    if doctor.detector == "doctor" and doctor.verdict.numbers["verdict"] == "explained":
+        explained = (i for i, f in enumerate(findings) if f.stage == 2 and f.detector != "required_views")
+        findings.insert(next(explained), findings.pop())
     return findings
-
-
-def _time_alignment(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
-    fps = signals.episode.fps
-    relative = rigid_inverse(T_base_tool[:-1]) @ T_base_tool[1:]
-    motion = np.linalg.norm(relative[..., :3, 3], axis=-1)
-    motion = motion + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
-    streams, changes = [], []
-    for view, pictures in signals.pictures.items():
-        arms = _arms_of(signals, view)
-        if arms:
-            streams.append(motion[:, list(arms)].max(axis=1))
-            changes.append(pictures.change[1:])
-    findings = []
-    if streams:
-        verdict = detect_image_lag(np.stack(streams, axis=1), np.stack(changes, axis=1), fps, config.time_alignment)
-        findings.append(Finding("image_lag", None, 2, verdict))
-    for i, camera in _wrist_cameras(signals):
-        if camera.moving and np.isfinite(camera.T_base_camera).all():
-            poses = camera.poses(np.arange(len(T_base_tool)))
-            verdict = detect_pose_lag(T_base_tool[:, i], poses, fps, config.time_alignment)
-            findings.append(Finding("pose_lag", camera.view, 2, verdict))
-    return findings
-
-
-def _projection(config: FilterConfig, signals: Signals, T_base_tool: np.ndarray) -> list[Finding]:
-    view = signals.episode.primary_view
-    camera = signals.episode.cameras.get(view)
-    if camera is None or view not in signals.gray or not np.isfinite(camera.K).all():
-        return []
-    gray = signals.gray[view]
-    camera = camera.resized(gray.shape[2], gray.shape[1])
-    poses = camera.poses(np.arange(len(gray)))
-    uvs, insides = [], []
-    for arm in range(T_base_tool.shape[1]):
-        uv, depth = project_points(T_base_tool[:, arm, :3, 3], camera.K, poses)
-        uvs.append(uv)
-        insides.append((depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width)))
-    verdict = detect_projection(gray, np.stack(uvs, axis=1), np.stack(insides, axis=1), config.projection)
-    return [Finding("projection", view, 2, verdict)]
 
 
 def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any]:
@@ -272,7 +108,7 @@ def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> dict[str, Any
 def _cuts(findings: list[Finding]) -> list[tuple[Finding, np.ndarray]]:
     """The findings that cut frames out, with those frames.
 
-    A view that is bad for most of the time bars the episode from Stage II, and Stage I does not look at it: no cut.
+    A view other than the primary one that is mostly bad excludes the episode from Stage II instead: nothing is cut.
     """
     return [
         (finding, finding.verdict.bad_frames)

@@ -1,51 +1,20 @@
-"""Static stretches: neither the robot nor the image moves.
+"""Motion of the robot: static stretches, resets, and joint readings that no arm can make.
 
-Resets: the robot goes back to where it began at once, as when two attempts were recorded into one file.
-
-Joint motion that no arm can make: readings that jump, and speeds beyond what the motors reach.
+Static: neither the robot nor the image moves. Reset: the robot returns to where it began at once, as when two attempts
+were recorded into one file. Joint readings: jumps, and speeds beyond what the motors reach.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from pydantic import Field
 
-from worldline_core.config import StrictModel
-from worldline_core.filters.verdict import Curve, Numbers, Verdict, runs
-
-SPEED_WINDOW_S = 0.5
-
-
-class StaticConfig(StrictModel):
-    """A stretch is static when all three stay below their thresholds."""
-
-    max_joint_speed_rad_s: float = Field(
-        default=0.03, gt=0, description="range of a joint within half a second, a second: encoder noise hardly counts"
-    )
-    max_gripper_speed_per_s: float = Field(default=0.05, gt=0)
-    max_image_change: float = Field(
-        default=0.6, gt=0, description="mean absolute change a frame of the coarse image, of 255"
-    )
-    min_run_s: float = Field(default=1.5, gt=0, description="shorter pauses are part of manipulation")
-
-
-def range_speed(values: np.ndarray, fps: float) -> np.ndarray:
-    """(n,) largest range of a column within SPEED_WINDOW_S around each frame, per second.
-
-    A difference of neighbours would multiply encoder noise by the frame rate.
-
-    Args:
-        values: (n, j).
-    """
-    count = len(values)
-    if values.shape[1] == 0 or count < 2:
-        return np.zeros(count)
-    reach = max(1, round(SPEED_WINDOW_S * fps / 2))
-    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
-    return (windows.max(axis=-1) - windows.min(axis=-1)).max(axis=1) * fps / (2 * reach)
+from worldline_core.filters.filter_config import FilterConfig, JointMotionConfig, ResetConfig, StaticConfig
+from worldline_core.filters.signals import SPEED_WINDOW_S, Signals
+from worldline_core.filters.verdict import Curve, Finding, Numbers, Verdict, bad_frames, runs
 
 
 def detect_static(
@@ -55,11 +24,11 @@ def detect_static(
 
     Args:
         joint_speed: (n,) `range_speed` of the joints [rad/s] (or tools [m/s] where poses are recorded).
-        gripper_speed: (n,) the same of the grippers, openings a second.
+        gripper_speed: (n,) the same of the grippers, openings per second.
         image_change: (n,) mean absolute change of the coarse task-facing image, of 255.
     """
     still = (joint_speed < config.max_joint_speed_rad_s) & (gripper_speed < config.max_gripper_speed_per_s)
-    # Half a window at either end saw the motion beside the stretch.
+    # At either end half a window also covers the motion beside the stretch.
     still = _widened(still, max(1, round(SPEED_WINDOW_S * fps / 2)))
     still &= image_change < config.max_image_change
     bad = np.zeros(len(still), dtype=bool)
@@ -93,24 +62,8 @@ def _widened(flags: np.ndarray, by: int) -> np.ndarray:
     return wide
 
 
-class ResetConfig(StrictModel):
-    """A reset covers most of the way back to the first pose within a moment, faster than the episode moves otherwise."""
-
-    min_jump_rad: float = Field(default=0.15, gt=0, description="a shorter way home is jitter")
-    home_share: float = Field(
-        default=0.2, gt=0, lt=1, description="distance to the first pose after, relative to before the way home"
-    )
-    max_return_s: float = Field(default=0.7, gt=0, description="a slower way home is motion like any other")
-    min_relative_step: float = Field(
-        default=1.15, ge=1, description="a single step home, relative to the episode's other steps (90th percentile)"
-    )
-    min_relative_speed: float = Field(
-        default=1.7, ge=1, description="mean speed of a way home of several steps, relative to the same"
-    )
-
-
-def way_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, int] | None:
-    """Frames (last before, first after) of the first way home, or None.
+def return_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, int] | None:
+    """Frames (last before, first after) of the first return to the first pose, or None.
 
     Args:
         joints: (n, j) [rad].
@@ -121,7 +74,7 @@ def way_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, 
     for i, j in _candidates(from_home, steps, longest, config):
         usual = _usual(np.concatenate([steps[:i], steps[j:]]))
         if (from_home[i] - from_home[j]) / (j - i) > _least(j - i, config) * usual:
-            # The way home may have begun before the part of it that leads straight there.
+            # The return may have begun before the part of it that leads straight home.
             begin = i
             while begin > max(j - longest, 0) and steps[begin - 1] > usual:
                 begin -= 1
@@ -130,11 +83,11 @@ def way_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[int, 
 
 
 def _candidates(from_home: np.ndarray, steps: np.ndarray, longest: int, config: ResetConfig) -> list[tuple[int, int]]:
-    """Pairs of frames between which the robot comes home at a speed that may be unusual: earliest, then shortest, first."""
+    """Pairs of frames between which the robot returns home at a speed that may be unusual; earliest first, then shortest."""
     ordered = np.sort(steps)
     pairs: list[tuple[int, int]] = []
     for span in range(1, longest + 1):
-        # The slowest steps alone bound the usual speed of any others from below.
+        # The slowest steps alone give a lower bound of the usual speed.
         least = _least(span, config) * _usual(ordered[: len(ordered) - span])
         before, after = from_home[:-span], from_home[span:]
         home = (before > config.min_jump_rad) & (after < config.home_share * before)
@@ -152,19 +105,19 @@ def _least(span: int, config: ResetConfig) -> float:
 
 
 def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict:
-    """Frames from the first way home on.
+    """Frames from the first return to the first pose on.
 
     Args:
         joints: (n, j) joint positions [rad], without grippers.
     """
     from_home = np.abs(joints - joints[0]).max(axis=1)
-    found = way_home(joints, fps, config)
+    found = return_home(joints, fps, config)
     bad = np.zeros(len(joints), dtype=bool)
     if found is not None:
         bad[found[0] + 1 :] = True
     return Verdict(
         "reset",
-        True,  # the attempt before the way home stays, if it is long enough
+        True,  # the attempt before the return stays, if it is long enough
         {
             "furthest_from_home_rad": float(from_home.max()),
             "reset_frame": None if found is None else found[0] + 1,
@@ -178,22 +131,12 @@ def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict
 
 
 _WINDOW = 4
-# A reading that jumps away and back makes two large steps; a third makes it motion.
 _LARGE_STEPS = 2
-
-
-class JointMotionConfig(StrictModel):
-    """Joint positions in radians. Arms of this size reach 2 to 4 rad/s (Panda 2.6, UR5e and xArm 3.1, ViperX 3.1)."""
-
-    min_jump_rad: float = Field(default=0.3, gt=0, description="smaller steps from frame to frame are no jump")
-    min_relative_step: float = Field(
-        default=3.0, gt=1, description="a jump, of the largest other step of the joint within four frames"
-    )
-    max_speed_rad_s: float = Field(default=7.0, gt=0, description="faster is no motion of an arm")
+"""A reading that jumps away and back makes two large steps; with a third it is motion."""
 
 
 def jump_steps(joints: np.ndarray, config: JointMotionConfig) -> np.ndarray:
-    """bool (n - 1, j): steps that stand alone among small ones.
+    """bool (n - 1, j): large steps among small ones.
 
     Args:
         joints: (n, j) [rad].
@@ -235,7 +178,7 @@ def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
 
 
 def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig) -> Verdict:
-    """Stretches of two frames or more above the speed limit; a single step is a jump, if anything.
+    """Stretches of two frames or more above the speed limit; a single step is left to the detector of jumps.
 
     Args:
         joints: (n, j) joint positions [rad], without grippers.
@@ -257,3 +200,30 @@ def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig
         bad,
         {"joint_speed_rad_s": Curve(np.concatenate([[0.0], speed]), config.max_speed_rad_s)},
     )
+
+
+def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """Resets first: what follows one is dropped, so its jump is not counted again."""
+    joints, fps = signals.joints, signals.episode.fps
+    if joints is None or not joints.shape[1]:
+        return []
+    reset = detect_reset(joints, fps, config.reset)
+    frame = reset.numbers["reset_frame"]
+    before = joints if frame is None else joints[: int(frame)]
+    findings = [Finding("reset", None, 1, reset)]
+    for name, verdict in (
+        ("joint_jump", detect_joint_jump(before, config.joint_motion)),
+        ("joint_speed", detect_joint_speed(before, fps, config.joint_motion)),
+    ):
+        bad = bad_frames([Finding(name, None, 1, verdict)], len(before))
+        verdict = replace(verdict, bad_frames=np.pad(bad, (0, len(joints) - len(before))))
+        findings.append(Finding(name, None, 1, verdict))
+    return findings
+
+
+def find_static(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """In the primary view."""
+    view = signals.primary_view
+    change = signals.pictures[view].coarse_change
+    verdict = detect_static(signals.joint_speed, signals.gripper_speed, change, signals.episode.fps, config.static)
+    return [Finding("static", view, 1, verdict)]

@@ -1,6 +1,6 @@
-"""Measured signals of an episode that the detectors look at: tool poses, speeds, small grey images, image change.
+"""What the detectors look at: tool poses and speeds of an episode, its small grey images, and statistics of each image.
 
-Numbers about each small grey picture of a view, which several detectors look at. About 0.05 ms a picture.
+The statistics take about 0.05 ms per image.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.filters.motion import range_speed
 
+SPEED_WINDOW_S = 0.5
 WHITE_LEVEL = 245
-"""Luma from which a pixel tells nothing any more."""
+"""Luma from which a pixel counts as saturated."""
 _FLAT_LEVELS = 2
 _COARSE = 4
-# Pictures whose differences are worked on at a time: they stay in the processor's cache.
 _BATCH = 16
+"""Images whose differences are computed at a time: they stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _differences(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         part = slice(start, start + _BATCH)
         rows = np.ascontiguousarray(gray[part]).reshape(-1, width)
         across[part] = row_sums(rows[:, 1:], rows[:, :-1], squared=True).reshape(-1, height).sum(axis=1)
-        # The last row of a picture and the first one of the next are no neighbours.
+        # The last row of an image and the first one of the next are not adjacent.
         below = np.append(row_sums(rows[1:], rows[:-1], squared=True), 0.0)
         down[part] = below.reshape(-1, height)[:, :-1].sum(axis=1)
         with_previous = np.ascontiguousarray(gray[max(start - 1, 0) : part.stop]).reshape(-1, width)
@@ -126,8 +126,25 @@ def _flat_edge(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return (highest - lowest <= _FLAT_LEVELS).mean(axis=1)
 
 
-_METRES_A_RADIAN = 0.3
-"""How far a tool gets whose arm nobody knows, a radian of a joint: half the reach of a small arm."""
+_METRES_PER_RADIAN = 0.3
+"""How far the tool of an unknown arm moves per radian of a joint: half the reach of a small arm."""
+
+
+def range_speed(values: np.ndarray, fps: float) -> np.ndarray:
+    """(n,) largest range of a column within SPEED_WINDOW_S around each frame, per second.
+
+    A difference of neighbours would multiply encoder noise by the frame rate.
+
+    Args:
+        values: (n, j).
+    """
+    count = len(values)
+    if values.shape[1] == 0 or count < 2:
+        return np.zeros(count)
+    reach = max(1, round(SPEED_WINDOW_S * fps / 2))
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
+    return (windows.max(axis=-1) - windows.min(axis=-1)).max(axis=1) * fps / (2 * reach)
 
 
 @dataclass(frozen=True)
@@ -161,17 +178,38 @@ class Signals:
     T_base_tool: np.ndarray | None
     arms: tuple[ArmModel, ...]
 
-    def tracks(self, arms: tuple[int, ...]) -> np.ndarray:
-        """(n, k, 3) positions [m] of the tools of some arms; where tools are unknown, the joints stand in for them.
+    @property
+    def primary_view(self) -> str:
+        """The view that decides for Stage I: the episode's primary one, or its first where that one has no images."""
+        return self.episode.primary_view if self.episode.primary_view in self.gray else next(iter(self.gray))
 
-        Nothing is known to move where joints are unknown too: k is 0.
+    @property
+    def calibrated_tools(self) -> np.ndarray | None:
+        """T_base_tool where there are calibrated cameras to compare the tools with; else None."""
+        return self.T_base_tool if self.episode.state_kind != "none" and self.episode.cameras else None
+
+    @property
+    def wrist_cameras(self) -> list[tuple[int, CameraTrack]]:
+        """(index of the arm, its wrist camera), of the calibrated ones."""
+        cameras = self.episode.cameras
+        return [(i, cameras[arm.wrist_view]) for i, arm in enumerate(self.arms) if arm.wrist_view in cameras]
+
+    def arms_in(self, view: str) -> tuple[int, ...]:
+        """Arms whose motion a view must show: its own for a wrist view, all for any other."""
+        own = tuple(i for i, arm in enumerate(self.arms) if arm.wrist_view == view)
+        return own or tuple(range(len(self.arms)))
+
+    def tracks(self, arms: tuple[int, ...]) -> np.ndarray:
+        """(n, k, 3) positions [m] of the tools of some arms; where tools are unknown, joints stand in for them.
+
+        k is 0 where joints are unknown too.
         """
         count = len(self.joint_speed)
         if self.T_base_tool is not None and arms:
             return self.T_base_tool[:, list(arms)][..., :3, 3]
         if self.joints is None:
             return np.zeros((count, 0, 3))
-        return np.concatenate([self.joints[..., None] * _METRES_A_RADIAN, np.zeros((*self.joints.shape, 2))], axis=-1)
+        return np.concatenate([self.joints[..., None] * _METRES_PER_RADIAN, np.zeros((*self.joints.shape, 2))], axis=-1)
 
 
 def measure(episode: Episode, thumbnails: Mapping[str, ViewThumbnails]) -> Signals:

@@ -1,11 +1,8 @@
-"""What a detector says about an episode.
-
-Reason codes of the filters, each in one sentence; docs/filters.md says more.
-"""
+"""What a detector says about an episode, and the reason codes, each in one sentence; docs/filters.md says more."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,6 +40,29 @@ class Verdict:
     def clean(self) -> bool:
         """Whether nothing at all was found."""
         return self.passed and (self.bad_frames is None or not self.bad_frames.any())
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A verdict of a detector, with the view that it was given for (None: for the whole episode).
+
+    `stage`: 1 when a failure drops the episode, 2 when it only excludes it from Stage II.
+    """
+
+    detector: str
+    view: str | None
+    stage: int
+    verdict: Verdict
+
+
+def bad_frames(found: Iterable[Finding], count: int, *detectors: str, view: str | None = None) -> np.ndarray:
+    """bool (count,): frames that one of the named detectors (all, if none is named) called bad, in a view or in any."""
+    bad = np.zeros(count, dtype=bool)
+    for finding in found:
+        named = not detectors or finding.detector in detectors
+        if named and view in (None, finding.view) and finding.verdict.bad_frames is not None:
+            bad |= finding.verdict.bad_frames
+    return bad
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -85,4 +105,4 @@ REASONS: dict[str, str] = {
     "projection": "Tools do not lie where the picture moves.",
     "time_alignment": "Pictures, camera poses and states show different instants.",
 }
-"""By code; a missing one is a code of curation or of a later version."""
+"""By code; a code that is not here is curation's or a later version's."""

@@ -24,9 +24,8 @@ from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
     from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.filters.examine import Finding
     from worldline_core.filters.filter_config import FilterConfig
-    from worldline_core.filters.verdict import Curve
+    from worldline_core.filters.verdict import Curve, Finding
 
 KEPT = "kept"
 LOST_WITH_THEM = "lost_with_them"
