@@ -50,7 +50,6 @@ for (const card of document.querySelectorAll("[data-player]")) {
   let wanted = !still, seen = false;
   const apply = () => {
     for (const video of videos) {
-      if (bar) video.removeAttribute("controls");
       video.playbackRate = rate;
       if (wanted && seen && video.offsetParent !== null) video.play().catch(() => {});
       else video.pause();
@@ -71,8 +70,11 @@ for (const card of document.querySelectorAll("[data-player]")) {
   };
   const tick = () => { if (wanted && seen) show(); requestAnimationFrame(tick); };
   const toggle = () => { wanted = !wanted; apply(); };
-  for (const video of videos) if (bar) video.addEventListener("click", toggle);
   if (bar) {
+    for (const video of videos) {
+      video.removeAttribute("controls");
+      video.addEventListener("click", toggle);
+    }
     button.addEventListener("click", toggle);
     slider.addEventListener("input", () => {
       wanted = false;
@@ -85,6 +87,7 @@ for (const card of document.querySelectorAll("[data-player]")) {
   card.addEventListener("change-view", () => { show(); apply(); });
   card.addEventListener("change-rate", apply);
   new IntersectionObserver(([entry]) => { seen = entry.isIntersecting; apply(); }, { threshold: 0.2 }).observe(card);
+  apply();
 }
 for (const button of document.querySelectorAll("[data-speed]")) {
   button.addEventListener("click", () => {

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,22 +26,6 @@ def evenly_spaced(count: int, wanted: int) -> list[int]:
     if count <= 0:
         return []
     return [round(i) for i in np.linspace(0, count - 1, min(wanted, count))]
-
-
-def one_of_each(rows: Sequence[Mapping[str, Any]], most: int) -> list[int]:
-    """Rows of an episode index that show every pair of embodiment and task once, at most `most`: failures and successes
-    in turn."""
-    seen: dict[tuple[str, str], list[int]] = {}
-    for index, row in enumerate(rows):
-        seen.setdefault((row["embodiment"], row["task_family"]), []).append(index)
-    chosen: list[int] = []
-    for turn, key in enumerate(sorted(seen)):
-        wanted = "failure" if turn % 2 else "success"
-        candidates = sorted(seen[key], key=lambda i: (rows[i]["outcome"] != wanted, rows[i]["episode_id"]))
-        chosen.append(candidates[0])
-    if len(chosen) > most:
-        chosen = [chosen[round(i)] for i in np.linspace(0, len(chosen) - 1, most)]
-    return chosen
 
 
 def contact_sheet(

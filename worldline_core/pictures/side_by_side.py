@@ -13,7 +13,7 @@ from worldline_core.data.video.encoder import encode_video
 from worldline_core.pictures.labels import Upscale, jpeg_bytes, scale_frames, scaled_size, text_strip
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
-LABEL_HEIGHT_PX = 32
+LABEL_HEIGHT_PX = 40
 GAP_PX = 6
 STRIP_PAPER = (24, 26, 31)
 STRIP_INK = (240, 240, 238)
@@ -55,7 +55,7 @@ def compose_side_by_side(
     height, width = scaled_size(first.shape[1], first.shape[2], tile_height)
     pieces: list[NDArray[np.uint8]] = []
     gap = np.full((count, height + LABEL_HEIGHT_PX * labels, GAP_PX, 3), STRIP_PAPER, dtype=np.uint8)
-    size_px = 19 if width >= 260 else 15
+    size_px = 26 if width >= 360 else 19 if width >= 260 else 15
     for label, frames in columns.items():
         body = scale_frames(frames[:count], (height, width), upscale)
         if labels:

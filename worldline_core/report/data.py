@@ -6,15 +6,15 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from markupsafe import Markup
 
-from worldline_core.errors import DataError
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.pages.page import Table, number, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, one_of_each
+from worldline_core.pictures.contact_sheet import contact_sheet
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.dataset_card import card_part
 from worldline_core.report.dataset_facts import DatasetFacts
+from worldline_core.report.episode_sheet import episode_rows, one_of_each
 from worldline_core.store.artifact_files import JsonObject, read_rows
 
 TITLE = "Data"
@@ -36,7 +36,7 @@ def data_section(context: ReportContext) -> Section:
         f" {split_note(rows)} Outcomes are labels for evaluation and never reach the model."
     )
     facts = DatasetFacts.read(folder)
-    sheet, unreadable = contact_sheet_of(context, folder, rows)
+    sheet, unreadable = contact_sheet_of(context, folder)
     return context.section(
         "data",
         TITLE,
@@ -112,25 +112,11 @@ def scene_table(rows: Sequence[JsonObject]) -> Table:
     return Table(("Scene", "Embodiments", "Split", "Episodes", *OUTCOMES), body, range(3, 7))
 
 
-def contact_sheet_of(
-    context: ReportContext, folder: Path, rows: Sequence[JsonObject]
-) -> tuple[Markup | None, list[str]]:
+def contact_sheet_of(context: ReportContext, folder: Path) -> tuple[Markup | None, list[str]]:
     """One episode per embodiment and task, six moments of its primary view; and what could not be shown."""
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-
     episodes = EpisodeSet.open(folder)
-    pictures: list[SheetRow] = []
-    unreadable: list[str] = []
-    for index in one_of_each(rows, context.config.contact_sheet_rows):
-        row = rows[index]
-        try:
-            frames = episodes.frames(index, row.get("primary_view") or "head", evenly_spaced(row["num_frames"], 6))
-        except DataError as error:
-            unreadable.append(f"{row['episode_id']}: {error.what}")
-            continue
-        note = f"{row['episode_id']}  ·  {row['scene']}  ·  {words(row['split'])}  ·  {row['outcome']}"
-        pictures.append(SheetRow(f"{row['embodiment']}  ·  {row['instruction']}", np.asarray(frames), note))
-    if not pictures:
+    shown, unreadable = episode_rows(episodes, one_of_each(episodes.rows, context.config.contact_sheet_rows))
+    if not shown:
         return None, unreadable
-    sheet = contact_sheet(pictures, tile_height=128)
-    return context.picture("contact_sheet", sheet, alt="Contact sheet of recorded episodes", photo=True), unreadable
+    alt = "Contact sheet of recorded episodes"
+    return context.picture("contact_sheet", contact_sheet(shown), alt=alt, photo=True), unreadable

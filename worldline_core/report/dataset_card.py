@@ -10,25 +10,22 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 import yaml
 from markupsafe import Markup
 
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.errors import DataError
 from worldline_core.pages.charts import funnel_chart
 from worldline_core.pages.page import markdown, render, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.contact_sheet import contact_sheet
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.report.dataset_facts import UNKNOWN, DatasetFacts, hours_of
+from worldline_core.report.episode_sheet import episode_rows, some_of_each
 from worldline_core.store.atomic import write_bytes_atomic
 
 PICTURES = "pictures"
 ROWS_PER_SOURCE = 6
-MOMENTS = 6
 SHEET_WIDTH = 1180
 MOST_INSTRUCTIONS = 15
 MOST_LEAKS = 12
@@ -313,37 +310,11 @@ def _write_pictures(facts: DatasetFacts, output: Path) -> list[tuple[str, str, i
     episodes = EpisodeSet.open(facts.folder)
     written: list[tuple[str, str, int]] = []
     for number, name in enumerate(facts.names):
-        rows = [row for index in _examples(facts, name) if (row := _sheet_row(episodes, index)) is not None]
+        own = [i for i, row in enumerate(facts.rows) if row.source == name and row.primary_view in row.views]
+        rows, _ = episode_rows(episodes, some_of_each(facts.rows, own, ROWS_PER_SOURCE))
         if rows:
             file = f"source_{number:02d}.jpg"
             sheet = contact_sheet(rows, tile_height=128, min_width=SHEET_WIDTH)
             write_bytes_atomic(output / PICTURES / file, jpeg_bytes(sheet))
             written.append((name, file, len(rows)))
     return written
-
-
-def _examples(facts: DatasetFacts, source: str) -> list[int]:
-    """Positions of up to six rows of a source, over its embodiments and tasks as far as they go."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for position, row in enumerate(facts.rows):
-        if row.source == source and row.primary_view in row.views:
-            groups.setdefault((row.embodiment, row.task_family), []).append(position)
-    turns = [positions for _, positions in sorted(groups.items())]
-    chosen: list[int] = []
-    depth = 0
-    while len(chosen) < ROWS_PER_SOURCE and any(depth < len(positions) for positions in turns):
-        chosen += [positions[depth] for positions in turns if depth < len(positions)]
-        depth += 1
-    if len(turns) > ROWS_PER_SOURCE:
-        chosen = [chosen[round(i)] for i in np.linspace(0, len(turns) - 1, ROWS_PER_SOURCE)]
-    return sorted(chosen[:ROWS_PER_SOURCE])
-
-
-def _sheet_row(episodes: EpisodeSet, index: int) -> SheetRow | None:
-    row = episodes.rows[index]
-    try:
-        frames = np.asarray(episodes.frames(index, row.primary_view, evenly_spaced(row.video_frames, MOMENTS)))
-    except (DataError, RejectedInputError):
-        return None  # the caption counts the episodes that are shown
-    title = f"{row.embodiment}  ·  {row.instruction or '(no instruction)'}"
-    return SheetRow(title, frames, f"{row.episode_id}  ·  {row.scene}  ·  {row.split}  ·  {row.outcome}")

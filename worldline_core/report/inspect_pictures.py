@@ -13,9 +13,10 @@ from tqdm import tqdm
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.pages.page import render, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, one_of_each
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture, png_bytes
 from worldline_core.report.actions import episode_overlay
+from worldline_core.report.episode_sheet import MOMENTS, episode_rows, one_of_each
 from worldline_core.report.refusals import episode_of
 from worldline_core.store.artifact_files import linked_folder, read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
 SHEET_ROWS = 8
-MOMENTS = 6
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,8 @@ class Subject:
     def sheet(self, episode_id: str | None, notes: list[str]) -> Picture | None:
         """Moments of one episode with its controls, or of several episodes (of one, for ActionTracks)."""
         if episode_id is None and self.kind == "EpisodeSet":
-            return episode_sheet(self.episodes)
+            rows, _ = episode_rows(self.episodes, one_of_each(self.episodes.rows, SHEET_ROWS))
+            return contact_sheet(rows) if rows else None
         if self.kind == "RolloutSet":
             return rollout_sheet(self.rollouts, episode_id)
         chosen = episode_id or self.first_episode
@@ -227,8 +228,7 @@ class Subject:
         An episode that cannot be shown stays on the page, with the reason.
         """
         rows = self.episodes.rows
-        index = read_rows(self.episodes.root / "index.parquet")
-        chosen = sorted(one_of_each(index, count)) if count else list(range(len(rows)))
+        chosen = sorted(one_of_each(rows, count)) if count else list(range(len(rows)))
         cards: list[dict[str, object]] = []
         for position in tqdm(chosen, "page", unit="episode", disable=None):
             row = rows[position]
@@ -276,19 +276,6 @@ class Subject:
         return path
 
 
-def episode_sheet(episodes: EpisodeSet) -> Picture | None:
-    """Six moments of up to eight episodes, spread over embodiments and tasks."""
-    rows: list[SheetRow] = []
-    for index in one_of_each(read_rows(episodes.root / "index.parquet"), SHEET_ROWS):
-        row = episodes.rows[index]
-        try:
-            frames = np.asarray(episodes.frames(index, row.primary_view, evenly_spaced(row.video_frames, MOMENTS)))
-        except DataError:
-            continue
-        rows.append(SheetRow(f"{row.embodiment}  ·  {row.instruction}  ·  {row.outcome}", frames, row.episode_id))
-    return contact_sheet(rows) if rows else None
-
-
 def rollout_sheet(rollouts: RolloutSet, episode_id: str | None) -> Picture | None:
     """Six moments of one prediction in all its views, or of up to eight predictions, head view first.
 
@@ -309,15 +296,9 @@ def rollout_sheet(rollouts: RolloutSet, episode_id: str | None) -> Picture | Non
             rows.append(SheetRow(view, frames[evenly_spaced(len(frames), MOMENTS)]))
         return contact_sheet(rows, title=f"{rollouts.method}  ·  {episode_id}")
     views = {str(row["episode_id"]): str(row["view"]) for row in reversed(read_rows(rollouts.root / "index.parquet"))}
-    for episode_id in evenly_chosen(sorted(rollouts.episode_ids)):
+    names = sorted(rollouts.episode_ids)
+    for episode_id in [names[i] for i in evenly_spaced(len(names), SHEET_ROWS)]:
         frames = np.asarray(rollouts.frames(episode_id, views[episode_id], rollouts.seeds(episode_id)[0]))
         moments = evenly_spaced(len(frames), MOMENTS)
         rows.append(SheetRow(f"{rollouts.method}  ·  {episode_id}", frames[moments], views[episode_id]))
     return contact_sheet(rows) if rows else None
-
-
-def evenly_chosen(names: list[str]) -> list[str]:
-    """Up to eight names, spread over the list."""
-    if len(names) <= SHEET_ROWS:
-        return names
-    return [names[round(i)] for i in np.linspace(0, len(names) - 1, SHEET_ROWS)]

@@ -103,7 +103,7 @@ def compare_with_history(scores: Mapping[str, Path], history: Path, night: str |
     )
     context = ReportContext(ReportConfig(), ReportInputs({**scores, "history": history}), history)
     nights = nights_section(context)
-    sections = [nights, *(make(context) for make in (quality_section, policy_section, planning_section))]
+    sections = [make(context) for make in (quality_section, policy_section, planning_section)]
     text = f"Night {compared.night}: {len(compared.regressions)} of {len(compared.changes)} metrics became worse."
     first = replace(nights, title="WorldLine nightly evaluation", lead=f"{text} {nights.lead}")
     context.write_pages(

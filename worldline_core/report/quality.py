@@ -14,12 +14,12 @@ from worldline_core.report.video_scores import IOU_METRICS, SPLIT_LABELS, VideoS
 
 TITLE = "Video quality"
 METRICS: dict[str, tuple[str, int]] = {
-    "robot_iou_exact": ("Robot IoU, exact ↑", 3),
-    "robot_iou": ("Robot IoU, segmenter ↑", 3),
-    "ssim": ("SSIM ↑", 3),
-    "psnr": ("PSNR, dB ↑", 2),
-    "lpips": ("LPIPS ↓", 3),
-    "end_effector_error_px": ("Tool error, px ↓", 2),
+    "robot_iou_exact": ("Robot IoU, exact\u00a0↑", 3),
+    "robot_iou": ("Robot IoU, segmenter\u00a0↑", 3),
+    "ssim": ("SSIM\u00a0↑", 3),
+    "psnr": ("PSNR, dB\u00a0↑", 2),
+    "lpips": ("LPIPS\u00a0↓", 3),
+    "end_effector_error_px": ("Tool error, px\u00a0↓", 2),
 }
 """Heading and digits of each metric that the tables show."""
 SUBGROUP_METRICS = ("robot_iou_exact", "robot_iou", "ssim", "psnr")
