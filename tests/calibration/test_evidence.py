@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from worldline_core.calibration.gripper_evidence import finger_flow, stopped_share
 from worldline_core.calibration.hypotheses import camera_lags, intrinsics_sizes, tool_offset
 from worldline_core.calibration.image_evidence import (
-    log_likelihood,
+    correlation_log_likelihood,
     still_view_agreement,
     wrist_flow_agreement,
 )
 from worldline_core.calibration.measures import refined_peak
 from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
-from worldline_core.calibration.pose_evidence import pose_terms, rms_hand_eye, unrest_log_likelihood
+from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, pose_terms, rms_hand_eye
 from worldline_core.calibration.reading import read
 from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
 from worldline_core.data.episodes.conventions import RecordedConventions
@@ -270,11 +270,15 @@ def test_no_stated_mount_no_offset() -> None:
 
 def test_log_likelihoods_fall_with_disagreement() -> None:
     typical = Typical(value=0.9, samples=20)
-    assert log_likelihood(0.9, typical) == pytest.approx(0.0)
-    assert log_likelihood(0.95, typical) > 0 > log_likelihood(0.8, typical)
-    assert log_likelihood(-0.5, typical) == log_likelihood(0.0, typical) == pytest.approx(10 * np.log(1 - 0.81))
-    assert unrest_log_likelihood(0.0, 0.0, CONFIG) == 0.0
-    assert unrest_log_likelihood(100.0, 90.0, CONFIG) == -60.0
+    assert correlation_log_likelihood(0.9, typical) == pytest.approx(0.0)
+    assert correlation_log_likelihood(0.95, typical) > 0 > correlation_log_likelihood(0.8, typical)
+    assert (
+        correlation_log_likelihood(-0.5, typical)
+        == correlation_log_likelihood(0.0, typical)
+        == pytest.approx(10 * np.log(1 - 0.81))
+    )
+    assert hand_eye_log_likelihood(0.0, 0.0, CONFIG) == 0.0
+    assert hand_eye_log_likelihood(100.0, 90.0, CONFIG) == -60.0
 
 
 def test_peaks_between_frames() -> None:

@@ -1,4 +1,8 @@
-"""The calibration doctor: measures an episode under every usual mistake and names the one that explains it."""
+"""The calibration doctor: reads an episode under every usual mistake and names the one that explains what it shows.
+
+From top to bottom: an episode is observed, read as it was recorded and under one mistake at a time (`read`), every
+reading is scored by its evidence (`_explain`), and the scores decide (`_decide`); `diagnose_set` adds episodes up.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,17 @@ import numpy as np
 from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, VerdictName
 from worldline_core.calibration.gripper_evidence import gripper_terms, inversion_gain
 from worldline_core.calibration.hypotheses import conventions_to_try, image_lags
-from worldline_core.calibration.image_evidence import image_terms, log_likelihood, observable_views, turn_log_likelihood
+from worldline_core.calibration.image_evidence import (
+    correlation_log_likelihood,
+    image_terms,
+    observable_views,
+    turn_log_likelihood,
+)
 from worldline_core.calibration.measures import notes_on, view_measures
 from worldline_core.calibration.observation import Observation, observe
-from worldline_core.calibration.pose_evidence import pose_terms, unrest_log_likelihood
+from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, pose_terms
 from worldline_core.calibration.reading import Reading, read
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.calibration.thresholds import MIN_TRAVEL_M, PAIRED_MISTAKES, CalibrationDoctorConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
@@ -26,8 +35,6 @@ __all__ = ["CalibrationDoctorConfig", "diagnose", "diagnose_set"]
 
 DEFAULT_CONFIG = CalibrationDoctorConfig()
 _CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size")
-_PAIRS_OF = 4
-_MIN_TRAVEL_M = 0.02
 
 
 def diagnose(
@@ -53,14 +60,16 @@ def diagnose(
     if recorded is None or not episode.cameras:
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
         return _undecided(episode, f"The recording has no {missing}: nothing can be compared")
-    quick = _unsuspicious(observation, recorded, config) if config.search == "when_suspicious" else None
-    if quick is not None:
-        return Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
-    none = _explain(observation, recorded, config)
+    poses = pose_terms(observation, recorded, config)
+    if config.search == "when_suspicious":
+        quick = _unsuspicious(observation, recorded, poses, config)
+        if quick is not None:
+            return Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
+    none = _explain(recorded, _terms(observation, recorded, config, poses), config)
     moves = float(np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max())
     measures = view_measures(observation, recorded, config)
     notes = notes_on(observation, recorded, measures, config)
-    singles = _singles(observation, recorded, none, config)
+    singles = _singles(observation, recorded, poses, none, config)
     ranked = sorted([none, *singles], key=lambda e: -e.score)
     best = ranked[0]
     if not _healthy(best, config) and not _healthy(none, config):
@@ -71,7 +80,7 @@ def diagnose(
     verdict, best = _decide(none, best, config)
     if best.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
         notes = (*notes, "The camera poses lead the states; they may follow the commands: give the kinematics to see")
-    if verdict == "consistent" and moves < _MIN_TRAVEL_M and not observable_views(observation, config):
+    if verdict == "consistent" and moves < MIN_TRAVEL_M and not observable_views(observation, config):
         verdict = "too_little_evidence"
         notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
     return Diagnosis(episode.episode_id, verdict, best, tuple(ranked), measures, notes)
@@ -100,12 +109,9 @@ def diagnose_set(
     members: dict[str, list[Explanation]] = defaultdict(list)
     for diagnosis in listed:
         tried: dict[str, Explanation] = {}
-        for explanation in diagnosis.ranked:
-            key = _set_key(explanation)
-            if len(explanation.conventions.departures) == 1 and (
-                key not in tried or explanation.score > tried[key].score
-            ):
-                tried[key] = explanation
+        for explanation in diagnosis.ranked:  # the best of each key comes first
+            if len(explanation.conventions.departures) == 1:
+                tried.setdefault(_set_key(explanation), explanation)
         for key, explanation in tried.items():
             gains[key] += float(np.clip(explanation.score - diagnosis.none.score, -config.max_gain, config.max_gain))
             members[key].append(explanation)
@@ -125,10 +131,10 @@ def diagnose_set(
 
 
 def _set_key(explanation: Explanation) -> str:
-    """Readings with the same key are the same over episodes."""
-    value = explanation.conventions.model_dump()
-    estimated = explanation.mistake in ("tool_offset_z_m",)
-    return explanation.mistake if estimated else f"{explanation.mistake}: {value.get(explanation.mistake)}"
+    """Readings with the same key are the same over episodes, whatever tool offset each episode estimates."""
+    if explanation.mistake == "tool_offset_z_m":
+        return explanation.mistake
+    return f"{explanation.mistake}: {getattr(explanation.conventions, explanation.mistake)}"
 
 
 def _summed(members: list[Explanation], score: float) -> Explanation:
@@ -147,30 +153,34 @@ def _summed(members: list[Explanation], score: float) -> Explanation:
     return Explanation(members[0].mistake, conventions, score, dict(evidence), lines)
 
 
-def _explain(
-    observation: Observation, reading: Reading, config: CalibrationDoctorConfig, terms: dict[str, float] | None = None
-) -> Explanation:
-    """A reading with its score."""
-    terms = _terms(observation, reading, config) if terms is None else terms
+def _explain(reading: Reading, terms: dict[str, float], config: CalibrationDoctorConfig) -> Explanation:
+    """A reading with its score: the sum of its terms, less what departing from the contract costs."""
     conventions = reading.conventions
     cost = config.complexity * (len(conventions.departures) + (conventions.views is not None) / 2)
     mistake = "+".join(conventions.departures) or "none"
     return Explanation(mistake, conventions, float(sum(terms.values())) - cost, terms, conventions.config_lines())
 
 
-def _terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
-    return (
-        pose_terms(observation, reading, config)
-        | image_terms(observation, reading, config)
-        | gripper_terms(observation, reading, config)
-    )
+def _terms(
+    observation: Observation,
+    reading: Reading,
+    config: CalibrationDoctorConfig,
+    poses: Mapping[str, float] | None = None,
+) -> dict[str, float]:
+    """All evidence of a reading; `poses` where its pose terms are known, since lags of images do not change them."""
+    return {
+        **(pose_terms(observation, reading, config) if poses is None else poses),
+        **image_terms(observation, reading, config),
+        **gripper_terms(observation, reading, config),
+    }
 
 
-def _unsuspicious(observation: Observation, recorded: Reading, config: CalibrationDoctorConfig) -> Explanation | None:
+def _unsuspicious(
+    observation: Observation, recorded: Reading, poses: Mapping[str, float], config: CalibrationDoctorConfig
+) -> Explanation | None:
     """The recording as written where nothing speaks against it, from what is quick to compute; else None."""
-    poses = pose_terms(observation, recorded, config)
     images = image_terms(observation, recorded, config, wrist_flow=False)
-    found = _explain(observation, recorded, config, poses | images)
+    found = _explain(recorded, {**poses, **images}, config)
     if min(poses.values(), default=0.0) < config.suspicion or not _healthy(found, config):
         return None
     if inversion_gain(observation, recorded, config) > 0:
@@ -184,16 +194,17 @@ def _unsuspicious(observation: Observation, recorded: Reading, config: Calibrati
 
 
 def _singles(
-    observation: Observation, recorded: Reading, none: Explanation, config: CalibrationDoctorConfig
+    observation: Observation,
+    recorded: Reading,
+    poses: Mapping[str, float],
+    none: Explanation,
+    config: CalibrationDoctorConfig,
 ) -> list[Explanation]:
     """Every usual mistake, one at a time."""
-    found = []
-    for conventions in conventions_to_try(observation, recorded, config):
-        reading = _read_or_none(observation, conventions)
-        if reading is not None:
-            found.append(_of_views(observation, reading, none, config))
-    lagging = (recorded.with_image_lag(lag) for lag in image_lags(observation, config))
-    return found + [_explain(observation, reading, config) for reading in lagging]
+    readings = [_read_or_none(observation, c) for c in conventions_to_try(observation, recorded, config)]
+    found = [_in_views_that_improve(observation, reading, none, config) for reading in readings if reading is not None]
+    lagging = [recorded.with_image_lag(lag) for lag in image_lags(observation, config)]
+    return found + [_explain(late, _terms(observation, late, config, poses), config) for late in lagging]
 
 
 def _read_or_none(observation: Observation, conventions: RecordedConventions) -> Reading | None:
@@ -203,22 +214,22 @@ def _read_or_none(observation: Observation, conventions: RecordedConventions) ->
         return None
 
 
-def _of_views(
+def _in_views_that_improve(
     observation: Observation, reading: Reading, none: Explanation, config: CalibrationDoctorConfig
 ) -> Explanation:
     """The mistake in those views which it improves: one camera of a rig may be written unlike the others."""
     terms = _terms(observation, reading, config)
     if reading.conventions.departures[0] not in _CAMERA_FIELDS:
-        return _explain(observation, reading, config, terms)
+        return _explain(reading, terms, config)
     views = list(reading.cameras)
     better = [view for view in views if _of_view(terms, view) > _of_view(none.evidence, view) + 1.0]
     if not better or len(better) == len(views):
-        return _explain(observation, reading, config, terms)
+        return _explain(reading, terms, config)
     others = [view for view in views if view not in better]
     merged = {name: none.evidence[name] if _view_of(name, others) else value for name, value in terms.items()}
     conventions = reading.conventions.model_copy(update={"views": tuple(better)})
     partial = _read_or_none(observation, conventions)
-    return _explain(observation, reading if partial is None else partial, config, merged)
+    return _explain(reading if partial is None else partial, merged, config)
 
 
 def _of_view(terms: Mapping[str, float], view: str) -> float:
@@ -236,13 +247,13 @@ def _pairs(observation: Observation, ranked: list[Explanation], config: Calibrat
         if explanation.mistake != "none":
             first.setdefault(explanation.mistake, explanation)
     found = []
-    for one, two in combinations(list(first.values())[:_PAIRS_OF], 2):
+    for one, two in combinations(list(first.values())[:PAIRED_MISTAKES], 2):
         changed = {field: getattr(two.conventions, field) for field in two.conventions.departures}
         views = one.conventions.views if one.conventions.views == two.conventions.views else None
         conventions = one.conventions.model_copy(update=changed | {"views": views})
         reading = _read_or_none(observation, conventions)
         if reading is not None:
-            found.append(_explain(observation, reading, config))
+            found.append(_explain(reading, _terms(observation, reading, config), config))
     return found
 
 
@@ -254,9 +265,9 @@ def _healthy(explanation: Explanation, config: CalibrationDoctorConfig) -> bool:
 def bad_terms(explanation: Explanation, config: CalibrationDoctorConfig) -> dict[str, float]:
     """The terms that no healthy recording has."""
     limits = {
-        "flow": log_likelihood(config.min_flow, config.arm_flow),
+        "flow": correlation_log_likelihood(config.min_flow, config.arm_flow),
         "turn": turn_log_likelihood(config.max_flow_turn_deg, config),
-        "hand-eye": unrest_log_likelihood(config.max_hand_eye_m, 0.0, config),
+        "hand-eye": hand_eye_log_likelihood(config.max_hand_eye_m, 0.0, config),
         **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
     }
     return {

@@ -1,7 +1,4 @@
-"""What the calibration doctor says about an episode, and about all episodes of a source.
-
-What a calibration check found: one finding an episode, one a source.
-"""
+"""What the calibration doctor says about an episode and about all episodes of a source, and what a check found."""
 
 from __future__ import annotations
 

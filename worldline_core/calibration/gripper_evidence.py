@@ -10,18 +10,22 @@ import numpy as np
 from worldline_core.calibration.image_evidence import cosine
 from worldline_core.calibration.observation import CELL_PX, Observation, cell_centres
 from worldline_core.calibration.reading import Reading, predict_motion
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Spread
+from worldline_core.calibration.thresholds import (
+    FINGER_LENGTH_M,
+    FINGER_REACH_M,
+    FULL_CHANGE,
+    LARGEST_DEVIATIONS,
+    MIN_FINGER_STEP_PX,
+    MIN_OPENING_RANGE,
+    MIN_OPENING_STEP,
+    STOPPED_GAP,
+    STOPPED_STEP,
+    STOPPED_TERM,
+    CalibrationDoctorConfig,
+    Spread,
+)
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import rigid_inverse
-
-_MIN_TRAVEL = 0.12  # range of the opening over the episode: less moves no finger visibly, and noise stays below
-_MOVES = 0.02  # of the opening a frame
-_FINGER_REACH_M = 0.06
-_GAP, _REST = 0.1, 0.01  # between opening and command; change of the opening a frame
-_FULL_CHANGE = 20.0
-_FINGER_LENGTH_M = 0.12
-_MIN_STEP_PX = 0.15
-_STOPPED, _LARGEST = -10.0, 4.0
 
 
 def gripper_terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
@@ -32,7 +36,7 @@ def gripper_terms(observation: Observation, reading: Reading, config: Calibratio
             terms[f"{name} {arm.wrist_view}"] = _log_likelihood(found, typical)
         stopped = stopped_share(reading, i)
         if stopped is not None:
-            terms[f"stopped gripper {arm.name}"] = _STOPPED * (1 - stopped)
+            terms[f"stopped gripper {arm.name}"] = STOPPED_TERM * (1 - stopped)
     return terms
 
 
@@ -43,7 +47,7 @@ def inversion_gain(observation: Observation, reading: Reading, config: Calibrati
         for _, found, typical in _signs(observation, reading, i, config):
             gain += _log_likelihood(-found, typical) - _log_likelihood(found, typical)
         stopped = stopped_share(reading, i)
-        gain += 0.0 if stopped is None else _STOPPED * (2 * stopped - 1)
+        gain += 0.0 if stopped is None else STOPPED_TERM * (2 * stopped - 1)
     return gain
 
 
@@ -60,7 +64,7 @@ def _signs(
 
 
 def _log_likelihood(correlation: float, typical: Spread) -> float:
-    return -0.5 * min(((correlation - typical.value) / typical.spread) ** 2, _LARGEST**2)
+    return -0.5 * min(((correlation - typical.value) / typical.spread) ** 2, LARGEST_DEVIATIONS**2)
 
 
 def finger_agreement(
@@ -77,13 +81,13 @@ def finger_agreement(
     if not _moves(observation, reading, arm, config):
         return None
     camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
-    near = np.median(np.linalg.norm(reading.points - tool[:, None], axis=-1), axis=0) < _FINGER_LENGTH_M
+    near = np.median(np.linalg.norm(reading.points - tool[:, None], axis=-1), axis=0) < FINGER_LENGTH_M
     T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
     points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
     fixed = replace(camera, T_base_camera=np.eye(4)[None])
     predicted = predict_motion(points, reading.radii[near], fixed)
     states, images = reading.steps(observation.num_images)
-    moving = predicted.step[states] > _MIN_STEP_PX
+    moving = predicted.step[states] > MIN_FINGER_STEP_PX
     if moving.sum() < 10:
         return 0.0  # whether there is a term must not depend on the reading
     return cosine(observation.motion(view).flow[images][moving], predicted.vector[states][moving])
@@ -94,7 +98,10 @@ def _moves(observation: Observation, reading: Reading, arm: int, config: Calibra
     view = observation.arms[arm].wrist_view
     if reading.gripper is None or view not in observation.gray or view not in reading.cameras:
         return False
-    return bool(np.ptp(reading.gripper[:, arm]) >= _MIN_TRAVEL) and len(observation.gray[view]) > config.min_image_pairs
+    return (
+        bool(np.ptp(reading.gripper[:, arm]) >= MIN_OPENING_RANGE)
+        and len(observation.gray[view]) > config.min_image_pairs
+    )
 
 
 def finger_flow(observation: Observation, reading: Reading, arm: int, config: CalibrationDoctorConfig) -> float | None:
@@ -112,13 +119,13 @@ def finger_flow(observation: Observation, reading: Reading, arm: int, config: Ca
         return 0.0
     away = cell_centres(camera.height, camera.width) - point
     distance = np.linalg.norm(away, axis=-1)
-    close = (distance < camera.K[0, 0] * _FINGER_REACH_M / near) & (distance > CELL_PX / 4)
+    close = (distance < camera.K[0, 0] * FINGER_REACH_M / near) & (distance > CELL_PX / 4)
     if close.sum() < 4:
         return 0.0
     outward = (motion.flow[images] * (away / np.maximum(distance, 1.0)[..., None])).sum(-1)
-    weight = close * np.minimum(motion.change[images], _FULL_CHANGE) / _FULL_CHANGE
+    weight = close * np.minimum(motion.change[images], FULL_CHANGE) / FULL_CHANGE
     spread, growth = (outward * weight).sum(axis=(1, 2)), opening[states]
-    moves = np.abs(growth) > _MOVES
+    moves = np.abs(growth) > MIN_OPENING_STEP
     # Over all steps, flow that comes without a moving finger counts against; over the others it does not.
     return (cosine(spread, growth) + cosine(spread[moves], growth[moves])) / 2
 
@@ -129,5 +136,9 @@ def stopped_share(reading: Reading, arm: int) -> float | None:
         return None
     opening, command = reading.gripper[:, arm], reading.gripper_command[:, arm]
     gap = opening - command
-    rests = (np.abs(np.gradient(opening)) < _REST) & (np.abs(gap) > _GAP) & (np.abs(np.gradient(command)) < _REST)
+    rests = (
+        (np.abs(np.gradient(opening)) < STOPPED_STEP)
+        & (np.abs(gap) > STOPPED_GAP)
+        & (np.abs(np.gradient(command)) < STOPPED_STEP)
+    )
     return float((gap[rests] > 0).mean()) if rests.sum() >= 4 else None

@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from worldline_core.calibration.observation import Observation
-from worldline_core.calibration.pose_evidence import rms_hand_eye, unrest_log_likelihood
+from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, rms_hand_eye
 from worldline_core.calibration.reading import Reading
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.calibration.thresholds import (
+    INTRINSICS_SNAP,
+    MAX_TOOL_OFFSET_M,
+    MIN_TOOL_OFFSET_M,
+    SAME_INTRINSICS_SIZE,
+    CalibrationDoctorConfig,
+)
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.transforms import rigid_inverse
@@ -17,9 +23,6 @@ _COMMON_SIZES = (
     (480, 848), (480, 640), (400, 640), (384, 640), (360, 640), (384, 512), (270, 480), (240, 424), (240, 320),
     (192, 320), (180, 320), (256, 256), (224, 224), (128, 128), (120, 160), (128, 192), (96, 128), (64, 96),
 )  # fmt: skip
-_SNAP = 0.02
-_SAME_SIZE = 0.1
-_MIN_OFFSET_M, _MAX_OFFSET_M = 0.01, 0.5
 
 
 def conventions_to_try(
@@ -92,7 +95,7 @@ def camera_lag_scores(
         for lag in range(-largest, largest + 1):
             a, b = tools[max(0, -lag) : len(tools) - max(0, lag), i], camera.T_base_camera
             _, metres, degrees = rms_hand_eye(a, b[max(0, lag) : len(b) - max(0, -lag)])
-            scores[lag] = scores.get(lag, 0.0) + unrest_log_likelihood(metres, degrees, config)
+            scores[lag] = scores.get(lag, 0.0) + hand_eye_log_likelihood(metres, degrees, config)
     return scores
 
 
@@ -103,9 +106,9 @@ def intrinsics_sizes(cameras: dict[str, CameraTrack]) -> list[tuple[int, int]]:
         K = camera.K
         height, width = 2 * K[1, 2] + 1, 2 * K[0, 2] + 1
         same = abs(np.log(max(height, 1.0) / camera.height)) + abs(np.log(max(width, 1.0) / camera.width))
-        if not np.isfinite(K).all() or min(height, width) < 8 or same < _SAME_SIZE:
+        if not np.isfinite(K).all() or min(height, width) < 8 or same < SAME_INTRINSICS_SIZE:
             continue
-        common = [s for s in _COMMON_SIZES if max(abs(s[0] / height - 1), abs(s[1] / width - 1)) < _SNAP]
+        common = [s for s in _COMMON_SIZES if max(abs(s[0] / height - 1), abs(s[1] / width - 1)) < INTRINSICS_SNAP]
         size = min(common, key=lambda s: abs(s[0] / height - 1) + abs(s[1] / width - 1), default=None)
         size = size or (round(height), round(width))
         if size not in sizes:
@@ -136,4 +139,4 @@ def tool_offset(observation: Observation, recorded: Reading) -> float | None:
     if not offsets:
         return None
     offset = float(np.median(offsets))
-    return offset if _MIN_OFFSET_M <= abs(offset) <= _MAX_OFFSET_M else None
+    return offset if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None

@@ -12,18 +12,18 @@ import numpy as np
 
 from worldline_core.calibration.observation import Observation, cell_centres
 from worldline_core.calibration.reading import Reading
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
-from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import rigid_inverse
-
-_MIN_STEP_PX = 0.7
-_FOLLOWS = 0.5  # correlation above which an angle between flows means something
-_METRES_PER_RADIAN = (
-    0.15  # a wrist camera that turns by one radian shows about as much change as one that goes this far
+from worldline_core.calibration.thresholds import (
+    FOLLOWS_CORRELATION,
+    INVERSE_DEPTHS_PER_M,
+    LARGEST_FLOW_ERROR_PX,
+    MIN_CHANGE,
+    MIN_STEP_PX,
+    MIN_TEXTURE,
+    WORST_TURN_TERM,
+    CalibrationDoctorConfig,
+    Typical,
 )
-_INVERSE_DEPTHS = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0])  # of the scene before a wrist camera [1/m]
-_MIN_TEXTURE, _MIN_CHANGE = 4.0, 5.0  # grey levels: where flow can be measured, and where there is any
-_LARGEST_ERROR_PX = 8.0
+from worldline_core.geometry.transforms import rigid_inverse
 
 
 def image_terms(
@@ -41,15 +41,19 @@ def image_terms(
     for view in observable_views(observation, config):
         if view in wrists and wrist_flow:
             flow = wrist_flow_agreement(observation, reading, view)
-            terms[f"wrist flow {view}"] = log_likelihood(flow, config.wrist_flow)
+            terms[f"wrist flow {view}"] = correlation_log_likelihood(flow, config.wrist_flow)
         elif view not in wrists:
             flow, change, turn_deg = still_view_agreement(observation, reading, view)
             terms[f"turn {view}"] = turn_log_likelihood(turn_deg, config)
-            terms[f"flow {view}"] = log_likelihood(flow, config.arm_flow if reading.whole_arms else config.tool_flow)
-            terms[f"change {view}"] = log_likelihood(
+            terms[f"flow {view}"] = correlation_log_likelihood(
+                flow, config.arm_flow if reading.whole_arms else config.tool_flow
+            )
+            terms[f"change {view}"] = correlation_log_likelihood(
                 change, config.arm_change if reading.whole_arms else config.tool_change
             )
-        terms[f"energy {view}"] = log_likelihood(energy_correlation(observation, reading, view), config.wrist_energy)
+        terms[f"energy {view}"] = correlation_log_likelihood(
+            energy_correlation(observation, reading, view), config.wrist_energy
+        )
     return terms
 
 
@@ -65,7 +69,7 @@ def observable_views(observation: Observation, config: CalibrationDoctorConfig) 
     return views
 
 
-def log_likelihood(correlation: float, typical: Typical) -> float:
+def correlation_log_likelihood(correlation: float, typical: Typical) -> float:
     """Of a correlation, as of a Gaussian's residual, relative to a typical recording; below 0 nothing gets worse."""
     r = float(np.clip(correlation, 0.0, 0.995))
     return typical.samples / 2 * float(np.log(1 - typical.value**2) - np.log(1 - r**2))
@@ -73,7 +77,7 @@ def log_likelihood(correlation: float, typical: Typical) -> float:
 
 def turn_log_likelihood(turn_deg: float, config: CalibrationDoctorConfig) -> float:
     """Of the angle by which measured flow is turned against the predicted."""
-    return max(-12.0, -0.5 * (turn_deg / config.flow_turn_deg) ** 2)
+    return max(WORST_TURN_TERM, -0.5 * (turn_deg / config.flow_turn_deg) ** 2)
 
 
 def still_view_agreement(observation: Observation, reading: Reading, view: str) -> tuple[float, float, float]:
@@ -88,7 +92,7 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     motion, predicted = observation.motion(view), reading.predicted(view)
     step, vector = predicted.step[states], predicted.vector[states]
     flow, change = motion.flow[images], motion.change[images]
-    moving = step > _MIN_STEP_PX
+    moving = step > MIN_STEP_PX
     if moving.sum() < 20:
         return 0.0, 0.0, 0.0
     measured, expected = flow[moving], vector[moving]
@@ -96,7 +100,7 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
     expected = expected * np.minimum(1.0, 20.0 / np.maximum(np.linalg.norm(expected, axis=-1, keepdims=True), 1e-9))
     agreement = cosine(measured, expected)
     across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
-    follows = np.hypot(agreement, across) > _FOLLOWS
+    follows = np.hypot(agreement, across) > FOLLOWS_CORRELATION
     turn_deg = float(np.degrees(np.arctan2(across, agreement))) if follows else 0.0
     x, y = np.log1p(np.minimum(step, 20.0)).ravel(), np.log1p(change).ravel()
     if x.std() < 1e-9 or y.std() < 1e-9:
@@ -118,18 +122,18 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
         return 0.0
     poses = camera.T_base_camera
     T_next_this = (rigid_inverse(poses[1:]) @ poses[:-1])[states]
-    keep = (motion.texture[images] > _MIN_TEXTURE) & (motion.change[images] > _MIN_CHANGE)
-    centres = cell_centres(camera.height, camera.width)
+    keep = (motion.texture[images] > MIN_TEXTURE) & (motion.change[images] > MIN_CHANGE)
+    centres, inverse_depths = cell_centres(camera.height, camera.width), np.array(INVERSE_DEPTHS_PER_M)
     rays = np.concatenate([centres, np.ones((*centres.shape[:2], 1))], axis=-1) @ np.linalg.inv(camera.K).T
     measured, expected = [], []
     for T, flow, cells in zip(T_next_this, motion.flow[images], keep, strict=True):
         if cells.sum() < 3:
             continue
         turned = rays[cells] @ T[:3, :3].T
-        moved = (turned[None] + _INVERSE_DEPTHS[:, None, None] * T[:3, 3]) @ camera.K.T
+        moved = (turned[None] + inverse_depths[:, None, None] * T[:3, 3]) @ camera.K.T
         ahead = moved[..., 2:] > 0.1
         step = np.where(ahead, moved[..., :2] / np.where(ahead, moved[..., 2:], 1.0) - centres[cells], 0.0)
-        error = np.minimum(np.linalg.norm(step - flow[cells], axis=-1), _LARGEST_ERROR_PX).sum(axis=1)
+        error = np.minimum(np.linalg.norm(step - flow[cells], axis=-1), LARGEST_FLOW_ERROR_PX).sum(axis=1)
         best = step[error.argmin()]
         length = np.linalg.norm(best, axis=-1, keepdims=True)
         expected.append(best * np.minimum(1.0, 20.0 / np.maximum(length, 1e-9)))
@@ -139,20 +143,11 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     return cosine(np.concatenate(measured), np.concatenate(expected))
 
 
-def tool_speed(tools: np.ndarray) -> np.ndarray:
-    """(n - 1, a) how much a tool moves from frame to frame [m], turning counted as travel."""
-    relative = rigid_inverse(tools[:-1]) @ tools[1:]
-    travel = np.linalg.norm(relative[..., :3, 3], axis=-1)
-    return travel + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
-
-
 def energy_correlation(observation: Observation, reading: Reading, view: str) -> float:
     """Correlation over time of the speed of what moves a view (its own arm, or the fastest) with its mean change."""
     states, images = reading.steps(observation.num_images)
     own = [i for i, arm in enumerate(observation.arms) if arm.wrist_view == view]
-    if "tools" not in reading.speeds:
-        reading.speeds["tools"] = tool_speed(reading.tools)
-    speed = reading.speeds["tools"][:, own or slice(None)].max(axis=1)[states]
+    speed = reading.tool_speed[:, own or slice(None)].max(axis=1)[states]
     return correlation(speed, observation.motion(view).mean_change[images])
 
 

@@ -16,11 +16,8 @@ from worldline_core.calibration.image_evidence import (
 from worldline_core.calibration.observation import Observation
 from worldline_core.calibration.pose_evidence import in_view_share, mount_offset, principal_point_offset, rms_hand_eye
 from worldline_core.calibration.reading import Reading
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.calibration.thresholds import COMMANDS_FIT_RATIO, NOTICEABLE_M, CalibrationDoctorConfig
 from worldline_core.data.episodes.episode import CameraTrack
-
-_FOLLOWS = 3.0  # times as rigid
-_NOTICEABLE_M = 0.001
 
 
 def view_measures(
@@ -100,7 +97,7 @@ def notes_on(
     for m in measures:
         if m.hand_eye_m is None or m.hand_eye_action_m is None:
             continue
-        if m.hand_eye_m > _NOTICEABLE_M and m.hand_eye_m > _FOLLOWS * m.hand_eye_action_m:
+        if m.hand_eye_m > NOTICEABLE_M and m.hand_eye_m > COMMANDS_FIT_RATIO * m.hand_eye_action_m:
             notes.append(
                 f"{m.view}: the camera poses follow the commands ({1e3 * m.hand_eye_action_m:.1f} mm), "
                 f"not the states ({1e3 * m.hand_eye_m:.1f} mm)"

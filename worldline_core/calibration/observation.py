@@ -10,6 +10,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from worldline_core.calibration.thresholds import STILL_CHANGE
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -17,7 +18,6 @@ from worldline_core.geometry.transforms import hand_eye_residual
 
 GRAY_WIDTH = 96
 CELL_PX = 4
-_STILL_CHANGE = 4.0  # grey levels: compression and sensor noise stay below
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Motion:
     @cached_property
     def moves(self) -> bool:
         """Whether anything moves at all."""
-        return bool((self.change.max(axis=(1, 2)) > _STILL_CHANGE).sum() >= 4)
+        return bool((self.change.max(axis=(1, 2)) > STILL_CHANGE).sum() >= 4)
 
     @cached_property
     def mean_change(self) -> np.ndarray:

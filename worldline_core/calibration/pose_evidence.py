@@ -6,26 +6,23 @@ import numpy as np
 
 from worldline_core.calibration.observation import Arm, Observation
 from worldline_core.calibration.reading import Reading
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.calibration.thresholds import (
+    FACING_DEG,
+    FACING_SPREAD_DEG,
+    FOLLOWS_COMMANDS_COST,
+    WORST_FACING_TERM,
+    WORST_HAND_EYE_TERM,
+    WORST_TERM,
+    CalibrationDoctorConfig,
+)
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
 
-_WORST = -40.0
-_WORST_UNREST = -60.0
-_FOLLOWS_COMMAND_COST = 2.0
-_FACING_DEG, _FACING_SPREAD_DEG = 45.0, 10.0
-
 
 def pose_terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
-    """Log-likelihood terms by name; a term of a view ends with the view's name. Computed once for a geometry."""
-    if not reading.pose_terms:
-        reading.pose_terms.update(_pose_terms(observation, reading, config))
-    return dict(reading.pose_terms)
-
-
-def _pose_terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
+    """Log-likelihood terms by name; a term of a view ends with the view's name. Images do not matter here."""
     terms = {"workspace": _workspace(reading, config)}
     if observation.episode.state_kind == "joints":
         terms["joint range"] = _joint_range(observation, reading)
@@ -50,14 +47,14 @@ def rms_hand_eye(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np
     return mount, float(np.sqrt((metres**2).mean())), float(np.sqrt((degrees**2).mean()))
 
 
-def unrest_log_likelihood(metres: float, degrees: float, config: CalibrationDoctorConfig) -> float:
-    """Of a hand-eye residual, with a heavy tail: frames of one recording are not independent."""
+def hand_eye_log_likelihood(metres: float, degrees: float, config: CalibrationDoctorConfig) -> float:
+    """Log-likelihood of a hand-eye residual, with a heavy tail: frames of one recording are not independent."""
     value = (metres / config.hand_eye_m) ** 2 + (degrees / config.hand_eye_deg) ** 2
-    return max(_WORST_UNREST, -config.samples / 2 * float(np.log1p(value)))
+    return max(WORST_HAND_EYE_TERM, -config.samples / 2 * float(np.log1p(value)))
 
 
 def _quadratic(*ratios: float) -> float:
-    return max(_WORST, -0.5 * float(sum(ratio**2 for ratio in ratios)))
+    return max(WORST_TERM, -0.5 * float(sum(ratio**2 for ratio in ratios)))
 
 
 def _wrist(
@@ -66,12 +63,12 @@ def _wrist(
     view = camera.view
     poses = camera.poses(np.arange(len(reading.tools)))
     mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)
-    unrest = unrest_log_likelihood(metres, degrees, config)
+    residual_term = hand_eye_log_likelihood(metres, degrees, config)
     if reading.action_tools is not None:
         _, by_action_m, by_action_deg = rms_hand_eye(reading.action_tools[:, i], poses)
-        followed = unrest_log_likelihood(by_action_m, by_action_deg, config) - _FOLLOWS_COMMAND_COST
-        unrest = max(unrest, followed)
-    terms = {f"hand-eye {view}": unrest}
+        followed = hand_eye_log_likelihood(by_action_m, by_action_deg, config) - FOLLOWS_COMMANDS_COST
+        residual_term = max(residual_term, followed)
+    terms = {f"hand-eye {view}": residual_term}
     if arm.T_tool_mount is not None:
         offset, turned = mount_offset(mount, arm.T_tool_mount)
         terms[f"mount {view}"] = _quadratic(offset / config.mount_m, turned / config.mount_deg)
@@ -80,8 +77,8 @@ def _wrist(
     distance = float(np.linalg.norm(tool))
     off_axis = float(np.degrees(np.arctan2(np.hypot(tool[0], tool[1]), tool[2])))
     far = max(0.0, np.log(max(distance, 1e-6) / config.max_wrist_camera_m)) / 0.2
-    aside = max(0.0, off_axis - _FACING_DEG) / _FACING_SPREAD_DEG
-    terms[f"faces its tool {view}"] = max(-15.0, _quadratic(far, aside))
+    aside = max(0.0, off_axis - FACING_DEG) / FACING_SPREAD_DEG
+    terms[f"faces its tool {view}"] = max(WORST_FACING_TERM, _quadratic(far, aside))
     return terms
 
 
@@ -137,7 +134,7 @@ def _upright(camera: CameraTrack) -> float:
 
 def _workspace(reading: Reading, config: CalibrationDoctorConfig) -> float:
     distance = np.linalg.norm(reading.tools[..., :3, 3], axis=-1)
-    return _WORST * float((distance > config.max_reach_m).mean())
+    return WORST_TERM * float((distance > config.max_reach_m).mean())
 
 
 def _joint_range(observation: Observation, reading: Reading) -> float:
@@ -147,7 +144,7 @@ def _joint_range(observation: Observation, reading: Reading) -> float:
         outside = observation.kinematics.embodiment.outside_limits(state, tolerance_rad=0.1)
     else:
         outside = np.abs(state) > 4 * np.pi
-    return _WORST * float(np.clip(outside.any(axis=1).mean(), 0.0, 1.0))
+    return WORST_TERM * float(np.clip(outside.any(axis=1).mean(), 0.0, 1.0))
 
 
 def _kinematics(by_joints: np.ndarray, recorded: np.ndarray, config: CalibrationDoctorConfig) -> float:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from worldline_core.actions.robot_masks import robot_capsules
 from worldline_core.calibration.observation import CELL_PX, Observation
+from worldline_core.calibration.thresholds import METRES_PER_RADIAN
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
@@ -16,6 +18,7 @@ from worldline_core.data.episodes.conventions import (
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import rigid_inverse
 
 _CAPSULE_SAMPLES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
@@ -42,16 +45,16 @@ class PredictedMotion:
 
 @dataclass(frozen=True)
 class Reading:
-    """Attributes:
-    tools: (n, a, 4, 4) T_base_tool; action_tools: the same of the commands, None where unknown.
-    kinematic_tools: (n, a, 4, 4) from joints where the recording also has tool poses, else None.
-    cameras: by view, K at the size of the grey images.
-    gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
-    points, radii: (n, p, 3), (p,) on the arms [m] (capsules of the links, or the hand where only tools are known).
-    whole_arms: whether the points are those of whole arms.
-    first_image: number of the image that belongs to frame 0 (may be negative).
-    pose_terms: what poses alone say, once it is computed; shared by readings that differ in their images only.
-    speeds: likewise "tools": how fast they move (`image_evidence.tool_speed`).
+    """An episode as it is under given conventions.
+
+    Attributes:
+        tools: (n, a, 4, 4) T_base_tool; action_tools: the same of the commands, None where unknown.
+        kinematic_tools: (n, a, 4, 4) from joints where the recording also has tool poses, else None.
+        cameras: by view, K at the size of the grey images.
+        gripper, gripper_command: (n, a) openings, None where the state has no gripper columns.
+        points, radii: (n, p, 3), (p,) on the arms [m] (capsules of the links, or the hand where only tools are known).
+        whole_arms: whether the points are those of whole arms.
+        first_image: number of the image that belongs to frame 0 (may be negative).
     """
 
     conventions: RecordedConventions
@@ -67,8 +70,6 @@ class Reading:
     whole_arms: bool
     first_image: int
     _predicted: dict[str, PredictedMotion] = field(default_factory=dict, repr=False)
-    pose_terms: dict[str, float] = field(default_factory=dict, repr=False)
-    speeds: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def with_image_lag(self, frames: int) -> Reading:
         """The same geometry with images that trail the states by so many frames."""
@@ -80,6 +81,13 @@ class Reading:
         start = max(0, -self.first_image)
         stop = max(start, min(len(self.tools), num_images - self.first_image) - 1)
         return slice(start, stop), slice(start + self.first_image, stop + self.first_image)
+
+    @cached_property
+    def tool_speed(self) -> np.ndarray:
+        """(n - 1, a) how much each tool moves from frame to frame [m], turning counted as travel."""
+        relative = rigid_inverse(self.tools[:-1]) @ self.tools[1:]
+        travel = np.linalg.norm(relative[..., :3, 3], axis=-1)
+        return travel + METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
 
     def predicted(self, view: str) -> PredictedMotion:
         """Predicted motion in a view; computed once."""

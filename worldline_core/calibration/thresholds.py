@@ -1,4 +1,7 @@
-"""Thresholds of the calibration doctor."""
+"""Thresholds of the calibration doctor: what users may change (`CalibrationDoctorConfig`), then what is fixed.
+
+Terms of a score are log-likelihoods: 0 is as a healthy recording typically is, lower is worse.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +53,9 @@ class CalibrationDoctorConfig(StrictModel):
     complexity: float = Field(default=2.0, ge=0, description="cost of a reading that departs from the contract")
     max_lag_frames: int = Field(default=6, ge=1, le=60)
     samples: float = Field(default=20.0, gt=0, description="independent frames that a hand-eye residual stands for")
-    hand_eye_m: float = Field(default=0.002, gt=0, description="unrest of a mounted camera that means nothing")
+    hand_eye_m: float = Field(default=0.002, gt=0, description="hand-eye residual of a camera that is mounted")
     hand_eye_deg: float = Field(default=0.7, gt=0)
-    max_hand_eye_m: float = Field(default=0.012, gt=0, description="more unrest, whatever the reading, is bad")
+    max_hand_eye_m: float = Field(default=0.012, gt=0, description="a larger residual is bad, whatever the reading")
     mount_m: float = Field(default=0.01, gt=0, description="spread of cameras around the stated mount")
     mount_deg: float = Field(default=3.0, gt=0)
     kinematics_m: float = Field(default=0.005, gt=0, description="spread of recorded poses around forward kinematics")
@@ -70,3 +73,54 @@ class CalibrationDoctorConfig(StrictModel):
     wrist_energy: Typical = Typical(value=0.8, samples=8)
     fingers: Spread = Spread(value=0.75, spread=0.4)
     finger_links: Spread = Spread(value=0.5, spread=0.3)
+
+
+# The decision
+PAIRED_MISTAKES = 4
+"""Of the mistakes that explain most alone, each two are tried together."""
+MIN_TRAVEL_M = 0.02
+"""A tool that moves less over the episode leaves no trace of a mistake."""
+
+# Poses: limits of single terms, and the places where cameras and tools can be
+WORST_TERM, WORST_HAND_EYE_TERM, WORST_FACING_TERM, WORST_TURN_TERM = -40.0, -60.0, -15.0, -12.0
+FOLLOWS_COMMANDS_COST = 2.0
+"""Of camera poses that follow the commands rather than the states."""
+FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
+"""Between a wrist camera's axis and the direction to its tool."""
+
+# Pictures
+STILL_CHANGE = 4.0
+"""Grey levels: compression and sensor noise stay below."""
+MIN_STEP_PX = 0.7
+"""Predicted motion of a cell that flow is compared with."""
+FOLLOWS_CORRELATION = 0.5
+"""Above it an angle between measured and predicted flow means something."""
+METRES_PER_RADIAN = 0.15
+"""A wrist camera that turns by one radian shows about as much change as one that goes this far."""
+INVERSE_DEPTHS_PER_M = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+"""Of the scene before a wrist camera, tried one by one."""
+MIN_TEXTURE, MIN_CHANGE = 4.0, 5.0
+"""Grey levels: where flow can be measured, and where there is any."""
+LARGEST_FLOW_ERROR_PX = 8.0
+
+# Grippers
+MIN_OPENING_RANGE = 0.12
+"""Over the episode: a smaller one moves no finger visibly, and noise stays below."""
+MIN_OPENING_STEP = 0.02
+"""Per frame, of a gripper that moves."""
+FINGER_REACH_M, FINGER_LENGTH_M = 0.06, 0.12
+STOPPED_GAP, STOPPED_STEP = 0.1, 0.01
+"""A stopped gripper: opening away from its command by more, and changing by less per frame."""
+FULL_CHANGE = 20.0
+"""Grey levels from which a cell has its whole weight."""
+MIN_FINGER_STEP_PX = 0.15
+STOPPED_TERM, LARGEST_DEVIATIONS = -10.0, 4.0
+
+# Numbers estimated for a mistake
+INTRINSICS_SNAP, SAME_INTRINSICS_SIZE = 0.02, 0.1
+"""Relative distance within which a usual image size is taken; log distance within which the size is as recorded."""
+MIN_TOOL_OFFSET_M, MAX_TOOL_OFFSET_M = 0.01, 0.5
+
+# Remarks
+COMMANDS_FIT_RATIO, NOTICEABLE_M = 3.0, 0.001
+"""Camera poses follow the commands when their residual against the states is larger by this ratio, and noticeable."""
