@@ -1,0 +1,51 @@
+"""No two modules need each other, and no two folders import each other; docs/architecture.md names every room."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import grimp
+import pytest
+
+PACKAGES = ("worldline_core", "tasks", "flows")
+
+
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """The modules that each module imports, also inside of functions."""
+    graph = grimp.build_graph(*PACKAGES)
+    return {module: set(graph.find_modules_directly_imported_by(module)) for module in graph.modules}
+
+
+def test_no_import_circles(imports: dict[str, set[str]]) -> None:
+    assert len(imports) > 100
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_no_two_folders_import_each_other(imports: dict[str, set[str]], project_root: Path) -> None:
+    folders: dict[str, set[str]] = defaultdict(set)
+    for module, imported in imports.items():
+        for other in imported:
+            here, there = (_folder(name, project_root) for name in (module, other))
+            # A package's public names may come from inside of it.
+            if here != there and not here.startswith(f"{there}/") and not there.startswith(f"{here}/"):
+                folders[here].add(there)
+    mutual = {(a, b) for a, others in folders.items() for b in others if a in folders.get(b, ()) and a < b}
+    assert not mutual
+
+
+def _folder(module: str, project_root: Path) -> str:
+    path = module.replace(".", "/")
+    return path if (project_root / path).is_dir() else path.rpartition("/")[0]
+
+
+def test_the_architecture_names_every_room(project_root: Path) -> None:
+    text = (project_root / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rooms = [path.parent.name for path in sorted((project_root / "worldline_core").glob("*/__init__.py"))]
+    assert len(rooms) > 10
+    assert [room for room in rooms if f"`{room}/`" not in text] == []
