@@ -1,0 +1,72 @@
+"""Every example runs as its docstring says, on the shipped recordings, in small."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from worldline_core.config import load_config
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import plan, run_node
+from worldline_core.store.store import ArtifactStore
+
+pytestmark = pytest.mark.slow
+
+
+def _run(project_root: Path, name: str, *arguments: str | Path) -> str:
+    result = subprocess.run(
+        [sys.executable, project_root / "examples" / name, *map(str, arguments)],
+        cwd=project_root, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+def test_check_calibration(project_root: Path, tmp_path: Path) -> None:
+    printed = _run(project_root, "check_calibration.py", "--episodes", 2, "--output", tmp_path)
+    assert "2 episodes: 2 consistent" in printed
+    assert (tmp_path / "index.html").is_file()
+
+
+def test_evaluate_videos_of_another_simulator(project_root: Path, tmp_path: Path) -> None:
+    nodes = plan(load_config(PipelineConfig, preset="smoke"), project_root)
+    store = ArtifactStore(tmp_path / "artifacts")
+    run_node("curate", nodes, store)
+    kept = run_node("filter", nodes, store)
+    episodes = EpisodeSet.open(kept.path)
+    number, row = next((i, row) for i, row in enumerate(episodes.rows) if row.split == "test")
+    # A simulator that predicts that nothing moves.
+    frames = episodes.frames(number, "head")
+    still = frames[:1].repeat(len(frames), axis=0)
+    (tmp_path / "videos").mkdir()
+    encode_video(tmp_path / "videos" / f"{row.episode_id}_head.mp4", still, row.fps)
+    printed = _run(
+        project_root, "evaluate_videos.py", tmp_path / "videos", kept.path, "--artifacts", tmp_path / "artifacts"
+    )
+    assert "1 episodes" in printed
+    assert "robot_iou" in printed
+    assert "psnr@head" in printed
+
+
+def test_plan_over_a_bank(project_root: Path, tmp_path: Path) -> None:
+    printed = _run(project_root, "plan_over_bank.py", "--candidates", 2, "--artifacts", tmp_path)
+    assert "true" in printed
+    assert "N =  2: success" in printed
+
+
+def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
+    dataset = tmp_path / "dataset"
+    shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/aloha_viperx", dataset)
+    shutil.rmtree(dataset / "meta" / "worldline")  # what a foreign dataset does not have
+    printed = _run(
+        project_root, "train_on_lerobot.py", dataset, "--embodiment", "aloha_viperx", "--steps", 2,
+        "--artifacts", tmp_path / "artifacts",
+    )  # fmt: skip
+    assert json.loads(printed[: printed.index("}") + 1])["steps"] == 2
