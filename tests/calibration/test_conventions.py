@@ -22,7 +22,7 @@ from worldline_core.data.episodes.conventions import (
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.source import LoadedEpisode, no_masks
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.sources.repaired import repair
+from worldline_core.data.sources.open import repair
 
 COUNT = 12
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])

@@ -24,7 +24,7 @@ from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
-from worldline_core.data.sources.repaired import undistorted
+from worldline_core.data.sources.open import undistorted
 from worldline_core.geometry.distortion import Distortion
 
 Make = Callable[..., tuple]

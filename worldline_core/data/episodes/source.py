@@ -131,7 +131,7 @@ class ForeignSourceConfig(SourceConfigBase):
     """What foreign recordings do not say about themselves and the user therefore declares."""
 
     split: Split = Field(default="test", description="never train without saying so")
-    scene: str | None = Field(default=None, description="scene of all episodes; default: one scene an episode folder")
+    scene: str | None = Field(default=None, description="scene of all episodes; default: one scene per episode folder")
     task_family: TaskFamily = "unknown"
     outcome: Outcome = "unknown"
 

@@ -253,7 +253,7 @@ class LeRobotSourceConfig(ForeignSourceConfig):
     calibration: str | None = Field(
         default=None,
         description="file in the dataset's folder with K and poses of the views (docs/sources.md); a name with "
-        "{episode_index:06d} is a file an episode",
+        "{episode_index:06d} is one file per episode",
     )
     task_column: str = Field(default="task_index", description="column of indices into the dataset's tasks")
     task_separator: str | None = Field(

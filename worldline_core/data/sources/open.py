@@ -1,14 +1,22 @@
-"""Open a configured source: the kinds there are, and the reader of each."""
+"""Open a configured source: the kinds there are, and the reader of each.
+
+What a reader loads is brought to the contract before anything else looks at its pixels: declared departures from the
+conventions are repaired, and distorting lenses taken out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
-from worldline_core.data.episodes.conventions import RecordedConventions
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
+from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
 from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.data.sources.agibot_world import AgibotWorldSource, AgibotWorldSourceConfig
@@ -16,7 +24,6 @@ from worldline_core.data.sources.droid_annotation import DroidAnnotationSource, 
 from worldline_core.data.sources.episode_set import EpisodeSetSource, EpisodeSetSourceConfig
 from worldline_core.data.sources.lerobot import LeRobotSourceConfig, open_lerobot
 from worldline_core.data.sources.mcap import McapSource, McapSourceConfig, McapTopicsSource, McapTopicsSourceConfig
-from worldline_core.data.sources.repaired import repair, undistorted
 from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceConfig
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
@@ -72,3 +79,104 @@ class _RepairedSource:
 
     def load(self, episode_id: str) -> LoadedEpisode:
         return undistorted(repair(self._source.load(episode_id), self._conventions))
+
+
+def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpisode:
+    """The loaded episode in the contract's conventions; images and masks follow a lag.
+
+    Raises: RejectedInputError where the conventions do not apply to the episode.
+    """
+    if not conventions.departures:
+        return loaded
+    recorded = loaded.episode
+    kept = range(recorded.num_video_frames)[image_frames(recorded.num_frames, conventions)]
+    lagging = bool(conventions.camera_lag_frames or conventions.image_lag_frames)
+    declared = {f"declared_{field}": str(getattr(conventions, field)) for field in conventions.departures}
+    repaired = apply_conventions(recorded, conventions)
+
+    def check_count(found: int, view: str) -> None:
+        where = f"episode {recorded.episode_id}, view {view}"
+        check_length("Video", where, states=recorded.num_video_frames, unit="frames", found=found)
+
+    def images(view: str) -> Iterator[np.ndarray]:
+        count = 0
+        for count, image in enumerate(loaded.each_image(view), 1):
+            if count - 1 in kept:
+                yield image
+        check_count(count, view)
+
+    def masks(view: str) -> np.ndarray | None:
+        found = loaded.robot_masks(view)
+        if found is not None:
+            check_count(len(found), view)
+        return None if found is None else found[kept.start : kept.stop]
+
+    clips = {view: clip.cut(kept.start, kept.stop) for view, clip in loaded.clips.items()}
+    episode = replace(repaired, conventions={**repaired.conventions, **declared})
+    if not lagging:
+        return replace(loaded, episode=episode)
+    return replace(loaded, episode=episode, images=images, robot_masks=masks, clips=clips)
+
+
+def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
+    """The episode with images, masks and K of pinhole cameras; its conventions name the lenses that were taken out.
+
+    Raises: RejectedInputError: singular_intrinsics; invalid_distortion when a lens has no camera matrix, its model cannot
+        be inverted inside of the image, or the images have another size than the one it was calibrated for.
+    """
+    if not loaded.distortions:
+        return loaded
+    from worldline_core.geometry.undistortion import Undistortion, undistortion
+
+    where = f"episode {loaded.episode.episode_id}"
+    cameras = dict(loaded.episode.cameras)
+    lenses: dict[str, Undistortion] = {}
+    for view, distortion in loaded.distortions.items():
+        if view not in cameras:
+            raise RejectedInputError(
+                "invalid_distortion",
+                "A lens is stated for a view without a camera matrix",
+                where=f"{where}, view {view}",
+                expected=", ".join(cameras) or "a calibrated view",
+                got=view,
+                evidence={"view": view},
+            )
+        camera = cameras[view]
+        check_intrinsics(camera, f"{where}, view {view}")
+        evidence = {"view": view, "model": distortion.model, "coefficients": list(distortion.coefficients)}
+        with rejected_as("invalid_distortion", f"{where}, view {view}", evidence):
+            lenses[view] = undistortion(distortion, camera.K, (camera.height, camera.width), None)
+        cameras[view] = replace(camera, K=lenses[view].K)
+
+    def straightened(values: np.ndarray, view: str) -> np.ndarray:
+        """Images (N, H, W, 3) or masks (N, H, W) of a view with a lens."""
+        size = lenses[view].image_size
+        if values.shape[1:3] != size:
+            raise RejectedInputError(
+                "invalid_distortion",
+                "Images have another size than their lens was calibrated for",
+                where=f"{where}, view {view}",
+                expected=f"{size[0]}x{size[1]}",
+                got=f"{values.shape[1]}x{values.shape[2]}",
+                evidence={"view": view, "calibrated": list(size), "images": list(values.shape[1:3])},
+            )
+        return lenses[view].masks(values) if values.ndim == 3 else lenses[view].frames(values)
+
+    def images(view: str) -> Iterator[np.ndarray]:
+        for image in loaded.each_image(view):
+            yield straightened(image[None], view)[0] if view in lenses else image
+
+    def robot_masks(view: str) -> np.ndarray | None:
+        masks = loaded.robot_masks(view)
+        return straightened(masks, view) if masks is not None and view in lenses else masks
+
+    taken_out = "; ".join(f"{view}: {d.model} {list(d.coefficients)}" for view, d in loaded.distortions.items())
+    conventions = {**loaded.episode.conventions, "undistorted": taken_out}
+    return replace(
+        loaded,
+        episode=replace(loaded.episode, cameras=cameras, conventions=conventions),
+        images=images,
+        robot_masks=robot_masks,
+        distortions={},
+        clips={view: clip for view, clip in loaded.clips.items() if view not in lenses},
+    )
