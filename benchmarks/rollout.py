@@ -18,12 +18,13 @@ import torch
 from einops import rearrange
 
 from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.tokenizer import load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.rollout.samplers import BLOCK_SIZE, BlockCausalSimulator, Noise, rollout_full_clip
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout_full_clip
 
 GRID = (8, 12)
 
@@ -41,9 +42,11 @@ def timed(work: Callable[[], object], device: str, *, processor: bool = False) -
 
 
 @torch.no_grad()
-def measure(model: WorldModel, tokenizer: VideoTokenizer, options: argparse.Namespace) -> dict[str, object]:
+def measure(
+    model: WorldModel, spec: CausalSpec, tokenizer: VideoTokenizer, options: argparse.Namespace
+) -> dict[str, object]:
     device, views = options.device, model.config.views
-    channels, frames = model.config.latent_channels, 1 + 4 * BLOCK_SIZE * 2
+    channels, frames = model.config.latent_channels, 1 + 4 * spec.block_size * 2
     latent_frames = 1 + (frames - 1) // 4
     first = torch.randn(1, len(views), channels, *GRID, device=device)
     maps = torch.randn(1, len(views), model.config.action_channels, latent_frames, *GRID, device=device)
@@ -56,11 +59,9 @@ def measure(model: WorldModel, tokenizer: VideoTokenizer, options: argparse.Name
         decode(rollout_full_clip(model, first, maps, noise=Noise([42]), steps=35, views=views, bfloat16=True))
 
     def causal(blocks: int = 2, *, processor: bool = False) -> list[float]:
-        simulator = BlockCausalSimulator(
-            model, noise=Noise([42]), views=views, recent_blocks=options.recent_blocks, bfloat16=True
-        )
+        simulator = BlockCausalSimulator(model, spec, noise=Noise([42]), views=views, bfloat16=True)
         simulator.start(first, maps[:, :, :, :1])
-        controls = maps[:, :, :, 1 : 1 + BLOCK_SIZE]
+        controls = maps[:, :, :, 1 : 1 + spec.block_size]
         return [
             timed(
                 lambda: decode(torch.cat((first[:, :, :, None], simulator.step(controls)), dim=3)),
@@ -76,8 +77,8 @@ def measure(model: WorldModel, tokenizer: VideoTokenizer, options: argparse.Name
     blocks = [causal(options.blocks, processor=True) for _ in range(options.repeats)]
     by_block = [statistics.median(times) for times in zip(*blocks, strict=True)]
     # The first blocks run on a window that is not yet full.
-    settled = by_block[1 + options.recent_blocks]
-    ends = (statistics.median(by_block[1 + options.recent_blocks :][:8]), statistics.median(by_block[-8:]))
+    settled = by_block[1 + spec.recent_blocks]
+    ends = (statistics.median(by_block[1 + spec.recent_blocks :][:8]), statistics.median(by_block[-8:]))
     return {
         "frames": frames,
         "full_clip_seconds_per_frame": full_seconds / frames,
@@ -98,19 +99,23 @@ def main() -> None:
     parser.add_argument("--tokenizer", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--blocks", type=int, default=50)
-    parser.add_argument("--recent-blocks", type=int, default=3)
+    parser.add_argument("--recent-blocks", type=int, help="by default as the checkpoint says, or 3")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--output", type=Path, help="also write the figures here, as JSON")
     options = parser.parse_args()
+    spec = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=CAUSAL_SIGMAS)
     if options.checkpoint is None:
         model = WorldModel(WorldModelConfig(towers="generation"))
         model.initialise(torch.Generator().manual_seed(0))
     else:
-        model, _ = load_checkpoint(options.checkpoint, towers="generation")
+        model, info = load_checkpoint(options.checkpoint, towers="generation")
+        spec = info.causal or spec
+    if options.recent_blocks is not None:
+        spec = spec.model_copy(update={"recent_blocks": options.recent_blocks})
     tokenizer: VideoTokenizer = PatchTokenizer() if options.tokenizer is None else load_tokenizer(options.tokenizer)
     if isinstance(tokenizer, torch.nn.Module):
         tokenizer.to(options.device).eval().requires_grad_(False)
-    figures = measure(model.to(options.device).eval(), tokenizer, options)
+    figures = measure(model.to(options.device).eval(), spec, tokenizer, options)
     text = json.dumps(figures, indent=1)
     print(text)
     if options.output is not None:

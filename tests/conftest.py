@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from worldline_core.model.contracts import ActionContract, CausalSpec
     from worldline_core.model.world_model import WorldModel
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
@@ -56,6 +57,39 @@ def make_model() -> Callable[..., WorldModel]:
             for parameter in model.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
         return model.eval()
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_contract() -> Callable[..., ActionContract]:
+    """Action contracts of small models."""
+
+    def make(**changes: object) -> ActionContract:
+        from worldline_core.model.contracts import ActionContract
+
+        values: dict[str, object] = {
+            "controls": "action",
+            "sigma_px_ref": 40.0,
+            "wrist_projection": "current_camera",
+            "fps": 8.0,
+            "grid_size": (4, 4),
+            "tokenizer": "0123",
+        }
+        return ActionContract.of_these_maps(**values | changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_spec() -> Callable[..., CausalSpec]:
+    """Causal blocks of small models: two latent frames, a window of one and three blocks, the paper's nodes."""
+
+    def make(**changes: object) -> CausalSpec:
+        from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
+
+        values = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "sigmas": CAUSAL_SIGMAS}
+        return CausalSpec.model_validate(values | changes)
 
     return make
 

@@ -17,18 +17,14 @@ from safetensors.torch import save_file
 from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes import episode_index
 from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.contracts import CausalSpec
 from worldline_core.training.latent_store import clip_key
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 FRAMES = 21
 EPISODES = {"a": "train", "b": "train", "c": "validation"}
 IMAGE = (32, 32)
-CONTRACT = {
-    "sigma_px_ref": 40.0,
-    "wrist_projection": "current_camera",
-    "tokenizer": "0123",
-    "grid_size": [4, 4],
-}
+SIGMA = 40.0
 
 
 def write_latents(root: Path) -> None:
@@ -98,11 +94,12 @@ def tracks_of(name: str) -> EpisodeTracks:
 
 
 @pytest.fixture
-def inputs(tmp_path: Path, make_model: Callable) -> dict[str, Path]:
+def inputs(tmp_path: Path, make_model: Callable, make_contract: Callable) -> dict[str, Path]:
     folders = {name: tmp_path / name for name in ("latents", "tracks", "episodes", "stage2", "tokenizer", "stage1")}
     write_latents(folders["latents"])
     folders["tracks"].mkdir()
-    write_index(folders["tracks"], write_shard(folders["tracks"], 0, [tracks_of(name) for name in EPISODES]))
+    shard = write_shard(folders["tracks"], 0, [tracks_of(name) for name in EPISODES])
+    write_index(folders["tracks"], shard, sigma_px_ref=SIGMA)
     folders["episodes"].mkdir()
     rows = [
         episode_index.EpisodeRow(
@@ -130,7 +127,7 @@ def inputs(tmp_path: Path, make_model: Callable) -> dict[str, Path]:
     ]
     episode_index.write_index(folders["episodes"], rows)
     for kind in ("stage1", "stage2"):
-        save_checkpoint(folders[kind], make_model(0), kind=kind, action_contract=CONTRACT)
+        save_checkpoint(folders[kind], make_model(0), kind=kind, action_contract=make_contract(sigma_px_ref=SIGMA))
     return folders
 
 
@@ -142,20 +139,14 @@ class Clip:
     maps: torch.Tensor
     noise: torch.Tensor
     mask: torch.Tensor
-    block_size: int = 2
+    spec: CausalSpec
     views: tuple[str, ...] = VIEWS
 
 
 @pytest.fixture
-def clip() -> Clip:
+def clip(make_spec: Callable) -> Clip:
     generator = torch.Generator().manual_seed(1)
     latents, noise = torch.randn(2, 2, 3, 4, 5, 4, 4, generator=generator)
     maps = torch.randn(2, 3, 9, 5, 4, 4, generator=generator)
     mask = (torch.rand(2, 3, 5, 4, 4, generator=generator) > 0.5).float()
-    return Clip(latents, maps, noise, mask)
-
-
-@pytest.fixture
-def contract() -> dict[str, object]:
-    """The action contract of the very small Stage II checkpoint."""
-    return dict(CONTRACT)
+    return Clip(latents, maps, noise, mask, make_spec())

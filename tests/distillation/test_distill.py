@@ -11,13 +11,19 @@ import torch
 from pydantic import ValidationError
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.distillation import objectives, teacher_trajectories
-from worldline_core.distillation.batches import robot_masks
+from worldline_core.distillation import trajectory_store
+from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.teacher_trajectories import TrajectoryStore, write_trajectories
+from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
+from worldline_core.distillation.teacher_trajectories import robot_masks, substep_sigmas
+from worldline_core.distillation.trajectory_regression import TrajectoryObjective
+from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError
-from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
+from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.digest import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_source import Clip
@@ -62,14 +68,14 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): digest_file(path) for path in folder_files(folder)}
 
 
-def test_three_steps_give_a_causal_checkpoint(
-    inputs: dict[str, Path], contract: dict[str, object], tmp_path: Path
-) -> None:
+def test_three_steps_give_a_causal_checkpoint(inputs: dict[str, Path], tmp_path: Path) -> None:
     output = tmp_path / "out"
     counts = distill(config(), inputs, output)
-    model, info = load_checkpoint(output, expect_kind="causal", action_contract=contract)
+    model, info = load_checkpoint(output, expect_kind="causal")
     assert info.metadata["distillation"] == "distribution_matching"
-    assert info.metadata["sigmas"] == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
+    assert info.contract == read_checkpoint_info(inputs["stage2"]).contract
+    assert info.causal == config().spec
+    assert info.causal.sigmas == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
     assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
     assert counts["episodes"] == 2
     json.dumps(counts, allow_nan=False)
@@ -88,6 +94,50 @@ def test_three_steps_give_a_causal_checkpoint(
     assert len(index["shards"]) == 2
 
 
+def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_result(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks of two latent frames, no recent block, nodes of two steps: distilled, saved, rolled out and timed so."""
+    small = DistillConfig.model_validate(
+        config().model_dump()
+        | {
+            "window": {"sink_blocks": 1, "recent_blocks": 0},
+            "sigmas": (1.0, 0.6, 0.0),
+            "trajectory_regression": {
+                "trainer": trainer(2),
+                "trajectories": {"clips": 2, "clips_per_shard": 2, "substeps": [1, 2]},
+            },
+        }
+    )
+    passes: list[tuple[int, int, float]] = []
+    forward = WorldModel.forward_block
+
+    def watch(model: WorldModel, noisy: torch.Tensor, sigma: float, cache: KVCache, **rest: object) -> torch.Tensor:
+        passes.append((noisy.shape[3], cache.frames, float(sigma)))
+        return forward(model, noisy, sigma, cache, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(WorldModel, "forward_block", watch)
+    distill(small, inputs, tmp_path / "out")
+    assert {(size, held) for size, held, _ in passes} == {(2, 1)}
+    # The nodes, and the sub-step of the teacher between 0.6 and 0.
+    between = substep_sigmas(0.6, 0.0, 2)[1]
+    assert {sigma for _, _, sigma in passes} == {1.0, 0.6, between}
+    for folder in (tmp_path / "out" / "teacher_forcing", tmp_path / "out"):
+        model, info = load_checkpoint(folder)
+        assert info.causal == small.spec
+        assert info.causal.recent_blocks == 0
+
+    class Codec:
+        latent_channels, spatial_compression, temporal_compression = 4, 8, 4
+
+    world = WorldLine(model, info, Codec(), bfloat16=False)  # type: ignore[arg-type]
+    assert (world.steps, world.frames_per_unit) == (2, 8)
+    passes.clear()
+    first, maps = torch.randn(1, 3, 4, 4, 4), torch.randn(1, 3, 9, 5, 4, 4)
+    assert len(world.time_blocks(first, maps, [42], blocks=4)) == 4
+    assert set(passes) == {(2, 1, 1.0), (2, 1, 0.6)}
+
+
 def test_a_finished_run_is_read_not_repeated(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,7 +147,7 @@ def test_a_finished_run_is_read_not_repeated(
     def refuse(*args: object, **kwargs: object) -> None:
         raise RuntimeError("trained again")
 
-    monkeypatch.setattr("worldline_core.distillation.distillation_step.train", refuse)
+    monkeypatch.setattr("worldline_core.distillation.distill.train", refuse)
     assert distill(config(), inputs, output) == counts
 
 
@@ -126,10 +176,10 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     settings = config(real_score=real_score)
     distill(settings, inputs, tmp_path / "whole")
     kills = [
-        (objectives.TeacherForcingObjective, "loss", 3),
-        (teacher_trajectories, "write_bytes_atomic", 2),
-        (objectives.TrajectoryObjective, "loss", 3),
-        (objectives.DistributionMatchingObjective, "loss", 8),
+        (TeacherForcingObjective, "loss", 3),
+        (trajectory_store, "write_bytes_atomic", 2),
+        (TrajectoryObjective, "loss", 3),
+        (DistributionMatchingObjective, "loss", 8),
     ]
     for owner, name, call in kills:
         with monkeypatch.context() as patch:
@@ -142,7 +192,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
 
 def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model: Callable) -> None:
     model = make_model(0)
-    objective = objectives.DistributionMatchingObjective(model, make_model(1), make_model(2), config(), None)
+    objective = DistributionMatchingObjective(model, make_model(1), make_model(2), config(), None)
     steps = [objective.exit_step(step) for step in range(60)]
     assert steps == [objective.exit_step(step) for step in range(60)]
     assert set(steps) == {0, 1, 2, 3}
@@ -170,7 +220,8 @@ def test_an_iteration_changes_one_of_the_two_models(inputs: dict[str, Path], tmp
 
 def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[str, Path]) -> None:
     views = ("head", "left_wrist", "right_wrist")
-    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=views, tracks=ActionTracks.open(inputs["tracks"]))
+    tracks = ActionTracks.open(inputs["tracks"])
+    loader = ClipLoader(LatentStore.open(inputs["latents"]), views=views, tracks=tracks)
     masks = robot_masks(loader, [Clip("a", 0, 17, 1), Clip("b", 4, 17, 1)], views)
     assert masks.shape == (2, 3, 5, 4, 4)
     assert set(masks.unique().tolist()) == {0.0, 1.0}
@@ -197,8 +248,17 @@ def test_only_a_stage2_checkpoint_of_the_same_latents_is_distilled(inputs: dict[
         distill(config(), {**inputs, "stage2": inputs["stage1"]}, tmp_path / "out")
     description = json.loads((inputs["latents"] / "store.json").read_text())
     (inputs["latents"] / "store.json").write_text(json.dumps({**description, "tokenizer": "other"}))
-    with pytest.raises(CheckpointError, match="action contract differs"):
+    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tokenizer.*0123.*other"):
         distill(config(), inputs, tmp_path / "out2")
+
+
+def test_tracks_of_another_width_are_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
+    (inputs["tracks"] / "tracks.json").write_text(json.dumps({"sigma_px_ref": 10.0}))
+    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tracks: sigma_px_ref.*40\.0.*10\.0"):
+        distill(config(), inputs, tmp_path / "out")
+    (inputs["tracks"] / "tracks.json").write_text("{}")
+    with pytest.raises(ArtifactError, match=r"(?s)do not say the width.*run render_actions again"):
+        distill(config(), inputs, tmp_path / "out")
 
 
 def test_distribution_matching_runs_whole_cycles() -> None:
@@ -206,6 +266,10 @@ def test_distribution_matching_runs_whole_cycles() -> None:
         DistillConfig.model_validate({"distribution_matching": {"trainer": trainer(10)}})
     with pytest.raises(ValidationError, match="must rise"):
         DistillConfig.model_validate({"distribution_matching": {"sigma_range": [0.9, 0.1]}})
+    with pytest.raises(ValidationError, match=r"one number per interval of sigmas is needed, 2"):
+        DistillConfig.model_validate({"sigmas": [1.0, 0.5, 0.0]})
+    with pytest.raises(ValidationError, match="must fall from at most 1 to 0"):
+        DistillConfig.model_validate({"sigmas": [0.5, 1.0, 0.0]})
 
 
 def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path) -> None:

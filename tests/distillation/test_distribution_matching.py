@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow
+from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.distillation.distribution_matching import (
     causal_score,
     distribution_gradient,
@@ -13,7 +13,6 @@ from worldline_core.distillation.distribution_matching import (
     fake_score_loss,
     full_clip_score,
     is_student_iteration,
-    self_forced_rollout,
 )
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
@@ -41,8 +40,7 @@ def rollout(model, clip, exit_step: int = 3, **options):
         options.pop("noise", clip.noise),
         exit_step,
         views=clip.views,
-        block_size=clip.block_size,
-        window=CacheWindow(),
+        spec=clip.spec,
         with_gradient=options.pop("with_gradient", False),
     )
 
@@ -57,7 +55,7 @@ def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(c
     real_mean, fake_mean = clip.latents + 1.0, clip.latents - 1.0
     sigma = torch.full((2, 2), 0.5)
     gradient = distribution_gradient(
-        gaussian_score(real_mean), gaussian_score(fake_mean), generated, clip.noise, sigma, clip.block_size
+        gaussian_score(real_mean), gaussian_score(fake_mean), generated, clip.noise, sigma, clip.spec.block_size
     )
     # (x - (z + 1)) / s - (x - (z - 1)) / s = -2 / s
     torch.testing.assert_close(gradient[..., 1:, :, :], torch.full_like(gradient[..., 1:, :, :], -4.0))
@@ -71,7 +69,7 @@ def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(c
 def test_equal_scores_leave_the_student_alone(clip) -> None:
     generated = clip.latents.clone().requires_grad_()
     score = gaussian_score(clip.latents)
-    gradient = distribution_gradient(score, score, generated, clip.noise, torch.full((2, 2), 0.3), clip.block_size)
+    gradient = distribution_gradient(score, score, generated, clip.noise, torch.full((2, 2), 0.3), clip.spec.block_size)
     loss = distribution_matching_loss(generated, gradient)
     loss.backward()
     assert loss.item() == 0
@@ -81,7 +79,7 @@ def test_equal_scores_leave_the_student_alone(clip) -> None:
 @pytest.mark.parametrize("score", [causal_score, full_clip_score])
 def test_a_student_update_reaches_the_student_alone(make_model, clip, score) -> None:
     student, real, fake = make_model(0), make_model(1), make_model(2)
-    options = {"views": clip.views, "block_size": clip.block_size}
+    options = {"views": clip.views, "block_size": clip.spec.block_size}
     generated = rollout(student, clip, 1, with_gradient=True)
     gradient = distribution_gradient(
         score(real, clip.maps, **options),
@@ -89,7 +87,7 @@ def test_a_student_update_reaches_the_student_alone(make_model, clip, score) -> 
         generated,
         clip.noise,
         torch.full((2, 2), 0.6),
-        clip.block_size,
+        clip.spec.block_size,
     )
     distribution_matching_loss(generated, gradient).backward()
     assert all(parameter.grad is None for model in (real, fake) for parameter in model.parameters())
@@ -100,13 +98,13 @@ def test_a_fake_score_update_reaches_the_fake_score_alone(make_model, clip) -> N
     student, fake = make_model(0), make_model(2)
     generated = rollout(student, clip)
     assert not generated.requires_grad
-    score = causal_score(fake, clip.maps, views=clip.views, block_size=clip.block_size)
+    score = causal_score(fake, clip.maps, views=clip.views, block_size=clip.spec.block_size)
     fake_score_loss(
         score,
         generated,
         clip.noise.flip(0),
         torch.full((2, 2), 0.6),
-        block_size=clip.block_size,
+        block_size=clip.spec.block_size,
         weighting=LossWeighting(),
     ).backward()
     assert all(parameter.grad is None for parameter in student.parameters())
@@ -162,17 +160,10 @@ def test_an_exit_step_outside_of_the_schedule_is_refused(make_model, clip) -> No
         rollout(make_model(0), clip, 4)
 
 
-@pytest.mark.parametrize("window", [CacheWindow(), CacheWindow(recent_blocks=0)])
-def test_rollout_equals_the_block_causal_sampler(make_model, clip, window: CacheWindow) -> None:
-    student = make_model(0)
-    simulator = BlockCausalSimulator(
-        student,
-        noise=Noise([1, 2]),
-        block_size=clip.block_size,
-        sink_blocks=window.sink_blocks,
-        recent_blocks=window.recent_blocks,
-        views=clip.views,
-    )
+@pytest.mark.parametrize("recent_blocks", [3, 0])
+def test_rollout_equals_the_block_causal_sampler(make_model, make_spec, clip, recent_blocks: int) -> None:
+    student, spec = make_model(0), make_spec(recent_blocks=recent_blocks)
+    simulator = BlockCausalSimulator(student, spec, noise=Noise([1, 2]), views=clip.views)
     simulator.start(clip.latents[:, :, :, 0], clip.maps[:, :, :, :1])
     predicted = [simulator.step(clip.maps[..., start : start + 2, :, :]) for start in (1, 3)]
     same_noise = Noise([1, 2])
@@ -184,8 +175,7 @@ def test_rollout_equals_the_block_causal_sampler(make_model, clip, window: Cache
         torch.cat((clip.noise[..., :1, :, :], *drawn), dim=3),
         3,
         views=clip.views,
-        block_size=clip.block_size,
-        window=window,
+        spec=spec,
         with_gradient=False,
     )
     assert torch.equal(generated[..., 1:, :, :], torch.cat(predicted, dim=3))
@@ -198,7 +188,7 @@ def test_residual_predicting_students_generate_and_learn_as_well(make_model, cli
     generated = rollout(student, clip, 2, with_gradient=True)
     sigma = torch.full((2, 2), 0.4)
     scores = [full_clip_score(m, clip.maps, views=clip.views, block_size=2) for m in (real, fake)]
-    gradient = distribution_gradient(*scores, generated, clip.noise, sigma, clip.block_size)
+    gradient = distribution_gradient(*scores, generated, clip.noise, sigma, clip.spec.block_size)
     loss = distribution_matching_loss(generated, gradient)
     loss.backward()
     assert bool(loss.isfinite())

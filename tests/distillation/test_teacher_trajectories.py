@@ -7,22 +7,17 @@ import itertools
 import pytest
 import torch
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow
-from worldline_core.distillation.teacher_trajectories import (
-    NODES,
-    euler_nodes,
-    node_of_each_block,
-    substep_sigmas,
-    teacher_trajectories,
-)
+from worldline_core.distillation.teacher_trajectories import euler_nodes, substep_sigmas, teacher_trajectories
+from worldline_core.distillation.trajectory_regression import node_of_each_block
 from worldline_core.errors import ConfigError
+from worldline_core.model.contracts import CAUSAL_SIGMAS as NODES
 
 
 @pytest.mark.parametrize("substeps", [(1, 1, 1, 1), (2, 2, 3, 9)])
 def test_euler_is_exact_on_a_straight_field(substeps: tuple[int, ...]) -> None:
     generator = torch.Generator().manual_seed(0)
     clean, noise = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64)
-    states = euler_nodes(lambda state, sigma: noise - clean, noise, substeps)
+    states = euler_nodes(lambda state, sigma: noise - clean, noise, substeps, NODES)
     assert len(states) == len(NODES)
     for sigma, state in zip(NODES, states, strict=True):
         torch.testing.assert_close(state, (1 - sigma) * clean + sigma * noise)
@@ -33,7 +28,8 @@ def test_finer_substeps_come_closer_to_the_true_flow() -> None:
     noise = torch.ones(1, dtype=torch.float64)
     exact = torch.exp(torch.tensor(-1.0, dtype=torch.float64))
     errors = [
-        abs(euler_nodes(lambda state, sigma: state, noise, (count,) * 4)[-1] - exact).item() for count in (1, 4, 16)
+        abs(euler_nodes(lambda state, sigma: state, noise, (count,) * 4, NODES)[-1] - exact).item()
+        for count in (1, 4, 16)
     ]
     assert errors[0] > 3 * errors[1] > 9 * errors[2] > 0
 
@@ -47,7 +43,7 @@ def test_substeps_end_on_the_nodes_and_descend() -> None:
     with pytest.raises(ConfigError, match="divide an interval"):
         substep_sigmas(0.5, 0.5, 1)
     with pytest.raises(ConfigError, match="sub-steps is needed"):
-        euler_nodes(lambda state, sigma: state, torch.ones(1), (1, 2))
+        euler_nodes(lambda state, sigma: state, torch.ones(1), (1, 2), NODES)
 
 
 def test_a_node_is_picked_for_each_block() -> None:
@@ -64,8 +60,7 @@ def trajectories(model, clip, **options):
         options.pop("maps", clip.maps),
         clip.noise,
         views=clip.views,
-        block_size=clip.block_size,
-        window=CacheWindow(),
+        spec=clip.spec,
         substeps=(1, 1, 1, 2),
         **options,
     )

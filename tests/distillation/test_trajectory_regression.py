@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
-from worldline_core.distillation.causal_teacher_forcing import block_sigmas, frame_sigmas, teacher_forcing_loss
-from worldline_core.distillation.teacher_trajectories import NODES
+from worldline_core.distillation.causal_objective import block_sigmas, frame_sigmas
+from worldline_core.distillation.causal_teacher_forcing import teacher_forcing_loss
 from worldline_core.distillation.trajectory_regression import draw_nodes, trajectory_regression_loss
+from worldline_core.model.contracts import CAUSAL_SIGMAS as NODES
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
 
 
@@ -37,7 +38,7 @@ def loss_of(student, nodes, clip, index, **options):
         index,
         mask=clip.mask,
         views=clip.views,
-        block_size=clip.block_size,
+        spec=clip.spec,
         **{"next_weight": 1.0, "terminal_weight": 0.5, "auxiliary": AuxiliaryWeights(), **options},
     )
 
@@ -80,7 +81,7 @@ def test_training_on_trajectories_lowers_the_loss(make_model, clip) -> None:
 
 
 def test_every_node_is_drawn() -> None:
-    index = draw_nodes(64, 2, torch.Generator().manual_seed(0))
+    index = draw_nodes(64, 2, 4, torch.Generator().manual_seed(0))
     assert sorted(set(index.flatten().tolist())) == [0, 1, 2, 3]
 
 
@@ -104,7 +105,7 @@ def test_teacher_forcing_trains_every_block_on_recorded_history(make_model, clip
             maps,
             history=history,
             views=clip.views,
-            block_size=clip.block_size,
+            block_size=clip.spec.block_size,
             sampling=SigmaSampling(),
             weighting=LossWeighting(),
             generator=torch.Generator().manual_seed(5),

@@ -91,7 +91,7 @@ def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) 
             writers["copy"].add(
                 episode_id, 0, {view: np.repeat(video[:1], NUM_FRAMES, 0) for view, video in frames.items()}
             )
-    write_index(tracks, index)
+    write_index(tracks, index, sigma_px_ref=40.0)
     for rollout in writers.values():
         rollout.close()
     inputs = {"tracks": tracks, **{f"rollouts.{name}": path for name, path in methods.items()}}

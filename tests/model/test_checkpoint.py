@@ -13,10 +13,19 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.contracts import ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 
-CONTRACT = {"fps": 8.0, "gripper": "0 closed, 1 open", "sigma_px_ref": 10.0}
+CONTRACT = ActionContract.of_these_maps(
+    controls="action",
+    fps=8.0,
+    sigma_px_ref=10.0,
+    wrist_projection="current_camera",
+    grid_size=(8, 12),
+    tokenizer="0123",
+)
+SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=2, sigmas=(1.0, 0.5, 0.0))
 
 
 def build(**changes: object) -> WorldModel:
@@ -36,7 +45,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_checkpoint_comes_back_as_it_was(folder: Path) -> None:
-    model, info = load_checkpoint(folder, expect_kind="stage2", action_contract={"fps": 8.0})
+    model, info = load_checkpoint(folder, expect_kind="stage2")
     for name, tensor in build().state_dict().items():
         assert torch.equal(model.state_dict()[name], tensor.half().float()), name
     assert (info.kind, info.metadata, info.action_contract) == ("stage2", {"step": 3}, CONTRACT)
@@ -52,8 +61,9 @@ def test_equal_models_give_equal_bytes(folder: Path, tmp_path: Path) -> None:
 def test_averaged_weights_may_be_stored_in_their_place(tmp_path: Path) -> None:
     model = build()
     average = {name: tensor + 1.0 for name, tensor in model.state_dict().items()}
-    save_checkpoint(tmp_path, model, kind="causal", action_contract={}, state_dict=average, dtype=torch.float32)
-    loaded, _ = load_checkpoint(tmp_path)
+    save_checkpoint(tmp_path, model, kind="base", action_contract=None, state_dict=average, dtype=torch.float32)
+    loaded, info = load_checkpoint(tmp_path)
+    assert info.action_contract is None
     torch.testing.assert_close(loaded.proj_out.bias, average["proj_out.bias"])
 
 
@@ -62,7 +72,7 @@ def test_the_generation_tower_is_taken_out_of_a_checkpoint_with_both(folder: Pat
     assert model.config.towers == "generation"
     assert info.config.towers == "both"
     assert not any("to_q" in name for name in model.state_dict())
-    save_checkpoint(tmp_path / "g", model, kind="stage2", action_contract={})
+    save_checkpoint(tmp_path / "g", model, kind="stage2", action_contract=CONTRACT)
     with pytest.raises(CheckpointError, match="no understanding tower"):
         load_checkpoint(tmp_path / "g", towers="both")
 
@@ -70,14 +80,45 @@ def test_the_generation_tower_is_taken_out_of_a_checkpoint_with_both(folder: Pat
 def test_what_does_not_fit_the_caller_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*expected: causal.*got: stage2"):
         load_checkpoint(folder, expect_kind="causal")
-    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*fps.*expected: 10\.0.*got: 8\.0"):
-        load_checkpoint(folder, action_contract={"fps": 10.0})
-    with pytest.raises(CheckpointError, match="got: not stored"):
-        load_checkpoint(folder, action_contract={"depth_unit": "m"})
+    with pytest.raises(CheckpointError, match=r"(?s)contract differs.*tracks: fps.*expected:.*8\.0.*got:.*10\.0"):
+        CONTRACT.require(where="tracks", fps=10.0, controls="action")
     with pytest.raises(CheckpointError, match="No checkpoint here"):
         load_checkpoint(tmp_path)
-    with pytest.raises(CheckpointError, match="Unknown checkpoint kind"):
-        save_checkpoint(tmp_path, build(), kind="final", action_contract={})  # type: ignore[arg-type]
+    with pytest.raises(CheckpointError, match="kind: Input should be"):
+        save_checkpoint(tmp_path, build(), kind="final", action_contract=None)  # type: ignore[arg-type]
+    with pytest.raises(CheckpointError, match="action_contract: a checkpoint of kind stage2 needs one"):
+        save_checkpoint(tmp_path, build(), kind="stage2", action_contract=None)
+    with pytest.raises(CheckpointError, match="causal: needed by the kind causal"):
+        save_checkpoint(tmp_path, build(), kind="causal", action_contract=CONTRACT)
+
+
+@pytest.mark.parametrize("part", ["action_contract", "causal"])
+def test_a_missing_unknown_or_other_field_of_a_contract_is_named(part: str, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, build(towers="generation"), kind="causal", action_contract=CONTRACT, causal=SPEC)
+    info = read_checkpoint_info(tmp_path)
+    assert (info.contract, info.causal) == (CONTRACT, SPEC)
+    path = tmp_path / "checkpoint.json"
+    whole = json.loads(path.read_text())
+    assert whole[part]
+    for name in whole[part]:
+        fields = {key: value for key, value in whole[part].items() if key != name}
+        path.write_text(json.dumps(whole | {part: fields}))
+        with pytest.raises(CheckpointError, match=rf"(?s){part}\.{name}: Field required.*next step: train it again"):
+            read_checkpoint_info(tmp_path)
+    path.write_text(json.dumps(whole | {part: whole[part] | {"gamma": 1}}))
+    with pytest.raises(CheckpointError, match=rf"{part}\.gamma: Extra inputs"):
+        read_checkpoint_info(tmp_path)
+    path.write_text(json.dumps({key: value for key, value in whole.items() if key != part}))
+    with pytest.raises(CheckpointError, match=part):
+        read_checkpoint_info(tmp_path)
+
+
+def test_maps_of_other_conventions_are_refused(folder: Path) -> None:
+    path = folder / "checkpoint.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"action_contract": content["action_contract"] | {"depth_unit": "mm"}}))
+    with pytest.raises(CheckpointError, match=r"action_contract\.depth_unit: Input should be 'm'"):
+        read_checkpoint_info(folder)
 
 
 def rewrite(folder: Path, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
@@ -116,15 +157,15 @@ def test_damaged_files_are_refused(folder: Path) -> None:
     for change, message in (
         ({"format": "other"}, "Not a checkpoint of this version"),
         ({"version": 2}, "Not a checkpoint of this version"),
-        ({"kind": "other"}, "Unknown checkpoint kind"),
-        ({"config": content["config"] | {"hidden": 3}}, "model config is not valid"),
+        ({"kind": "other"}, "kind: Input should be"),
+        ({"config": content["config"] | {"hidden": 3}}, r"config\.hidden: Extra inputs"),
     ):
         description.write_text(json.dumps(content | change))
         with pytest.raises(CheckpointError, match=message):
             read_checkpoint_info(folder)
     del content["metadata"]
     description.write_text(json.dumps(content))
-    with pytest.raises(CheckpointError, match="lacks keys"):
+    with pytest.raises(CheckpointError, match="metadata: Field required"):
         read_checkpoint_info(folder)
     description.write_text("{")
     with pytest.raises(CheckpointError, match="not JSON"):
@@ -135,6 +176,6 @@ def test_weights_that_are_not_finite_are_not_stored(tmp_path: Path) -> None:
     model = build()
     model.proj_in.weight.data[0, 0] = 1e6
     with pytest.raises(CheckpointError, match=r"(?s)not finite.*proj_in\.weight"):
-        save_checkpoint(tmp_path, model, kind="base", action_contract={})
-    save_checkpoint(tmp_path, model, kind="base", action_contract={}, dtype=torch.bfloat16)
+        save_checkpoint(tmp_path, model, kind="base", action_contract=None)
+    save_checkpoint(tmp_path, model, kind="base", action_contract=None, dtype=torch.bfloat16)
     assert read_checkpoint_info(tmp_path).dtype == "bfloat16"

@@ -115,7 +115,7 @@ def write_tracks(folder: Path) -> None:
                 capsules=np.zeros((NUM_FRAMES, 1, 2, 3), np.float32), capsule_radii=np.ones(1, np.float32),
             )
         )  # fmt: skip
-    write_index(folder, write_shard(folder, 0, tracks))
+    write_index(folder, write_shard(folder, 0, tracks), sigma_px_ref=36.0)
     numbers = {"episodes": 2, "valid": 50, "outside_image": 4}
     write_json_atomic(folder / "summary.json", {"by_embodiment": {"aloha_viperx": numbers, "ur5e_pair": numbers}})
 

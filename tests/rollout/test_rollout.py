@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,18 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, wr
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.rollout.rollout import RolloutConfig, rollout
-from worldline_core.rollout.rollout_config import shuffled_partners
+from worldline_core.rollout.rollout import RolloutConfig, rollout, shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.digest import digest_folder
 from worldline_core.training.train_tokenizer import fit_patch_tokenizer
 
 SIZE = (32, 48)
+SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)
 N = 33
 NAMES = {"a-0": "ur5e_pair", "a-1": "ur5e_pair", "b/0 x": "aloha_viperx", "b-1": "aloha_viperx", "b-2": "aloha_viperx"}
 
@@ -54,7 +57,7 @@ def track(name: str, shift: float) -> EpisodeTracks:
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, make_spec: Callable) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("rollout")
     K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
@@ -67,10 +70,12 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
                 cameras={view: CameraTrack(view, K, np.eye(4)[None], SIZE[1], SIZE[0]) for view in VIEWS},
             )  # fmt: skip
             writer.add(episode, {view: recorded(seed) for view in VIEWS})
-    write_index(root / "tracks", write_shard(root / "tracks", 0, [track(n, s) for s, n in enumerate(NAMES)]))
+    shard = write_shard(root / "tracks", 0, [track(n, s) for s, n in enumerate(NAMES)])
+    write_index(root / "tracks", shard, sigma_px_ref=40.0)
     torch.manual_seed(0)
     video = torch.from_numpy(np.stack([recorded(s) for s in range(4)])).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
-    fit_patch_tokenizer([video], channels=8, refinement_width=4, refinement_depth=1).save(root / "tokenizer")
+    tokenizer = fit_patch_tokenizer([video], channels=8, refinement_width=4, refinement_depth=1)
+    tokenizer.save(root / "tokenizer")
     config = WorldModelConfig(
         latent_channels=8, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=12, intermediate_size=32,
         rope_sections=(2, 2, 2), towers="generation",
@@ -80,15 +85,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
-    contract = {
-        "fps": 8.0,
-        "controls": "action",
-        "sigma_px_ref": 40.0,
-        "wrist_projection": "current_camera",
-        "grid_size": [4, 6],
-    }
-    for kind in ("stage2", "causal"):
-        save_checkpoint(root / kind, model, kind=kind, action_contract=contract, metadata={"clip_latent_frames": 9})
+    contract = make_contract(grid_size=(4, 6), tokenizer=tokenizer.encoder_digest[:16])
+    save_checkpoint(root / "stage2", model, kind="stage2", action_contract=contract)
+    save_checkpoint(root / "causal", model, kind="causal", action_contract=contract, causal=SPEC)
+    small = make_spec(recent_blocks=1, sigmas=(1.0, 0.5, 0.0))
+    save_checkpoint(root / "small_blocks", model, kind="causal", action_contract=contract, causal=small)
     return {
         "episodes": root / "episodes",
         "tracks": root / "tracks",
@@ -154,6 +155,39 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(
         RolloutConfig(sampler="full_clip", timed_blocks=2)
 
 
+def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks of two latent frames, a window of one recent block, two Euler steps: as the checkpoint says."""
+    frames, held, levels = [], [], []
+    forward = WorldModel.forward_block
+
+    def watch(model: WorldModel, noisy: torch.Tensor, sigma: float, cache: KVCache, **rest: object) -> torch.Tensor:
+        frames.append(noisy.shape[3])
+        held.append(cache.frames)
+        levels.append(sigma)
+        return forward(model, noisy, sigma, cache, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(WorldModel, "forward_block", watch)
+    config = CONFIG.model_copy(update={"timed_blocks": 3, "seeds": (42,), "embodiments": ("ur5e_pair",)})
+    given = inputs | {"checkpoint": inputs["checkpoint"].parent / "small_blocks"}
+    summary = rollout(config.model_copy(update={"num_frames": 31}), given, tmp_path)
+    assert (summary["steps"], summary["recent_blocks"], summary["frames"]) == (2, 1, 25)
+    assert set(frames) == {2}
+    assert max(held) == 1 + 2
+    assert levels == [1.0, 0.5] * (len(levels) // 2)
+    speed = json.loads((tmp_path / "run" / "speed.json").read_text())
+    assert speed["steps"] == 2
+    assert len(speed["block_seconds"]) == 3
+    assert len(speed["long_rollout"]["block_seconds"]) == 3
+    # A wider window and other steps can be asked for.
+    held.clear()
+    wider = config.model_copy(update={"recent_blocks": 2, "steps": 1, "timed_blocks": 0})
+    summary = rollout(wider, given, tmp_path / "wider")
+    assert (summary["steps"], summary["recent_blocks"], summary["frames"]) == (1, 2, 33)
+    assert max(held) == 1 + 4
+
+
 def test_interrupted_rollouts_end_with_the_same_bytes(
     inputs: dict[str, Path], predicted: tuple[Path, dict], tmp_path: Path
 ) -> None:
@@ -202,15 +236,17 @@ def test_the_whole_clip_sampler_takes_stage2_checkpoints_only(inputs: dict[str, 
 
 
 def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
-    model = WorldModel(WorldModelConfig(latent_channels=8, num_layers=1, towers="generation"))
-    model.initialise()
-    save_checkpoint(tmp_path / "c", model, kind="causal", action_contract={"fps": 10.0, "grid_size": [4, 6]})
-    with pytest.raises(CheckpointError, match="action contract differs"):
-        rollout(CONFIG, inputs | {"checkpoint": tmp_path / "c"}, tmp_path / "out")
-    contract = {"fps": 8.0, "grid_size": [4, 6], "tokenizer": "0123456789abcdef"}
-    save_checkpoint(tmp_path / "d", model, kind="causal", action_contract=contract)
-    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*tokenizer"):
-        rollout(CONFIG, inputs | {"checkpoint": tmp_path / "d"}, tmp_path / "out")
+    model, info = load_checkpoint(inputs["checkpoint"])
+    for name, value in (
+        ("fps", 10.0),
+        ("tokenizer", "0123456789abcdef"),
+        ("sigma_px_ref", 10.0),
+        ("controls", "state"),
+    ):
+        contract = info.contract.model_copy(update={name: value})
+        save_checkpoint(tmp_path / name, model, kind="causal", action_contract=contract, causal=SPEC)
+        with pytest.raises(CheckpointError, match=rf"(?s)action contract differs.*: {name}.*expected:.*{value}"):
+            rollout(CONFIG, inputs | {"checkpoint": tmp_path / name}, tmp_path / "out")
     with pytest.raises(DataError, match="No episode to predict"):
         rollout(CONFIG.model_copy(update={"splits": ("bank",)}), inputs, tmp_path / "out")
 

@@ -7,14 +7,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
 from worldline_core.rollout.samplers import (
-    CAUSAL_SIGMAS,
     BlockCausalSimulator,
     Noise,
-    check_nodes,
     euler_step,
     rollout_full_clip,
     shifted_sigmas,
@@ -34,16 +34,19 @@ def observation(batch: int = 2, frames: int = 9) -> tuple[torch.Tensor, torch.Te
     return first, torch.randn(batch, 3, 9, frames, 4, 4, generator=generator)
 
 
+SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=CAUSAL_SIGMAS)
+
+
 def test_nodes_of_the_samplers() -> None:
     assert shifted_sigmas(4, 5.0) == pytest.approx(CAUSAL_SIGMAS)
-    assert sigmas_causal() == CAUSAL_SIGMAS
+    assert sigmas_causal(SPEC) == sigmas_causal(SPEC, 4) == CAUSAL_SIGMAS
     assert len(sigmas_full()) == 36
     assert sigmas_full(2) == (1.0, 0.5, 0.0)
-    assert sigmas_causal(2) == pytest.approx((1.0, 5 / 6, 0.0))
+    assert sigmas_causal(SPEC, 2) == pytest.approx((1.0, 5 / 6, 0.0))
     with pytest.raises(ConfigError, match="at least one step"):
         shifted_sigmas(0)
-    with pytest.raises(ConfigError, match="must fall from at most 1 to 0"):
-        check_nodes((1.0, 0.5, 0.5, 0.0))
+    with pytest.raises(ValidationError, match="must fall from at most 1 to 0"):
+        CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=(1.0, 0.5, 0.5, 0.0))
 
 
 def test_euler_reaches_the_sample_of_a_constant_velocity() -> None:
@@ -92,10 +95,10 @@ def roll(simulator: BlockCausalSimulator, first: torch.Tensor, maps: torch.Tenso
 
 def test_block_causal_rollout_accepts_new_controls_and_never_looks_ahead(model: WorldModel) -> None:
     first, maps = observation(frames=13)
-    before = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    before = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, maps)
     changed = maps.clone()
     changed[:, :, :, 5:] *= -1
-    after = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, changed)
+    after = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, changed)
     assert torch.equal(before[0], after[0])
     assert not torch.allclose(before[1], after[1], atol=1e-3)
     assert len(before) == 3
@@ -104,7 +107,7 @@ def test_block_causal_rollout_accepts_new_controls_and_never_looks_ahead(model: 
 
 def test_blocks_equal_the_full_block_causal_pass_at_every_step(model: WorldModel) -> None:
     first, maps = observation()
-    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]), sigmas=(1.0, 0.0))
+    simulator = BlockCausalSimulator(model, SPEC.model_copy(update={"sigmas": (1.0, 0.0)}), noise=Noise([42, 43]))
     blocks = roll(simulator, first, maps)
     noise = Noise([42, 43])
     noisy = torch.cat([first[:, :, :, None], *(noise.draw((3, 4, 4, 4, 4)) for _ in range(2))], dim=3)
@@ -115,7 +118,9 @@ def test_blocks_equal_the_full_block_causal_pass_at_every_step(model: WorldModel
 
 def test_long_rollouts_keep_a_window_of_constant_size(model: WorldModel) -> None:
     first, maps = observation(batch=1, frames=1 + 4 * 7)
-    simulator = BlockCausalSimulator(model, noise=Noise([42]), sigmas=(1.0, 0.0), recent_blocks=2)
+    simulator = BlockCausalSimulator(
+        model, SPEC.model_copy(update={"sigmas": (1.0, 0.0), "recent_blocks": 2}), noise=Noise([42])
+    )
     simulator.start(first, maps[:, :, :, :1])
     sizes = []
     for start in range(1, maps.shape[3], 4):
@@ -126,30 +131,30 @@ def test_long_rollouts_keep_a_window_of_constant_size(model: WorldModel) -> None
 
 def test_forks_go_on_separately_and_repeat_the_original(model: WorldModel) -> None:
     first, maps = observation(frames=13)
-    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42, 43]))
     simulator.start(first, maps[:, :, :, :1])
     simulator.step(maps[:, :, :, 1:5])
     fork = simulator.fork()
     other = fork.step(-maps[:, :, :, 5:9])
     continued = simulator.step(maps[:, :, :, 5:9])
-    whole = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    whole = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, maps)
     assert torch.equal(continued, whole[1])
     assert not torch.allclose(other, continued, atol=1e-3)
 
 
 def test_a_simulator_starts_again_from_nothing(model: WorldModel) -> None:
     first, maps = observation()
-    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42, 43]))
     roll(simulator, first, maps)
     simulator.noise = Noise([42, 43])
     again = roll(simulator, first, maps)
-    fresh = roll(BlockCausalSimulator(model, noise=Noise([42, 43])), first, maps)
+    fresh = roll(BlockCausalSimulator(model, SPEC, noise=Noise([42, 43])), first, maps)
     assert torch.equal(again[1], fresh[1])
 
 
 def test_misuse_is_refused(model: WorldModel) -> None:
     first, maps = observation()
-    simulator = BlockCausalSimulator(model, noise=Noise([42, 43]))
+    simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42, 43]))
     with pytest.raises(DataError, match="has not been started"):
         simulator.step(maps[:, :, :, 1:5])
     simulator.start(first, maps[:, :, :, :1])

@@ -122,7 +122,7 @@ def write_tracks(root: Path, count: int) -> None:
                 capsule_radii=np.ones(1, np.float32),
             )
         )
-    write_index(root, write_shard(root, 0, tracks))
+    write_index(root, write_shard(root, 0, tracks), sigma_px_ref=60.0)
 
 
 def write_episodes(root: Path, count: int, validation: int) -> None:

@@ -72,7 +72,7 @@ def inputs(world: Any, tiny_model: dict[str, Any], tmp_path_factory: pytest.Temp
     model = WorldModel(WorldModelConfig.model_validate(tiny_model))
     model.initialise(torch.Generator().manual_seed(0))
     folder = tmp_path_factory.mktemp("base")
-    save_checkpoint(folder, model, kind="base", action_contract={})
+    save_checkpoint(folder, model, kind="base", action_contract=None)
     return {**world.inputs, "stage1": folder}
 
 
@@ -80,7 +80,6 @@ def stage2(output: Path, inputs: dict[str, Path], batch_size: int, **run: Any) -
     config = {
         "trainer": trainer(6, batch_size),
         "clips": {"lengths": [9, 17], "view_weights": {"joint": 1.0, "head": 1.0}},
-        "sigma_px_ref": 60.0,
         "action_multiplier": 3.0,
         "relational": None,
     }

@@ -79,7 +79,6 @@ def stage2(**changes: Any) -> Stage2Config:
     values = {
         "trainer": TRAINER,
         "clips": {"lengths": [9, 13, 17], "order": "epochs"},
-        "sigma_px_ref": 60.0,
         "action_multiplier": 3.0,
         "relational": None,
     }

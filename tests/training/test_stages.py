@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, TrainingError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.contracts import ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.training import stage as stage_module
 from worldline_core.training import trainer as trainer_module
@@ -44,7 +45,6 @@ def stage2(steps: int, **changes: Any) -> Stage2Config:
     values = {
         "trainer": trainer_values(steps),
         "clips": {"lengths": [9, 17]},
-        "sigma_px_ref": 60.0,
         "action_multiplier": 3.0,
         "action_dropout": 0.1,
         "relational": None,
@@ -140,7 +140,7 @@ def test_a_state_that_was_trained_on_other_episodes_is_refused(
 def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeConfig, tmp_path: Path) -> None:
     base = WorldModel(model_config())
     base.initialise(torch.Generator().manual_seed(0))
-    save_checkpoint(tmp_path / "base", base, kind="base", action_contract={})
+    save_checkpoint(tmp_path / "base", base, kind="base", action_contract=None)
     config = stage2(
         160, trainer=trainer_values(160, batch_size=8, ema_decay=0.95), weighting={"kind": "sample"}, action_dropout=0.0
     )
@@ -149,7 +149,7 @@ def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeC
     assert losses[-1] < 0.4 * losses[0]
     assert result["validation/sample_error"] < 0.8 * result["validation/sample_error_shuffled_actions"]
     _, info = load_checkpoint(tmp_path / "run", expect_kind="stage2")
-    assert info.action_contract["sigma_px_ref"] == 60.0
+    assert info.contract.sigma_px_ref == 60.0
     assert info.metadata["step"] == 160
 
 
@@ -200,12 +200,28 @@ def test_outcomes_do_not_reach_the_model(world: Any, stage1_folder: Path, tmp_pa
     assert digested(tmp_path / "one") == digested(tmp_path / "two")
 
 
-def test_wrong_checkpoint_and_missing_teacher_are_named(
-    world: Any, model_config: MakeConfig, stage1_folder: Path, tmp_path: Path
+def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
+    world: Any, model_config: MakeConfig, make_contract: Callable[..., ActionContract], tmp_path: Path
 ) -> None:
     model = WorldModel(model_config(towers="generation"))
     model.initialise(torch.Generator().manual_seed(0))
-    save_checkpoint(tmp_path / "causal", model, kind="causal", action_contract={})
+    narrow = make_contract(sigma_px_ref=10.0, tokenizer="synthetic")
+    save_checkpoint(tmp_path / "stage2", model, kind="stage2", action_contract=narrow)
+    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*'sigma_px_ref': 10\.0.*60\.0"):
+        train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
+
+
+def test_wrong_checkpoint_and_missing_teacher_are_named(
+    world: Any,
+    model_config: MakeConfig,
+    stage1_folder: Path,
+    make_contract: Callable[..., ActionContract],
+    make_spec: Callable[..., CausalSpec],
+    tmp_path: Path,
+) -> None:
+    model = WorldModel(model_config(towers="generation"))
+    model.initialise(torch.Generator().manual_seed(0))
+    save_checkpoint(tmp_path / "causal", model, kind="causal", action_contract=make_contract(), causal=make_spec())
     with pytest.raises(CheckpointError, match="wrong kind"):
         train_stage2(stage2(2), {**world.inputs, "stage1": tmp_path / "causal"}, tmp_path / "out")
     with pytest.raises(CheckpointError, match="wrong kind"):

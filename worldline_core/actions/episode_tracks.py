@@ -4,8 +4,9 @@ Axis legend: n frames, v views, a arms, s capsules. Frames of reference: base, t
 of the gripper), camera (OpenCV axes). Units: metres, pixels of the recorded frame size (centre of the first pixel
 is 0), gripper opening 0 closed .. 1 open. Which samples are valid is decided in `tool_projection`.
 
-On disk: shards `tracks-00000.safetensors` ... with entries `<episode_id>/<array>`, and `index.parquet` with one row per
-episode. Bytes depend on the tracks alone.
+On disk: shards `tracks-00000.safetensors` ... with entries `<episode_id>/<array>`, `index.parquet` with one row per
+episode, and `tracks.json`: the width of the Gaussian that these tracks are to be drawn with. Bytes depend on the tracks
+alone.
 """
 
 from __future__ import annotations
@@ -20,17 +21,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
 from worldline_core.actions.tool_projection import project_tools
+from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.store.atomic import atomic_path, write_bytes_atomic
+from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
 HEAD_VIEW = "head"
-INDEX_FILE = "index.parquet"
+INDEX_FILE, DESCRIPTION_FILE = "index.parquet", "tracks.json"
 SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")
 """Arrays with one entry per frame, view and arm: what action maps are rendered from."""
 ARRAYS = (*SAMPLES, "T_base_tool", "T_base_camera", "K", "capsules", "capsule_radii")
@@ -209,8 +212,15 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
     return rows
 
 
-def write_index(root: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write the index, ordered by episode id."""
+class TracksDescription(StrictModel):
+    """What holds for all tracks of an artifact: sigma of their Gaussian, pixels on the 384 x 512 reference canvas."""
+
+    sigma_px_ref: float = Field(gt=0)
+
+
+def write_index(root: Path, rows: Sequence[dict[str, Any]], *, sigma_px_ref: float) -> None:
+    """Write the index, ordered by episode id, and the width that action maps of these tracks have."""
+    write_json_atomic(root / DESCRIPTION_FILE, TracksDescription(sigma_px_ref=sigma_px_ref).model_dump())
     ordered = sorted(rows, key=lambda row: row["episode_id"])
     with atomic_path(root / INDEX_FILE) as temporary:
         pq.write_table(pa.Table.from_pylist(ordered, schema=_SCHEMA), temporary)
@@ -219,15 +229,16 @@ def write_index(root: Path, rows: Sequence[dict[str, Any]]) -> None:
 class ActionTracks:
     """Read access to a finished ActionTracks artifact; only the episodes asked for are read."""
 
-    def __init__(self, root: Path, rows: Sequence[dict[str, Any]]) -> None:
+    def __init__(self, root: Path, rows: Sequence[dict[str, Any]], description: TracksDescription) -> None:
         self.root = root
+        self.sigma_px_ref = description.sigma_px_ref
         self._rows = {row["episode_id"]: row for row in rows}
 
     @classmethod
     def open(cls, root: Path) -> ActionTracks:
         """Open an artifact.
 
-        Raises: ArtifactError when the index is missing or lacks a column.
+        Raises: ArtifactError when the index is missing or lacks a column, or `tracks.json` does not say the width.
         """
         path = Path(root) / INDEX_FILE
         if not path.is_file():
@@ -240,7 +251,7 @@ class ActionTracks:
             raise ArtifactError(
                 "ActionTracks index lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
             )
-        return cls(Path(root), table.to_pylist())
+        return cls(Path(root), table.to_pylist(), _read_description(Path(root) / DESCRIPTION_FILE))
 
     @property
     def episode_ids(self) -> list[str]:
@@ -288,3 +299,16 @@ class ActionTracks:
             camera_motion=tuple(row["camera_motion"]),
             **arrays,
         )
+
+
+def _read_description(path: Path) -> TracksDescription:
+    try:
+        return TracksDescription.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise ArtifactError(
+            "The action tracks do not say the width of their Gaussian",
+            where=path,
+            expected="sigma_px_ref, pixels on the 384 x 512 reference canvas",
+            got=str(error),
+            next_step="run render_actions again",
+        ) from error

@@ -47,7 +47,9 @@ class RenderActionsConfig(StrictModel):
         without_mount: what wrist cameras without a known mount follow.
         description_paths: by embodiment, a kinematic description that is the user's own file.
         preview_height: of one view in the previews, pixels; small frames are enlarged by a whole factor up to it.
-        sigma_px_ref: of the heat in the previews, pixels on the 384 x 512 reference canvas.
+        sigma_px_ref: width of the Gaussian, pixels on the 384 x 512 reference canvas: in the previews, and in the
+            action maps of every model that is trained on these tracks. Coarse latent grids need more than the paper's
+            10, or a point between two cells vanishes.
     """
 
     source: Literal["action", "state"] = "action"
@@ -212,7 +214,7 @@ def render_actions(
         for embodiment, numbers in shard["counts"].items():
             counts.setdefault(embodiment, []).append(numbers)
     _account(episodes, rows, rejected, stored, output)
-    write_index(output, rows)
+    write_index(output, rows, sigma_px_ref=config.sigma_px_ref)
     write_quarantine(output, rejected)
     _previews(config, episodes, ActionTracks.open(output), output)
     by_embodiment = {name: add_counts(parts) for name, parts in sorted(counts.items())}

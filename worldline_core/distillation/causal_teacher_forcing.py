@@ -1,7 +1,7 @@
 """Stage III, step 1: causal teacher forcing (appendix, "Causal Teacher-Forcing Adaptation").
 
-The Stage II objective under block-causal attention: one observed latent frame, then blocks of `block_size` latent
-frames; each noisy block sees the recorded clean blocks before it and its own action maps.
+The Stage II objective under block-causal attention: one observed latent frame, then blocks; each noisy block sees the
+recorded clean blocks before it and its own action maps.
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """
@@ -11,35 +11,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from einops import repeat
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 
-from worldline_core.config import StrictModel
-from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.distillation.causal_objective import CausalObjective, block_sigmas, frame_sigmas, maps_of
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.flow_matching import (
-    LossWeighting,
-    SigmaSampling,
-    add_noise,
-    flow_matching_loss,
-    sample_sigmas,
-)
+from worldline_core.training.clip_loader import Batch
+from worldline_core.training.flow_matching import LossWeighting, SigmaSampling, add_noise, flow_matching_loss
 
 
-def frame_sigmas(sigma: Float[Tensor, "b blocks"], block_size: int) -> Float[Tensor, "b t"]:
-    """Noise level of every latent frame: 0 for the observed one, its block's level for every other."""
-    later = repeat(sigma, "b blocks -> b (blocks size)", size=block_size)
-    return torch.cat((later.new_zeros(len(later), 1), later), dim=1)
+class TeacherForcingObjective(CausalObjective):
+    """Flow matching of every block given the clean blocks before it."""
 
-
-def block_sigmas(
-    sampling: SigmaSampling, clips: int, latent_frames: int, block_size: int, generator: torch.Generator
-) -> Float[Tensor, "b blocks"]:
-    """An independent noise level for every block of every clip: each block is its own denoising problem."""
-    blocks = len(block_bounds(latent_frames, block_size)) - 1
-    return sample_sigmas(sampling, clips * blocks, generator).reshape(clips, blocks)
+    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        """Teacher-forcing loss of one batch; the history may be a slightly corrupted copy of the recorded latents."""
+        settings = self.config.teacher_forcing
+        latents, history = batch.latents, None
+        if settings.history_noise:
+            disturbance = torch.randn(latents.shape, generator=generator, device=latents.device)
+            disturbance[..., :1, :, :] = 0
+            history = latents + settings.history_noise * disturbance
+        loss = teacher_forcing_loss(
+            self.model,
+            latents,
+            maps_of(batch),
+            history=history,
+            views=batch.views,
+            block_size=self.spec.block_size,
+            sampling=settings.sigma,
+            weighting=settings.weighting,
+            generator=generator,
+        )
+        return loss, {}
 
 
 def teacher_forcing_loss(
@@ -57,7 +60,7 @@ def teacher_forcing_loss(
     """Flow-matching loss of every block of `latents`, given the clean blocks before it.
 
     Args:
-        history: clean blocks the model sees instead of `latents` themselves (a slightly corrupted copy, for example).
+        history: clean blocks the model sees instead of `latents` themselves.
 
     Raises:
         DataError: the clip does not divide into blocks.
@@ -66,9 +69,8 @@ def teacher_forcing_loss(
     noise = torch.randn(latents.shape, generator=generator, device=generator.device)
     sigma, noise = sigma.to(latents), noise.to(latents)
     levels = frame_sigmas(sigma, block_size)
-    noisy = add_noise(latents, noise, levels)
     velocity = model.forward_teacher_forcing(
-        noisy,
+        add_noise(latents, noise, levels),
         latents if history is None else history,
         sigma,
         action_maps=action_maps,
@@ -76,10 +78,3 @@ def teacher_forcing_loss(
         views=views,
     )
     return flow_matching_loss(velocity, latents, noise, levels, weighting)
-
-
-class CacheWindow(StrictModel):
-    """Blocks that stay visible: the first ones and the most recent ones (one and three in the paper)."""
-
-    sink_blocks: int = Field(default=1, ge=1)
-    recent_blocks: int = Field(default=3, ge=0)

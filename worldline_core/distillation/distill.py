@@ -1,4 +1,4 @@
-"""The distill step: Stage II in, a four-step block-causal simulator out (paper, Stage III).
+"""The distill step: Stage II in, a few-step block-causal simulator out (paper, Stage III).
 
 Folder: `teacher_forcing/` and `trajectory_regression/` hold the intermediate checkpoints (kind "causal"; both can be
 rolled out), every step has its `metrics.jsonl`, the result itself lies at the top. `run/` keeps the training states and
@@ -7,28 +7,47 @@ the offline trajectories; a killed run continues there, and on a CPU ends with t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from worldline_core.distillation.batches import TrajectoryLoader, TrajectoryMaker
+from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.distillation.auxiliary_losses import PerceptualDistance, PerceptualLoss
+from worldline_core.distillation.causal_objective import CausalObjective
+from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.distillation_step import LPIPS_OFF, STEPS, DistillationStage, named_parameters
-from worldline_core.distillation.objectives import (
-    DistributionMatchingObjective,
-    TeacherForcingObjective,
-    TrajectoryObjective,
+from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
+from worldline_core.distillation.teacher_trajectories import TrajectoryMaker
+from worldline_core.distillation.trajectory_regression import TrajectoryObjective
+from worldline_core.distillation.trajectory_store import (
+    INDEX,
+    TrajectoryLoader,
+    TrajectoryStore,
+    write_trajectories,
 )
-from worldline_core.distillation.teacher_trajectories import INDEX, NODES, TrajectoryStore, write_trajectories
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
+from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
-from worldline_core.training.trainer import ParameterGroup, TrainerConfig, wait_for_all
+from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, ClipRow, named_rows, training_rows
+from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.stage import validation_function
+from worldline_core.training.trainer import ParameterGroup, TrainerConfig, join_processes, train, wait_for_all
 
 __all__ = ["DistillConfig", "distill"]
+
+logger = logging.getLogger(__name__)
+
+STEPS = ("teacher_forcing", "trajectory_regression", "distribution_matching")
+LPIPS_OFF = "off: no LPIPS weights configured"
 
 
 def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -36,119 +55,225 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
 
     Raises:
         CheckpointError: the checkpoint is not of Stage II, or its action maps and latents are not those given here.
+        ConfigError: the clips are not whole blocks of all views.
         DataError: no clip fits the blocks.
         TrainingError: a loss or gradient is not finite.
     """
     torch.manual_seed(config.teacher_forcing.trainer.seed)
-    stage = DistillationStage.open(config, inputs, output)
-    metrics = {
-        **_teacher_forcing(stage),
-        **_trajectory_regression(stage),
-        **_distribution_matching(stage),
-    }
+    _check_clips(config)
+    run = DistillationRun.open(config, inputs, output)
+    metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
     return {
         "steps": {name: getattr(config, name).trainer.steps for name in STEPS},
-        "lpips": "on" if stage.perceptual is not None else LPIPS_OFF,
-        "episodes": len([row for row in stage.rows if row.split in config.splits]),
+        "lpips": run.lpips,
+        "episodes": len([row for row in run.rows if row.split in config.splits]),
         **metrics,
     }
 
 
-def _teacher_forcing(stage: DistillationStage) -> dict[str, float]:
-    settings = stage.config.teacher_forcing
-    model, info = load_checkpoint(stage.stage2, expect_kind="stage2", towers="generation")
-    _check_clips(stage.config)
-    views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
-    clips = stage.config.clips.model_copy(update=views)
-    sampler = stage.sampler(settings.trainer.batch_size, settings.trainer.seed, distributed=True, clips=clips)
-    return stage.train_step(
-        STEPS[0],
-        settings.trainer,
-        model,
-        TeacherForcingObjective(model.to(settings.trainer.device).train(), stage.config),
-        lambda index: stage.loader.load(sampler.clips(index)),
-        info,
-    )
+@dataclass(frozen=True)
+class DistillationRun:
+    """What the three steps share: the clips, the teacher, and how a step is trained and saved."""
 
+    config: DistillConfig
+    stage2: Path
+    stage2_info: CheckpointInfo
+    store: LatentStore
+    loader: ClipLoader
+    rows: list[ClipRow]
+    output: Path
+    perceptual: PerceptualDistance | None
+    rank: int
+    world_size: int
 
-def _trajectory_regression(stage: DistillationStage) -> dict[str, float]:
-    settings = stage.config.trajectory_regression
-    parent = stage.folder(STEPS[0])
-    student, info = load_checkpoint(parent, expect_kind="causal")
-    trajectories = _trajectories(stage, parent, info)
-    return stage.train_step(
-        STEPS[1],
-        settings.trainer,
-        student,
-        TrajectoryObjective(student.to(settings.trainer.device).train(), stage.config, stage.perceptual),
-        _trajectory_loader(stage, trajectories, settings.trainer).load,
-        info,
-    )
+    @classmethod
+    def open(cls, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> DistillationRun:
+        """Open every input and check that they belong together.
 
-
-def _distribution_matching(stage: DistillationStage) -> dict[str, float]:
-    settings = stage.config.distribution_matching
-    student, info = load_checkpoint(stage.folder(STEPS[1]), expect_kind="causal")
-    teacher = stage.stage2 if settings.real_score == "stage2" else stage.folder(STEPS[0])
-    real, fake = (load_checkpoint(teacher, towers="generation")[0].to(settings.trainer.device) for _ in range(2))
-    objective = DistributionMatchingObjective(
-        student.to(settings.trainer.device).train(), real, fake.train(), stage.config, stage.perceptual
-    )
-    trajectories = TrajectoryStore.open(_trajectory_folder(stage))
-    groups = (ParameterGroup("fake", named_parameters(fake, "fake."), settings.fake_score_rate),)
-    return stage.train_step(
-        STEPS[2],
-        settings.trainer,
-        student,
-        objective,
-        _trajectory_loader(stage, trajectories, settings.trainer).load,
-        info,
-        groups,
-    )
-
-
-def _trajectories(stage: DistillationStage, teacher_folder: Path, info: CheckpointInfo) -> TrajectoryStore:
-    """The offline trajectories of the causal teacher; shards that exist are kept."""
-    settings = stage.config.trajectory_regression.trajectories
-    trainer = stage.config.trajectory_regression.trainer
-    folder = _trajectory_folder(stage)
-    if stage.rank == 0 and not (folder / INDEX).is_file():
-        teacher, _ = load_checkpoint(teacher_folder, expect_kind="causal")
-        per_shard = min(settings.clips, settings.clips_per_shard)
-        sampler = stage.sampler(per_shard, settings.seed, distributed=False)
-        maker = TrajectoryMaker(stage.config, trainer, teacher.to(trainer.device), stage.loader, sampler)
-        write_trajectories(
-            folder,
-            -(-settings.clips // per_shard),
-            maker,
-            {
-                "teacher": info.weights_sha256,
-                "nodes": list(NODES),
-                "precision": trainer.precision,
-                "clips": stage.config.clips.model_dump(mode="json"),
-                **settings.model_dump(mode="json"),
-            },
+        Raises:
+            CheckpointError: the checkpoint's action maps and latents are not those given here.
+        """
+        output.mkdir(parents=True, exist_ok=True)
+        device = config.teacher_forcing.trainer.device
+        rank, world_size = join_processes(device)
+        info = read_checkpoint_info(Path(inputs["stage2"]))
+        store, tracks = LatentStore.open(Path(inputs["latents"])), ActionTracks.open(Path(inputs["tracks"]))
+        contract = info.contract
+        contract.require(
+            where=inputs["latents"],
+            tokenizer=store.description["tokenizer"],
+            grid_size=tuple(store.latent_shape[1:]),
         )
-    if stage.rank == 0:
-        write_bytes_atomic(stage.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
-    wait_for_all()
-    return TrajectoryStore.open(folder)
+        contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
+        loader = ClipLoader(
+            store,
+            views=tuple(config.views),
+            tracks=tracks,
+            wrist_projection=contract.wrist_projection,
+            device=device,
+        )
+        return cls(
+            config=config,
+            stage2=Path(inputs["stage2"]),
+            stage2_info=info,
+            store=store,
+            loader=loader,
+            rows=training_rows(store, EpisodeSet.open(Path(inputs["episodes"])), stage=2, tracks=tracks),
+            output=output,
+            perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
+            rank=rank,
+            world_size=world_size,
+        )
 
+    @property
+    def lpips(self) -> str:
+        """Whether the perceptual term is on, in words."""
+        return "on" if self.perceptual is not None else LPIPS_OFF
 
-def _trajectory_folder(stage: DistillationStage) -> Path:
-    return stage.output / "run" / "trajectories"
+    def folder(self, step: str) -> Path:
+        """Where a step's checkpoint lies; the last step's is the result itself."""
+        return self.output if step == STEPS[-1] else self.output / step
 
+    def teacher_forcing(self) -> dict[str, float]:
+        """Step 1, from the Stage II model."""
+        settings = self.config.teacher_forcing
+        model, info = load_checkpoint(self.stage2, expect_kind="stage2", towers="generation")
+        views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
+        clips = self.config.clips.model_copy(update=views)
+        sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, distributed=True)
+        objective = TeacherForcingObjective(model.to(settings.trainer.device).train(), self.config)
+        return self._train(
+            STEPS[0], settings.trainer, objective, lambda index: self.loader.load(sampler.clips(index)), info
+        )
 
-def _trajectory_loader(stage: DistillationStage, store: TrajectoryStore, trainer: TrainerConfig) -> TrajectoryLoader:
-    return TrajectoryLoader(
-        store,
-        stage.loader,
-        batch_size=trainer.batch_size,
-        seed=trainer.seed,
-        generated_history=stage.config.trajectory_regression.trajectories.history == "generated",
-        rank=stage.rank,
-        world_size=stage.world_size,
-    )
+    def trajectory_regression(self) -> dict[str, float]:
+        """Step 2, from step 1's model, on trajectories that this model makes."""
+        settings = self.config.trajectory_regression
+        student, info = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
+        self._make_trajectories(info)
+        objective = TrajectoryObjective(student.to(settings.trainer.device).train(), self.config, self.perceptual)
+        return self._train(STEPS[1], settings.trainer, objective, self._trajectories(settings.trainer).load, info)
+
+    def distribution_matching(self) -> dict[str, float]:
+        """Step 3, from step 2's model; the real and the fake score start from the same weights."""
+        settings = self.config.distribution_matching
+        student, info = load_checkpoint(self.folder(STEPS[1]), expect_kind="causal")
+        scores = self.stage2 if settings.real_score == "stage2" else self.folder(STEPS[0])
+        real, fake = (load_checkpoint(scores, towers="generation")[0].to(settings.trainer.device) for _ in range(2))
+        objective = DistributionMatchingObjective(
+            student.to(settings.trainer.device).train(), real, fake.train(), self.config, self.perceptual
+        )
+        other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate)
+        load = self._trajectories(settings.trainer).load
+        return self._train(STEPS[2], settings.trainer, objective, load, info, other)
+
+    def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, *, distributed: bool) -> ClipSampler:
+        """Clips of the training splits; the same on every process unless `distributed`."""
+        return ClipSampler(
+            self.store,
+            clips,
+            splits=self.config.splits,
+            batch_size=batch_size,
+            seed=seed,
+            rank=self.rank if distributed else 0,
+            world_size=self.world_size if distributed else 1,
+            rows=self.rows,
+        )
+
+    @property
+    def _trajectory_folder(self) -> Path:
+        return self.output / "run" / "trajectories"
+
+    def _make_trajectories(self, teacher_info: CheckpointInfo) -> None:
+        """The offline trajectories of the causal teacher; shards that exist are kept."""
+        settings = self.config.trajectory_regression.trajectories
+        trainer = self.config.trajectory_regression.trainer
+        folder = self._trajectory_folder
+        if self.rank == 0 and not (folder / INDEX).is_file():
+            teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
+            per_shard = min(settings.clips, settings.clips_per_shard)
+            sampler = self._sampler(per_shard, settings.seed, self.config.clips, distributed=False)
+            maker = TrajectoryMaker(self.config, trainer, teacher.to(trainer.device), self.loader, sampler)
+            facts = {
+                "teacher": teacher_info.weights_sha256,
+                "causal": self.config.spec.model_dump(mode="json"),
+                "precision": trainer.precision,
+                "clips": self.config.clips.model_dump(mode="json"),
+                **settings.model_dump(mode="json"),
+            }
+            write_trajectories(folder, -(-settings.clips // per_shard), maker, facts)
+        if self.rank == 0:
+            write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
+        wait_for_all()
+
+    def _trajectories(self, trainer: TrainerConfig) -> TrajectoryLoader:
+        return TrajectoryLoader(
+            TrajectoryStore.open(self._trajectory_folder),
+            self.loader,
+            batch_size=trainer.batch_size,
+            seed=trainer.seed,
+            generated_history=self.config.trajectory_regression.trajectories.history == "generated",
+            rank=self.rank,
+            world_size=self.world_size,
+        )
+
+    def _train(
+        self,
+        step: str,
+        trainer: TrainerConfig,
+        objective: CausalObjective,
+        load: Callable[[int], Batch],
+        parent: CheckpointInfo,
+        *other_groups: ParameterGroup,
+    ) -> dict[str, float]:
+        """Train one step with the shared loop, then write its checkpoint and metrics; a finished step is only read."""
+        folder, log = self.folder(step), self.output / step / "metrics.jsonl"
+        if (folder / "checkpoint.json").is_file() and log.is_file():
+            return _prefixed(step, read_checkpoint_info(folder).metadata["metrics"])
+        work, model = self.output / "run" / step, objective.model
+        result = train(
+            trainer,
+            groups=(ParameterGroup("student", _named_parameters(model)), *other_groups),
+            objective=objective,
+            load=load,
+            validate=validation_function(
+                self.loader, self.config.clips, self.config.validation_splits, trainer, self.rows, objective
+            ),
+            output=work,
+            identity={
+                "step": step,
+                "config": self.config.model_dump(mode="json"),
+                "parent": parent.weights_sha256,
+                "stage2": self.stage2_info.weights_sha256,
+                "episodes": named_rows(self.rows),
+            },
+            title=step.replace("_", " "),
+            rank=self.rank,
+            world_size=self.world_size,
+        )
+        if self.rank == 0:
+            names = _named_parameters(model).keys()
+            write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
+            save_checkpoint(
+                folder,
+                model,
+                kind="causal",
+                action_contract=self.stage2_info.contract,
+                causal=self.config.spec,
+                metadata={
+                    "distillation": step,
+                    "step": trainer.steps,
+                    "seed": trainer.seed,
+                    "start": {"kind": parent.kind, "weights_sha256": parent.weights_sha256},
+                    "tokenizer": self.store.description["tokenizer"],
+                    "lpips": self.lpips,
+                    "metrics": result.metrics,
+                },
+                state_dict=model.state_dict()
+                | {name: result.average[name] for name in names if name in result.average},
+            )
+        wait_for_all()
+        return _prefixed(step, result.metrics)
 
 
 def _check_clips(config: DistillConfig) -> None:
@@ -169,3 +294,23 @@ def _check_clips(config: DistillConfig) -> None:
             expected=f"1 + k * {span} frames",
             got=odd,
         )
+
+
+def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> PerceptualDistance | None:
+    wanted = config.trajectory_regression.auxiliary.lpips or config.distribution_matching.auxiliary.lpips
+    if config.lpips_weights is None:
+        if wanted:
+            logger.warning("The perceptual auxiliary is %s; it is left out of the loss.", LPIPS_OFF)
+        return None
+    codec = load_tokenizer(tokenizer)
+    if isinstance(codec, torch.nn.Module):
+        codec.to(device).eval().requires_grad_(False)
+    return PerceptualLoss(codec, config.lpips_weights, device=device)
+
+
+def _named_parameters(model: WorldModel, prefix: str = "") -> dict[str, torch.nn.Parameter]:
+    return {prefix + name: parameter for name, parameter in model.named_parameters()}
+
+
+def _prefixed(step: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    return {f"{step}/{name}": value for name, value in metrics.items()}

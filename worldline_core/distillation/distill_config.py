@@ -9,13 +9,21 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow
+from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.training.clip_sampler import ClipSampling
+from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
 from worldline_core.training.trainer import OptimizerConfig, TrainerConfig
 
 CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
+
+
+class CacheWindow(StrictModel):
+    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper)."""
+
+    sink_blocks: int = Field(default=1, ge=1)
+    recent_blocks: int = Field(default=3, ge=0)
 
 
 class TeacherForcingConfig(StrictModel):
@@ -38,13 +46,13 @@ class TeacherForcingConfig(StrictModel):
 class TrajectoriesConfig(StrictModel):
     """The offline trajectories of the frozen causal teacher.
 
-    ``substeps``: Euler steps of the teacher between neighbouring nodes; (1, 1, 1, 1) is the plain four-step sampler.
+    ``substeps``: Euler steps of the teacher between neighbouring nodes; 1 everywhere is the plain few-step sampler.
     ``history``: what each block sees before it, the recorded blocks or the teacher's own.
     """
 
     clips: int = Field(default=512, ge=1)
     clips_per_shard: int = Field(default=16, ge=1)
-    substeps: tuple[int, int, int, int] = (2, 2, 3, 9)
+    substeps: tuple[int, ...] = (2, 2, 3, 9)
     history: Literal["recorded", "generated"] = "recorded"
     seed: int = Field(default=1, ge=0)
 
@@ -96,7 +104,10 @@ class DistributionMatchingConfig(StrictModel):
 
 
 class DistillConfig(StrictModel):
-    """Stage III. ``block_size`` counts latent frames (4 in the paper: 16 video frames)."""
+    """Stage III. What it trains, the model keeps: ``spec`` is saved with it and read by everything that rolls it out.
+
+    ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
+    """
 
     clips: ClipSampling = ClipSampling()
     splits: list[str] = Field(default=["train"], min_length=1)
@@ -104,7 +115,29 @@ class DistillConfig(StrictModel):
     views: list[str] = Field(default=["head", "left_wrist", "right_wrist"], min_length=1)
     block_size: int = Field(default=4, ge=1)
     window: CacheWindow = CacheWindow()
+    sigmas: tuple[float, ...] = CAUSAL_SIGMAS
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
     distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()
     lpips_weights: Path | None = Field(default=None, description="folder of the LPIPS weights; None: that term is off")
+
+    @model_validator(mode="after")
+    def _one_interval_per_step(self) -> Self:
+        steps, substeps = self.spec.steps, self.trajectory_regression.trajectories.substeps
+        if len(substeps) != steps:
+            raise ValueError(f"trajectories.substeps {substeps}: one number per interval of sigmas is needed, {steps}")
+        return self
+
+    @property
+    def spec(self) -> CausalSpec:
+        """Blocks, window and nodes of the distilled model.
+
+        Of recent blocks it keeps no more than the longest clip has: what lies further back, it has never seen.
+        """
+        blocks = (max(self.clips.lengths) - 1) // (TEMPORAL_COMPRESSION * self.block_size)
+        return CausalSpec(
+            block_size=self.block_size,
+            sink_blocks=self.window.sink_blocks,
+            recent_blocks=max(0, min(self.window.recent_blocks, blocks - 1)),
+            sigmas=self.sigmas,
+        )

@@ -8,81 +8,124 @@ score and the fake score, which follows the student's distribution. With v = eps
 
 so the student target sg(G - g) lies towards what the real score believes and away from the fake one.
 
-A gradient flows only through the pass of one random exit step of every block (all other passes and the cache are free
-of gradients), so memory does not grow with the number of blocks or steps.
+A gradient flows only through the pass of one random exit step of every block.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
+from einops import repeat
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow, frame_sigmas
-from worldline_core.distillation.distill_config import CYCLE
-from worldline_core.distillation.teacher_trajectories import NODES
-from worldline_core.errors import ConfigError
-from worldline_core.model.block_causal_attention import KVCache, block_bounds
+from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses, enabled_terms
+from worldline_core.distillation.causal_objective import (
+    CausalObjective,
+    block_sigmas,
+    frame_sigmas,
+    with_observed_frame,
+)
+from worldline_core.distillation.distill_config import CYCLE, DistillConfig
+from worldline_core.distillation.trajectory_store import parts_of
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.samplers import integrate
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
+from worldline_core.training.trainer import step_generator
 
 Score = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Velocity at (noisy clip, the clip's own clean latents, sigma of every block "b blocks")."""
 
 
+class DistributionMatchingObjective(CausalObjective):
+    """Step 3: five updates of the fake score, then one of the student, in one training loop.
+
+    An iteration gives gradients to one of the two models only; the optimiser leaves the other as it is. Every iteration
+    reports all metrics, zero for those of the other model and scaled by the share of the iterations that measure them,
+    so that a mean over whole cycles is the mean over these.
+    """
+
+    def __init__(
+        self,
+        student: WorldModel,
+        real: WorldModel,
+        fake: WorldModel,
+        config: DistillConfig,
+        perceptual: PerceptualDistance | None,
+    ) -> None:
+        super().__init__(student, config)
+        self.settings = config.distribution_matching
+        self.real = real.eval().requires_grad_(False)
+        self.fake = fake
+        self.perceptual = perceptual
+
+    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The student's loss in one iteration of six, the fake score's in the others."""
+        trajectories, maps = parts_of(batch)
+        student_turn = is_student_iteration(step)
+        enabled = enabled_terms(self.settings.auxiliary, perceptual=self.perceptual is not None)
+        names = ("distribution_matching", *enabled)
+        noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
+        if self.settings.target == "teacher":
+            # The teacher's trajectory started from this noise: its clean end is what this rollout should become.
+            noise = with_observed_frame(noise[..., :1, :, :], trajectories.nodes[:, 0])
+        generated = self.rollout(batch, maps, noise, self.exit_step(step), with_gradient=student_turn)
+        sigma = self.sigmas(batch, generator)
+        fresh = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
+        fake = self.score(self.fake, batch, maps)
+        if not student_turn:
+            loss = fake_score_loss(
+                fake,
+                generated,
+                fresh,
+                sigma,
+                block_size=self.spec.block_size,
+                weighting=self.settings.weighting,
+            )
+            return loss, {**dict.fromkeys(names, 0.0), "fake_score": loss.item() * CYCLE / (CYCLE - 1)}
+        gradient = distribution_gradient(
+            self.score(self.real, batch, maps), fake, generated, fresh, sigma, self.spec.block_size
+        )
+        matching = distribution_matching_loss(generated, gradient)
+        target = batch.latents
+        if self.settings.target == "teacher":
+            target = with_observed_frame(target[..., :1, :, :], trajectories.nodes[:, -1])
+        extra = auxiliary_losses(
+            generated,
+            target,
+            mask=trajectories.mask,
+            views=batch.views,
+            block_size=self.spec.block_size,
+            weights=self.settings.auxiliary,
+            perceptual=self.perceptual,
+        )
+        terms = {"distribution_matching": matching.detach(), **extra.terms}
+        values = {name: terms[name].item() * CYCLE for name in names}
+        return matching + extra.total, {**values, "fake_score": 0.0}
+
+    def exit_step(self, step: int) -> int:
+        """Exit step of this iteration: random, and the same on every process (it does not depend on the rank)."""
+        stream = step_generator(self.settings.trainer.seed + 1, step, "cpu")
+        return int(torch.randint(self.spec.steps, (1,), generator=stream))
+
+    def sigmas(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Noise level of every block: one per clip for Stage II scores, which know no other, else independent."""
+        clips, frames = len(batch.latents), batch.latents.shape[3]
+        drawn = block_sigmas(self.settings.sigma, clips, frames, self.spec.block_size, generator)
+        if self.settings.real_score == "stage2":
+            drawn = repeat(drawn[:, 0], "b -> b blocks", blocks=drawn.shape[1])
+        return drawn.clamp(*self.settings.sigma_range)
+
+    def score(self, model: WorldModel, batch: Batch, maps: Tensor) -> Score:
+        """The velocity field of a score model, in the form it was trained in."""
+        form = full_clip_score if self.settings.real_score == "stage2" else causal_score
+        return form(model, maps, views=batch.views, block_size=self.spec.block_size)
+
+
 def is_student_iteration(iteration: int) -> bool:
     """One in six; the last of each cycle, so that the fake score knows the student before it is first asked."""
     return iteration % CYCLE == CYCLE - 1
-
-
-def self_forced_rollout(
-    student: WorldModel,
-    first: Float[Tensor, "b v c 1 h w"],
-    action_maps: Float[Tensor, "b v a t h w"],
-    noise: Float[Tensor, "b v c t h w"],
-    exit_step: int,
-    *,
-    views: Sequence[str],
-    block_size: int,
-    window: CacheWindow,
-    with_gradient: bool,
-) -> Float[Tensor, "b v c t h w"]:
-    """Generate a clip with the student's sampler, stopping every block at `exit_step` with its clean prediction.
-
-    `exit_step` = K - 1 is the complete four-step sampler. An earlier exit predicts the clean block from an earlier
-    node, so that in the course of training every node's prediction is matched.
-
-    Args:
-        first: the observed latent frame.
-        noise: starting noise of every frame; frame 0 is not read.
-        with_gradient: let gradients flow through the exit pass of each block.
-
-    Raises:
-        ConfigError: no such step.
-        DataError: the clip does not divide into blocks.
-    """
-    if not 0 <= exit_step < len(NODES) - 1:
-        raise ConfigError("No such exit step", expected=f"0..{len(NODES) - 2}", got=exit_step)
-    cache = KVCache(window.sink_blocks, window.recent_blocks)
-    student.write_block(first, cache, action_maps=action_maps[..., :1, :, :], views=views)
-    bounds = block_bounds(noise.shape[3], block_size)
-    blocks = [first]
-    for start, stop in bounds[1:]:
-        maps = action_maps[..., start:stop, :, :]
-        velocity = partial(student.forward_block, cache=cache, action_maps=maps, views=views)
-        state = noise[..., start:stop, :, :]
-        with torch.no_grad():
-            state = integrate(velocity, state, NODES[: exit_step + 1])
-        with torch.set_grad_enabled(with_gradient):
-            clean = integrate(velocity, state, (NODES[exit_step], 0.0))
-        blocks.append(clean)
-        if stop < bounds[-1][1]:
-            student.write_block(clean, cache, action_maps=maps, views=views)
-    return torch.cat(blocks, dim=3)
 
 
 def causal_score(

@@ -1,49 +1,37 @@
 """Denoising trajectories of the frozen causal teacher (appendix, "Four-Step Trajectory Regression").
 
-For every block, explicit Euler integration from noise along sigma = 1, 15/16, 5/6, 5/8, 0, keeping the state at each of
-these nodes. Between two nodes the ODE may take several sub-steps: with one sub-step everywhere the teacher is exactly
-its own four-step sampler, and only the terminal objective teaches anything; finer sub-steps make the nodes those of
-the teacher's many-step solution, which the student then reaches in four.
+For every block, explicit Euler integration from noise along the nodes of the sampler (the paper's: sigma = 1, 15/16,
+5/6, 5/8, 0), keeping the state at each of them. Between two nodes the ODE may take several sub-steps: with one sub-step
+everywhere the teacher is exactly its own few-step sampler, and only the terminal objective teaches anything; finer
+sub-steps make the nodes those of the teacher's many-step solution, which the student then reaches in few.
 
 Axes: b clips, k nodes, v views, c latent channels, t latent frames (nodes leave out the observed one), h w rows and
 columns.
-
-Offline teacher trajectories on disk: shards that are made once, resumed after an interruption, and read at random.
-
-Which clips and which noise a shard holds follows from the seed and the shard's number alone, so a shard that is missing
-is remade with the same bytes. Layout: `shard-00000.safetensors` ... (`nodes`, half precision, axes n k v c u h w;
-`mask`, bytes, axes n v t h w; the clips in the header) and `trajectories.json` (settings and the digest of every shard),
-written last.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
-from einops import rearrange
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from worldline_core.distillation.causal_teacher_forcing import CacheWindow
-from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.model.block_causal_attention import KVCache, block_bounds
+from worldline_core.distillation.auxiliary_losses import clip_robot_masks
+from worldline_core.distillation.causal_objective import maps_of
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.errors import ConfigError
+from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.samplers import CAUSAL_SHIFT, CAUSAL_SIGMAS, VelocityField, integrate
-from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.store.digest import digest_file
+from worldline_core.rollout.samplers import VelocityField, integrate
+from worldline_core.training.clip_loader import ClipLoader
+from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import Clip
-
-NODES = CAUSAL_SIGMAS
-"""Noise levels of the four-step sampler, at which the trajectories are kept."""
+from worldline_core.training.trainer import TrainerConfig, autocast, step_generator
 
 
 def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
@@ -66,13 +54,13 @@ def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
 
 
 def euler_nodes(
-    velocity: VelocityField, noise: Tensor, substeps: Sequence[int], nodes: Sequence[float] = NODES
+    velocity: VelocityField, noise: Tensor, substeps: Sequence[int], nodes: Sequence[float]
 ) -> list[Tensor]:
     """States at all `nodes`, the first being the noise itself, by explicit Euler steps of dx/dsigma = velocity.
 
     Args:
         velocity: field at (state, sigma).
-        substeps: Euler steps of each interval, one number an interval.
+        substeps: Euler steps of each interval, one number per interval.
 
     Raises:
         ConfigError: another number of intervals than of sub-step counts.
@@ -98,8 +86,7 @@ def teacher_trajectories(
     noise: Float[Tensor, "b v c t h w"],
     *,
     views: Sequence[str],
-    block_size: int,
-    window: CacheWindow,
+    spec: CausalSpec,
     substeps: Sequence[int],
     generated_history: bool = False,
 ) -> Float[Tensor, "b k v c u h w"]:
@@ -113,14 +100,14 @@ def teacher_trajectories(
     Raises:
         DataError: the clip does not divide into blocks.
     """
-    bounds = block_bounds(latents.shape[3], block_size)
-    cache = KVCache(window.sink_blocks, window.recent_blocks)
+    bounds = block_bounds(latents.shape[3], spec.block_size)
+    cache = spec.new_cache()
     teacher.write_block(latents[..., :1, :, :], cache, action_maps=action_maps[..., :1, :, :], views=views)
     blocks: list[Tensor] = []
     for start, stop in bounds[1:]:
         maps = action_maps[..., start:stop, :, :]
         velocity = partial(teacher.forward_block, cache=cache, action_maps=maps, views=views)
-        states = euler_nodes(velocity, noise[..., start:stop, :, :], substeps)
+        states = euler_nodes(velocity, noise[..., start:stop, :, :], substeps, spec.sigmas)
         blocks.append(torch.stack(states, dim=1))
         if stop < bounds[-1][1]:
             clean = states[-1] if generated_history else latents[..., start:stop, :, :]
@@ -128,121 +115,54 @@ def teacher_trajectories(
     return torch.cat(blocks, dim=4)
 
 
-def with_observed_frame(
-    first: Float[Tensor, "b v c 1 h w"], later: Float[Tensor, "b v c u h w"]
-) -> Float[Tensor, "b v c t h w"]:
-    """A whole clip: the observed latent frame, then the others."""
-    return torch.cat((first, later), dim=3)
-
-
-def node_of_each_block(
-    nodes: Float[Tensor, "b k v c u h w"], index: Tensor, block_size: int
-) -> Float[Tensor, "b v c u h w"]:
-    """The state of every block at the node that `index` (b, blocks) names for it."""
-    split = rearrange(nodes, "b k v c (n s) h w -> b n k v c s h w", s=block_size)
-    clips = torch.arange(index.shape[0], device=index.device)[:, None]
-    blocks = torch.arange(index.shape[1], device=index.device)[None, :]
-    return rearrange(split[clips, blocks, index], "b n v c s h w -> b v c (n s) h w")
-
-
-INDEX = "trajectories.json"
-
-MakeShard = Callable[[int], tuple[Sequence[Clip], Tensor, Tensor]]
-"""Clips, their nodes (n k v c u h w) and robot masks (n v t h w) of a shard, by its number."""
-
-
-def shard_path(folder: Path, number: int) -> Path:
-    """File of a shard."""
-    return folder / f"shard-{number:05d}.safetensors"
-
-
-def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dict[str, Any]) -> None:
-    """Make every shard that is not there yet, then the index.
-
-    Args:
-        settings: everything that decides the content (teacher, seed, schedule), JSON values.
+def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str]) -> Float[Tensor, "b v t h w"]:
+    """Robot masks of some clips from their action tracks.
 
     Raises:
-        ArtifactError: the folder holds trajectories made with other settings.
+        ConfigError: the loader has no action tracks.
     """
-    from tqdm import tqdm
+    if loader.tracks is None:
+        raise ConfigError("Robot masks come from action tracks", next_step="give the tracks to the clip loader")
+    cut = []
+    for clip in clips:
+        frames = np.arange(clip.num_frames) * clip.stride + clip.start
+        cut.append(loader.tracks.tracks(clip.episode_id).clip(frames))
+    _, rows, columns = loader.store.latent_shape
+    return clip_robot_masks(cut, views, (rows, columns))
 
-    recorded = folder / "settings.json"
-    if recorded.is_file():
-        found = json.loads(recorded.read_text(encoding="utf-8"))
-        if found != settings:
-            raise ArtifactError(
-                "The folder holds trajectories made with other settings",
-                where=folder,
-                expected=settings,
-                got=found,
-                next_step="remove the folder, or use another one",
+
+class TrajectoryMaker:
+    """Makes the shards of the trajectory store: clips by sampler, noise by seed, nodes by the frozen teacher."""
+
+    def __init__(
+        self,
+        config: DistillConfig,
+        trainer: TrainerConfig,
+        teacher: WorldModel,
+        loader: ClipLoader,
+        sampler: ClipSampler,
+    ) -> None:
+        self.config = config
+        self.trainer = trainer
+        self.teacher = teacher.eval().requires_grad_(False)
+        self.loader = loader
+        self.sampler = sampler
+
+    def __call__(self, number: int) -> tuple[Sequence[Clip], Tensor, Tensor]:
+        """Clips, nodes and masks of shard `number`."""
+        settings = self.config.trajectory_regression.trajectories
+        batch = self.loader.load(self.sampler.clips(number))
+        generator = step_generator(settings.seed, number, self.trainer.device)
+        noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
+        with autocast(self.trainer):
+            nodes = teacher_trajectories(
+                self.teacher,
+                batch.latents,
+                maps_of(batch),
+                noise,
+                views=batch.views,
+                spec=self.config.spec,
+                substeps=settings.substeps,
+                generated_history=settings.history == "generated",
             )
-    write_json_atomic(recorded, settings)
-    for number in tqdm(range(shards), desc="teacher trajectories", unit="shard", disable=None):
-        path = shard_path(folder, number)
-        if path.is_file():
-            continue
-        clips, nodes, mask = make(number)
-        header = {"clips": json.dumps([asdict(clip) for clip in clips])}
-        tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
-        write_bytes_atomic(path, save({name: value.contiguous() for name, value in tensors.items()}, metadata=header))
-    index = {
-        "settings": settings,
-        "shards": [digest_file(shard_path(folder, number)) for number in range(shards)],
-    }
-    write_json_atomic(folder / INDEX, index)
-
-
-class TrajectoryStore:
-    """Read access to finished trajectories."""
-
-    def __init__(self, folder: Path, clips: Sequence[tuple[int, int, Clip]]) -> None:
-        self.folder = folder
-        self._clips = list(clips)
-
-    @classmethod
-    def open(cls, folder: Path) -> TrajectoryStore:
-        """Open a finished folder.
-
-        Raises:
-            ArtifactError: it has no index, or a shard is missing or damaged.
-        """
-        if not (folder / INDEX).is_file():
-            raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
-        shards = json.loads((folder / INDEX).read_text(encoding="utf-8"))["shards"]
-        clips: list[tuple[int, int, Clip]] = []
-        for number in range(len(shards)):
-            path = shard_path(folder, number)
-            try:
-                with safe_open(path, framework="pt") as shard:
-                    header = shard.metadata() or {}
-            except (OSError, SafetensorError) as error:
-                raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
-            if "clips" not in header:
-                raise ArtifactError("Not a shard of trajectories", where=path, expected="clips in its header")
-            clips += [(number, row, Clip(**clip)) for row, clip in enumerate(json.loads(header["clips"]))]
-        return cls(folder, clips)
-
-    def __len__(self) -> int:
-        return len(self._clips)
-
-    def clips(self, indices: Sequence[int]) -> tuple[Clip, ...]:
-        """The clips of some trajectories."""
-        return tuple(self._clips[index][2] for index in indices)
-
-    def nodes(self, indices: Sequence[int]) -> Float[Tensor, "b k v c u h w"]:
-        """The states of some trajectories, in single precision."""
-        return self._read("nodes", indices)
-
-    def masks(self, indices: Sequence[int]) -> Float[Tensor, "b v t h w"]:
-        """The robot masks of some trajectories."""
-        return self._read("mask", indices)
-
-    def _read(self, name: str, indices: Sequence[int]) -> Tensor:
-        rows = []
-        for index in indices:
-            number, row, _ = self._clips[index]
-            with safe_open(shard_path(self.folder, number), framework="pt") as shard:
-                rows.append(shard.get_slice(name)[row : row + 1])
-        return torch.cat(rows).float()
+        return batch.clips, nodes, robot_masks(self.loader, batch.clips, batch.views)

@@ -13,13 +13,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from einops import rearrange
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights, PerceptualDistance, auxiliary_losses
-from worldline_core.distillation.causal_teacher_forcing import frame_sigmas
-from worldline_core.distillation.teacher_trajectories import NODES, node_of_each_block, with_observed_frame
+from worldline_core.distillation.causal_objective import CausalObjective, frame_sigmas, with_observed_frame
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.trajectory_store import parts_of
+from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import broadcast_sigma
 
 
@@ -31,9 +35,48 @@ class TrajectoryLoss:
     terms: dict[str, Tensor]
 
 
-def draw_nodes(clips: int, blocks: int, generator: torch.Generator) -> Int[Tensor, "b blocks"]:
-    """A noisy node, 0 (pure noise) to K - 1, for every block, all equally likely."""
-    return torch.randint(len(NODES) - 1, (clips, blocks), generator=generator, device=generator.device)
+class TrajectoryObjective(CausalObjective):
+    """Regression of the teacher's trajectories."""
+
+    def __init__(self, model: WorldModel, config: DistillConfig, perceptual: PerceptualDistance | None) -> None:
+        super().__init__(model, config)
+        self.perceptual = perceptual
+
+    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        """Trajectory loss of one batch, and its parts."""
+        settings = self.config.trajectory_regression
+        trajectories, maps = parts_of(batch)
+        blocks = (batch.latents.shape[3] - 1) // self.spec.block_size
+        loss = trajectory_regression_loss(
+            self.model,
+            trajectories.nodes,
+            trajectories.clean,
+            maps,
+            draw_nodes(len(batch.latents), blocks, self.spec.steps, generator),
+            mask=trajectories.mask,
+            views=batch.views,
+            spec=self.spec,
+            next_weight=settings.next_weight,
+            terminal_weight=settings.terminal_weight,
+            auxiliary=settings.auxiliary,
+            perceptual=self.perceptual,
+        )
+        return loss.total, {name: value.item() for name, value in loss.terms.items()}
+
+
+def draw_nodes(clips: int, blocks: int, steps: int, generator: torch.Generator) -> Int[Tensor, "b blocks"]:
+    """A noisy node, 0 (pure noise) to K - 1 (K = `steps`), for every block, all equally likely."""
+    return torch.randint(steps, (clips, blocks), generator=generator, device=generator.device)
+
+
+def node_of_each_block(
+    nodes: Float[Tensor, "b k v c u h w"], index: Tensor, block_size: int
+) -> Float[Tensor, "b v c u h w"]:
+    """The state of every block at the node that `index` (b, blocks) names for it."""
+    split = rearrange(nodes, "b k v c (n s) h w -> b n k v c s h w", s=block_size)
+    clips = torch.arange(index.shape[0], device=index.device)[:, None]
+    blocks = torch.arange(index.shape[1], device=index.device)[None, :]
+    return rearrange(split[clips, blocks, index], "b n v c s h w -> b v c (n s) h w")
 
 
 def trajectory_regression_loss(
@@ -45,7 +88,7 @@ def trajectory_regression_loss(
     *,
     mask: Float[Tensor, "b v t h w"] | None,
     views: Sequence[str],
-    block_size: int,
+    spec: CausalSpec,
     next_weight: float,
     terminal_weight: float,
     auxiliary: AuxiliaryWeights,
@@ -60,28 +103,27 @@ def trajectory_regression_loss(
         mask: robot masks at latent resolution, or None where no robot term is wanted.
     """
     first = clean[..., :1, :, :]
-    levels = torch.tensor(NODES, device=nodes.device, dtype=nodes.dtype)
-    state = with_observed_frame(first, node_of_each_block(nodes, index, block_size))
-    following = with_observed_frame(first, node_of_each_block(nodes, index + 1, block_size))
+    levels = torch.tensor(spec.sigmas, device=nodes.device, dtype=nodes.dtype)
+    state = with_observed_frame(first, node_of_each_block(nodes, index, spec.block_size))
+    following = with_observed_frame(first, node_of_each_block(nodes, index + 1, spec.block_size))
     end = with_observed_frame(first, nodes[:, -1])
     sigma, sigma_next = levels[index], levels[index + 1]
     velocity = student.forward_teacher_forcing(
-        state, clean, sigma, action_maps=action_maps, block_size=block_size, views=views
+        state, clean, sigma, action_maps=action_maps, block_size=spec.block_size, views=views
     ).float()
-    here = broadcast_sigma(frame_sigmas(sigma, block_size))
-    there = broadcast_sigma(frame_sigmas(sigma_next, block_size))
+    here = broadcast_sigma(frame_sigmas(sigma, spec.block_size))
+    there = broadcast_sigma(frame_sigmas(sigma_next, spec.block_size))
     stepped = state + (there - here) * velocity
     predicted = state - here * velocity
     # Frame 0 is the observation in both: it adds nothing and is left out of the means.
-    intervals = len(NODES) - 1
-    next_loss = intervals * ((stepped - following)[..., 1:, :, :] ** 2).mean()
+    next_loss = spec.steps * ((stepped - following)[..., 1:, :, :] ** 2).mean()
     terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
     extra = auxiliary_losses(
         predicted,
         end,
         mask=mask,
         views=views,
-        block_size=block_size,
+        block_size=spec.block_size,
         weights=auxiliary,
         perceptual=perceptual,
     )

@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self
 
 import torch
-from pydantic import ValidationError
+from pydantic import ValidationError, field_validator, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
+from worldline_core.model.contracts import ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, is_text_parameter
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -26,17 +27,47 @@ VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "checkpoint.json"
 
 
-@dataclass(frozen=True)
-class CheckpointInfo:
-    """What a checkpoint says about itself."""
+class CheckpointInfo(StrictModel):
+    """What ``checkpoint.json`` says; every field is read strictly, and none has a default for a model that needs it.
+
+    Attributes:
+        action_contract: what the action maps meant that it was trained with; None (an empty object in the file) for
+            models that have seen none.
+        causal: blocks, window and nodes of a block-causal model.
+        metadata: where it comes from; nothing is computed from it.
+    """
 
     kind: CheckpointKind
     config: WorldModelConfig
-    action_contract: dict[str, Any]
-    """Units, frame, gripper polarity, fps, sigma of the action maps it was trained with."""
+    action_contract: ActionContract | None
+    causal: CausalSpec | None = None
     metadata: dict[str, Any]
     dtype: str
     weights_sha256: str
+
+    @field_validator("action_contract", mode="before")
+    @classmethod
+    def _empty_is_none(cls, value: object) -> object:
+        return None if value == {} else value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.kind in ("stage2", "causal") and self.action_contract is None:
+            raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
+        if (self.kind == "causal") != (self.causal is not None):
+            raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
+        return self
+
+    @property
+    def contract(self) -> ActionContract:
+        """The action contract of a model that takes actions.
+
+        Raises:
+            CheckpointError: it has none.
+        """
+        if self.action_contract is None:
+            raise CheckpointError("The model takes no actions", expected="a Stage II or causal model", got=self.kind)
+        return self.action_contract
 
 
 def save_checkpoint(
@@ -44,7 +75,8 @@ def save_checkpoint(
     model: WorldModel,
     *,
     kind: CheckpointKind,
-    action_contract: Mapping[str, Any],
+    action_contract: ActionContract | None,
+    causal: CausalSpec | None = None,
     metadata: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float16,
     state_dict: Mapping[str, Tensor] | None = None,
@@ -55,10 +87,8 @@ def save_checkpoint(
         state_dict: weights to store instead of the model's own (an averaged copy).
 
     Raises:
-        CheckpointError: the kind is unknown, or a weight is not finite in ``dtype``.
+        CheckpointError: the kind is unknown or lacks its contract, or a weight is not finite in ``dtype``.
     """
-    if kind not in get_args(CheckpointKind):
-        raise CheckpointError("Unknown checkpoint kind", expected=list(get_args(CheckpointKind)), got=kind)
     source = model.state_dict() if state_dict is None else state_dict
     tensors: dict[str, Tensor] = {}
     for name, tensor in sorted(source.items()):
@@ -67,28 +97,35 @@ def save_checkpoint(
             raise CheckpointError(
                 "A weight is not finite", where=name, next_step=f"it may overflow {dtype}; check training"
             )
-    content = save(tensors)
-    write_bytes_atomic(folder / WEIGHTS, content)
-    write_json_atomic(
-        folder / DESCRIPTION,
+    weights = save(tensors)
+    info = _checked(
         {
-            "format": FORMAT,
-            "version": VERSION,
             "kind": kind,
-            "config": model.config.model_dump(mode="json"),
-            "action_contract": dict(action_contract),
+            "config": model.config,
+            "action_contract": action_contract,
+            "causal": causal,
             "metadata": dict(metadata or {}),
             "dtype": str(dtype).removeprefix("torch."),
-            "weights_sha256": hashlib.sha256(content).hexdigest(),
+            "weights_sha256": hashlib.sha256(weights).hexdigest(),
         },
+        where=folder,
     )
+    write_bytes_atomic(folder / WEIGHTS, weights)
+    write_description(folder, info)
+
+
+def write_description(folder: Path, info: CheckpointInfo) -> None:
+    """Write ``checkpoint.json``."""
+    content = info.model_dump(mode="json", exclude={"causal"} if info.causal is None else None)
+    content["action_contract"] = content["action_contract"] or {}
+    write_json_atomic(folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **content})
 
 
 def read_checkpoint_info(folder: Path) -> CheckpointInfo:
     """Read ``checkpoint.json`` alone.
 
     Raises:
-        CheckpointError: the file is missing, damaged, of another format, or has an invalid config.
+        CheckpointError: the file is missing, damaged, of another format, or lacks a field; the message names it.
     """
     path = folder / DESCRIPTION
     if not path.is_file():
@@ -102,26 +139,20 @@ def read_checkpoint_info(folder: Path) -> CheckpointInfo:
         raise CheckpointError(
             "Not a checkpoint of this version", where=path, expected={"format": FORMAT, "version": VERSION}, got=got
         )
-    wanted = {"kind", "config", "action_contract", "metadata", "dtype", "weights_sha256"}
-    missing = wanted - content.keys()
-    if missing:
-        raise CheckpointError("The checkpoint description lacks keys", where=path, expected=sorted(missing))
-    if content["kind"] not in get_args(CheckpointKind):
-        raise CheckpointError(
-            "Unknown checkpoint kind", where=path, expected=list(get_args(CheckpointKind)), got=content["kind"]
-        )
+    return _checked({key: value for key, value in content.items() if key not in ("format", "version")}, where=path)
+
+
+def _checked(content: Mapping[str, Any], *, where: object) -> CheckpointInfo:
     try:
-        config = WorldModelConfig.model_validate(content["config"])
+        return CheckpointInfo.model_validate(content)
     except ValidationError as error:
-        raise CheckpointError("The checkpoint's model config is not valid", where=path, got=str(error)) from error
-    return CheckpointInfo(
-        kind=content["kind"],
-        config=config,
-        action_contract=content["action_contract"],
-        metadata=content["metadata"],
-        dtype=content["dtype"],
-        weights_sha256=content["weights_sha256"],
-    )
+        problems = [f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors()]
+        raise CheckpointError(
+            "The checkpoint description is not valid",
+            where=where,
+            got="; ".join(problems),
+            next_step="train it again with this version; for one of an earlier version, see tools/rewrite_checkpoint.py",
+        ) from error
 
 
 def load_checkpoint(
@@ -129,7 +160,6 @@ def load_checkpoint(
     *,
     expect_kind: CheckpointKind | tuple[CheckpointKind, ...] | None = None,
     towers: Literal["both", "generation"] | None = None,
-    action_contract: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> tuple[WorldModel, CheckpointInfo]:
     """Build the model and fill it; nothing may be missing, left over, or of another shape.
@@ -137,7 +167,6 @@ def load_checkpoint(
     Args:
         expect_kind: kind or kinds the caller can use.
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
-        action_contract: keys the caller relies on; each must be stored with the same value.
 
     Raises:
         CheckpointError: anything that does not fit, saying what was expected and what was found.
@@ -148,7 +177,6 @@ def load_checkpoint(
         raise CheckpointError(
             "The checkpoint is of the wrong kind", where=folder, expected=" or ".join(kinds), got=info.kind
         )
-    check_action_contract(info.action_contract, action_contract or {}, where=folder)
     config = info.config
     if towers == "both" and config.towers != "both":
         raise CheckpointError(
@@ -198,20 +226,3 @@ def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object
             )
     model.to(dtype)
     model.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()})
-
-
-def check_action_contract(stored: Mapping[str, Any], wanted: Mapping[str, Any], *, where: object) -> None:
-    """Compare every key of ``wanted`` with what a checkpoint was trained on.
-
-    Raises:
-        CheckpointError: a key is absent or has another value.
-    """
-    for key, value in wanted.items():
-        if key not in stored or stored[key] != value:
-            raise CheckpointError(
-                "The action contract differs from the one the model was trained with",
-                where=f"{where}: {key}",
-                expected=value,
-                got=stored.get(key, "not stored"),
-                next_step="render the action tracks with the stored contract, or use another checkpoint",
-            )

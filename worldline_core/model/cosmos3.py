@@ -185,5 +185,5 @@ def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], ou
     dtype = {"bfloat16": torch.bfloat16, "float16": torch.float16}[config.dtype]
     model, report = load_cosmos3(inputs["diffusers"], fps=config.fps, changes=config.changes, dtype=dtype)
     metadata = {"source": "Cosmos3 in diffusers format", "ignored": list(report.ignored), "new": list(report.new)}
-    save_checkpoint(output, model, kind="base", action_contract={}, metadata=metadata, dtype=dtype)
+    save_checkpoint(output, model, kind="base", action_contract=None, metadata=metadata, dtype=dtype)
     return {"parameters": sum(parameter.numel() for parameter in model.parameters()), "ignored": len(report.ignored)}

@@ -118,7 +118,7 @@ _STEPS = (
     ),
     Step(
         "render_actions",
-        3,
+        4,
         "worldline_core.actions.render_actions",
         "render_actions",
         "RenderActionsConfig",
@@ -196,7 +196,7 @@ _STEPS = (
     ),
     Step(
         "distill",
-        1,
+        2,
         "worldline_core.distillation.distill",
         "distill",
         "DistillConfig",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
-from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.overlay_views import overlay_sheet
 from worldline_core.actions.overlays import OverlayStyle, heat_picture
 from worldline_core.errors import DataError
@@ -46,7 +45,7 @@ def actions_section(context: ReportContext) -> Section:
     for index in chosen:
         row = episodes.rows[index]
         try:
-            picture = episode_overlay(episodes, index, tracks.tracks(row.episode_id), sigma_of(context))
+            picture = episode_overlay(episodes, index, tracks.tracks(row.episode_id), tracks.sigma_px_ref)
         except DataError as error:
             unreadable.append(f"No overlay of {row.episode_id}: {error.what}")
             continue
@@ -89,12 +88,6 @@ def sample_table(folder: Path) -> Table | None:
     return Table(headings, rows, range(1, len(headings)), caption) if causes else None
 
 
-def sigma_of(context: ReportContext) -> float:
-    """Sigma on the reference canvas with which the tracks' previews were drawn."""
-    config = context.inputs.manifest("render_actions").get("config") or {}
-    return float(config.get("sigma_px_ref", SIGMA_PX_REFERENCE))
-
-
 def channels_picture(
     context: ReportContext, episodes: EpisodeSet, tracks: ActionTracks, index: int
 ) -> tuple[Markup, str]:
@@ -107,7 +100,7 @@ def channels_picture(
     moment = found.num_frames // 2
     grid = (max(1, found.image_size[0] // LATENT_PIXELS), max(1, found.image_size[1] // LATENT_PIXELS))
     clip = collate_tracks([found.clip([moment])])
-    maps = render_action_maps(clip, found.image_size, grid, sigma_of(context))[0, :, :, 0].numpy()
+    maps = render_action_maps(clip, found.image_size, grid, tracks.sigma_px_ref)[0, :, :, 0].numpy()
     rows = [
         SheetRow(words(view), np.stack([heat_picture(channel, tile_height=96) for channel in maps[v]]))
         for v, view in enumerate(found.views)

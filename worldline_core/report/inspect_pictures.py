@@ -18,7 +18,7 @@ from worldline_core.pictures.labels import Picture, png_bytes
 from worldline_core.report.actions import episode_overlay
 from worldline_core.report.episode_sheet import MOMENTS, episode_rows, one_of_each
 from worldline_core.report.refusals import episode_of
-from worldline_core.store.artifact_files import linked_folder, read_json, read_rows
+from worldline_core.store.artifact_files import linked_folder, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
@@ -156,9 +156,10 @@ class Subject:
     def sigma_px_ref(self) -> float:
         """Of the heat, as the tracks' own previews were drawn with."""
         from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+        from worldline_core.actions.episode_tracks import ActionTracks
 
-        manifest = {} if self.tracks_folder is None else read_json(self.tracks_folder / "manifest.json")
-        return float(manifest.get("config", {}).get("sigma_px_ref", SIGMA_PX_REFERENCE))
+        folder = self.tracks_folder
+        return SIGMA_PX_REFERENCE if folder is None else ActionTracks.open(folder).sigma_px_ref
 
     @property
     def first_episode(self) -> str:

@@ -3,30 +3,90 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from torch import Tensor
 from tqdm import tqdm
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.rollout.predictor import Predictor
-from worldline_core.rollout.rollout_config import Job, RolloutConfig, shuffled_partners
+from worldline_core.model.video_tokenizer import frames_to_video, video_to_frames
 from worldline_core.rollout.rollout_set import RolloutSetWriter
-from worldline_core.rollout.samplers import BLOCK_SIZE
 from worldline_core.rollout.speed import BatchTime, SpeedLog, device_name, long_rollout, timed
+from worldline_core.rollout.worldline import WorldLine
 
-__all__ = ["RolloutConfig", "rollout"]
+Controls = Literal["true", "zero", "shuffled"]
+"""Whose controls drive a prediction: the episode's own, none, or those of another episode."""
+
+
+class RolloutConfig(StrictModel):
+    """Which episodes are predicted, and how."""
+
+    method: str = Field(default="worldline", min_length=1)
+    """Name the predictions carry in scores and reports."""
+    sampler: Literal["full_clip", "block_causal", "copy_first_frame"] = "block_causal"
+    steps: int | None = Field(default=None, ge=1)
+    """Euler steps; by default 35 for a whole clip, and per block those the causal model was trained with."""
+    actions: Controls = "true"
+    seeds: tuple[int, ...] = Field(default=(42,), min_length=1)
+    splits: tuple[str, ...] = ("test",)
+    banks: tuple[str, ...] | None = None
+    """Only episodes of these candidate banks."""
+    embodiments: tuple[str, ...] | None = None
+    max_episodes_per_embodiment: int | None = Field(default=None, ge=1)
+    num_frames: int = Field(default=33, ge=5)
+    """Longest prediction; shorter episodes are predicted as far as whole blocks (or groups) go."""
+    batch_size: int = Field(default=8, ge=1)
+    sink_blocks: int | None = Field(default=None, ge=1)
+    recent_blocks: int | None = Field(default=None, ge=0)
+    """Window of the cache; by default the one that the causal model was trained with."""
+    crf: int = Field(default=8, ge=0, le=51)
+    bfloat16: bool = True
+    device: str = "cpu"
+    timed_blocks: int = Field(default=0, ge=0)
+    """Blocks of one long block-causal rollout made to measure what each costs; it changes no prediction."""
+
+    @model_validator(mode="after")
+    def _distinct_seeds(self) -> Self:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f"seeds repeat: {self.seeds}")
+        return self
+
+    @model_validator(mode="after")
+    def _blocks_to_time(self) -> Self:
+        if self.timed_blocks and self.sampler != "block_causal":
+            raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
+        return self
+
+
+@dataclass(frozen=True)
+class Job:
+    """One prediction: an episode, whose controls drive it, a seed, and how many frames it gets."""
+
+    position: int
+    episode_id: str
+    controls_of: str
+    seed: int
+    frames: int
 
 
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
 
     Writes a RolloutSet. Predictions already there are kept; a batch is made again as a whole if one of its videos is
-    missing, so the bytes do not depend on where an earlier call stopped. Times go to ``run/speed.json``: seconds a frame, and
-    ``block_seconds`` of the block-causal sampler, per trajectory; ``long_rollout`` holds those of ``timed_blocks``.
+    missing, so the bytes do not depend on where an earlier call stopped. Times go to ``run/speed.json``: seconds per
+    frame, and ``block_seconds`` of the block-causal sampler, per trajectory; ``long_rollout`` holds those of
+    ``timed_blocks``.
 
     Returns:
         counts, frames, and the checkpoint's kind.
@@ -42,42 +102,131 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
     tracks = ActionTracks.open(Path(inputs["tracks"]))
     chosen = choose_episodes(config, episodes)
-    jobs = plan_jobs(config, episodes, tracks, chosen)
-    predictor = Predictor(config, inputs, episodes, tracks)
-    writer = RolloutSetWriter(output, config.method, predictor.fps, crf=config.crf)
+    world = _load(config, inputs, episodes, tracks)
+    jobs = plan_jobs(config, episodes, tracks, chosen, TEMPORAL_FACTOR if world is None else world.frames_per_unit)
+    views, image_size = _form(world, episodes)
+    writer = RolloutSetWriter(output, config.method, float(episodes.rows[0].fps), crf=config.crf)
     speed, first = SpeedLog(output / "run"), True
     for batch in tqdm(list(batches(jobs, config.batch_size)), desc=f"rollout {config.method}", disable=None):
-        if all(writer.has(job.episode_id, job.seed, predictor.views) for job in batch):
+        if all(writer.has(job.episode_id, job.seed, views) for job in batch):
             for job in batch:
-                for view in predictor.views:
-                    writer.register(job.episode_id, job.seed, view, job.frames, predictor.image_size)
+                for view in views:
+                    writer.register(job.episode_id, job.seed, view, job.frames, image_size)
             continue
-        predictions, elapsed = timed(partial(predictor.predict, batch), config.device)
+        predictions, elapsed = timed(partial(_predict, config, world, episodes, tracks, batch), config.device)
         made = sum(job.frames for job in batch)
-        speed.add(BatchTime(len(batch), made, elapsed.wall, tuple(predictor.block_seconds), first))
+        blocks = () if world is None else tuple(world.block_seconds)
+        speed.add(BatchTime(len(batch), made, elapsed.wall, blocks, first))
         first = False
         for job, frames in zip(batch, predictions, strict=True):
             writer.add(job.episode_id, job.seed, frames)
     writer.close()
     facts: dict[str, Any] = {
-        "steps": predictor.steps,
+        "steps": None if world is None else world.steps,
         "batch_size": config.batch_size,
         "device": config.device,
         "device_name": device_name(config.device),
         "dtype": "bfloat16" if config.bfloat16 else "float32",
     }
-    if config.timed_blocks:
-        facts["long_rollout"] = long_rollout(predictor.time_blocks(jobs[0], config.timed_blocks), config.device)
+    if config.timed_blocks and world is not None:
+        job = jobs[0]
+        encoded = world.encode(_observed(world, episodes, [job]), [tracks.tracks(job.controls_of)], [job.frames])
+        times = world.time_blocks(*encoded, [job.seed], config.timed_blocks)
+        facts["long_rollout"] = long_rollout(times, config.device)
     speed.close(facts)
     return {
         "method": config.method,
         "episodes": len(chosen),
         "predictions": len(jobs),
         "frames": sum(job.frames for job in jobs),
-        "checkpoint_kind": None if predictor.info is None else predictor.info.kind,
-        "steps": predictor.steps,
-        "recent_blocks": predictor.recent_blocks,
+        "checkpoint_kind": None if world is None else world.info.kind,
+        "steps": facts["steps"],
+        "recent_blocks": None if world is None or world.causal is None else world.causal.recent_blocks,
     }
+
+
+def _load(
+    config: RolloutConfig, inputs: Mapping[str, Path], episodes: EpisodeSet, tracks: ActionTracks
+) -> WorldLine | None:
+    """The model, where one is needed, for these recordings.
+
+    Raises:
+        CheckpointError: it is of the wrong kind for the sampler, or was trained with other controls.
+    """
+    if config.sampler == "copy_first_frame":
+        return None
+    world = WorldLine.from_pretrained(
+        Path(inputs["checkpoint"]),
+        tokenizer=Path(inputs["tokenizer"]),
+        expect_kind="stage2" if config.sampler == "full_clip" else "causal",
+        device=config.device,
+        bfloat16=config.bfloat16,
+        steps=config.steps,
+        sink_blocks=config.sink_blocks,
+        recent_blocks=config.recent_blocks,
+    )
+    world.contract.require(where=inputs["episodes"], fps=float(episodes.rows[0].fps))
+    world.contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
+    return world
+
+
+def _form(world: WorldLine | None, episodes: EpisodeSet) -> tuple[tuple[str, ...], tuple[int, int]]:
+    """Views and image size (H, W) of the predictions: the model's, or where frames are copied the recordings'."""
+    if world is not None:
+        return world.views, world.image_size
+    views = tuple(episodes.rows[0].views)
+    recorded = episodes.frames(0, views[0], [0]).shape
+    return views, (recorded[1], recorded[2])
+
+
+def _observed(world: WorldLine | None, episodes: EpisodeSet, batch: Sequence[Job]) -> Float[Tensor, "b v 3 h w"]:
+    """First frames of every view in [-1, 1].
+
+    Raises:
+        DataError: an episode lacks a view.
+    """
+    views, image_size = _form(world, episodes)
+    firsts = []
+    for job in batch:
+        row = episodes.rows[job.position]
+        if not set(views) <= set(row.views):
+            raise DataError(
+                "An episode lacks views the model needs", where=job.episode_id, expected=views, got=row.views
+            )
+        frames = [episodes.frames(job.position, view, [0]) for view in views]
+        firsts.append(torch.stack([frames_to_video(frame, image_size)[:, 0] for frame in frames]))
+    return torch.stack(firsts)
+
+
+def _predict(
+    config: RolloutConfig,
+    world: WorldLine | None,
+    episodes: EpisodeSet,
+    tracks: ActionTracks,
+    batch: Sequence[Job],
+) -> list[dict[str, np.ndarray]]:
+    """Predicted frames of every view of every job, the observed frame first.
+
+    Raises:
+        CheckpointError: the model was trained with other controls than these.
+    """
+    images = _observed(world, episodes, batch)
+    if world is None:
+        views, _ = _form(world, episodes)
+        return [
+            {view: np.repeat(video_to_frames(first[v, :, None]), job.frames, axis=0) for v, view in enumerate(views)}
+            for first, job in zip(images, batch, strict=True)
+        ]
+    driven = [tracks.tracks(job.controls_of) for job in batch]
+    for track in driven:
+        world.contract.require(where=f"{tracks.root}, episode {track.episode_id}", controls=track.controls)
+    return world.predict_batch(
+        images,
+        driven,
+        [job.frames for job in batch],
+        [job.seed for job in batch],
+        without_actions=config.actions == "zero",
+    )
 
 
 def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
@@ -108,11 +257,13 @@ def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
     return chosen
 
 
-def plan_jobs(config: RolloutConfig, episodes: EpisodeSet, tracks: ActionTracks, chosen: Sequence[int]) -> list[Job]:
-    """Every prediction to make, with its length.
+def plan_jobs(
+    config: RolloutConfig, episodes: EpisodeSet, tracks: ActionTracks, chosen: Sequence[int], unit: int
+) -> list[Job]:
+    """Every prediction to make, with its length: 1 + k * ``unit`` frames.
 
     Raises:
-        DataError: an episode has no action tracks, or is shorter than one block.
+        DataError: an episode has no action tracks, or is shorter than one unit.
     """
     rows = [episodes.rows[position] for position in chosen]
     missing = [row.episode_id for row in rows if row.episode_id not in tracks]
@@ -122,7 +273,6 @@ def plan_jobs(config: RolloutConfig, episodes: EpisodeSet, tracks: ActionTracks,
     if config.actions == "shuffled":
         embodiment_of = {row.episode_id: row.embodiment for row in episodes.rows}
         partners = shuffled_partners(list(partners), embodiment_of, tracks.episode_ids, config.seeds[0])
-    unit = 4 * BLOCK_SIZE if config.sampler == "block_causal" else 4
     jobs = []
     for position, row in zip(chosen, rows, strict=True):
         frames = 1 + (min(config.num_frames, row.num_frames) - 1) // unit * unit
@@ -140,3 +290,34 @@ def batches(jobs: Sequence[Job], size: int) -> Iterator[list[Job]]:
         same = [job for job in jobs if job.frames == frames]
         for start in range(0, len(same), size):
             yield same[start : start + size]
+
+
+def shuffled_partners(
+    episodes: Sequence[str], embodiment_of: Mapping[str, str], pool: Sequence[str], seed: int
+) -> dict[str, str]:
+    """For every episode another of the same embodiment, no one its own, as far as possible no two the same.
+
+    Episodes of an embodiment are arranged in a random circle (a function of ``seed`` and the ids only) and each takes
+    its successor's controls. An embodiment with a single chosen episode draws its partner from ``pool``.
+
+    Raises:
+        DataError: an episode has no other of its embodiment.
+    """
+    partners: dict[str, str] = {}
+    for embodiment in sorted({embodiment_of[episode] for episode in episodes}):
+        members = sorted(episode for episode in episodes if embodiment_of[episode] == embodiment)
+        generator = np.random.default_rng([seed, *embodiment.encode()])
+        if len(members) == 1:
+            others = sorted(e for e in pool if embodiment_of.get(e) == embodiment and e not in members)
+            if not others:
+                raise DataError(
+                    "No other episode of this embodiment to take controls from",
+                    where=members[0],
+                    expected="at least two episodes with tracks",
+                    got=embodiment,
+                )
+            partners[members[0]] = others[int(generator.integers(len(others)))]
+            continue
+        circle = [members[int(i)] for i in generator.permutation(len(members))]
+        partners.update(zip(circle, [*circle[1:], circle[0]], strict=True))
+    return partners

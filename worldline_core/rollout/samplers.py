@@ -12,17 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.block_causal_attention import KVCache
+from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.model.world_model_config import VIEWS
 
 VelocityField = Callable[[Tensor, float], Tensor]
 """Velocity at (state, noise level)."""
 FULL_STEPS = 35
-CAUSAL_SHIFT = 5.0
-CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
-"""Nodes of the four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4."""
-BLOCK_SIZE = 4
 
 
 def shifted_sigmas(steps: int, shift: float = 1.0) -> tuple[float, ...]:
@@ -42,9 +38,9 @@ def sigmas_full(steps: int = FULL_STEPS) -> tuple[float, ...]:
     return shifted_sigmas(steps)
 
 
-def sigmas_causal(steps: int = 4) -> tuple[float, ...]:
-    """Nodes of the block-causal sampler; four steps are :data:`CAUSAL_SIGMAS`."""
-    return CAUSAL_SIGMAS if steps == 4 else shifted_sigmas(steps, CAUSAL_SHIFT)
+def sigmas_causal(spec: CausalSpec, steps: int | None = None) -> tuple[float, ...]:
+    """Nodes of the block-causal sampler: those the model was trained on, or for another number of steps shifted ones."""
+    return spec.sigmas if steps in (None, spec.steps) else shifted_sigmas(steps or 1, CAUSAL_SHIFT)
 
 
 def euler_step(
@@ -59,17 +55,6 @@ def integrate(velocity: VelocityField, state: Tensor, sigmas: Sequence[float]) -
     for sigma, next_sigma in itertools.pairwise(sigmas):
         state = euler_step(state, velocity(state, sigma), sigma, next_sigma)
     return state
-
-
-def check_nodes(sigmas: Sequence[float]) -> None:
-    """Refuse nodes that do not fall from at most 1 to 0.
-
-    Raises:
-        ConfigError: they do not.
-    """
-    falling = all(later < earlier for earlier, later in itertools.pairwise(sigmas))
-    if len(sigmas) < 2 or sigmas[0] > 1 or sigmas[-1] != 0 or not falling:
-        raise ConfigError("Noise levels must fall from at most 1 to 0", got=list(sigmas))
 
 
 class Noise:
@@ -102,8 +87,7 @@ def rollout_full_clip(
     action_maps: Float[Tensor, "b v a t h w"] | None,
     *,
     noise: Noise,
-    steps: int = 35,
-    sigmas: Sequence[float] | None = None,
+    steps: int = FULL_STEPS,
     frames: int | None = None,
     views: Sequence[str] = VIEWS,
     text: TextContext | None = None,
@@ -113,15 +97,12 @@ def rollout_full_clip(
 
     Args:
         action_maps: controls of every latent frame; None for a model without actions (then give ``frames``).
-        noise: one source a clip.
-        sigmas: nodes, instead of ``steps`` even ones.
+        noise: one source per clip.
 
     Raises:
-        ConfigError: the noise levels do not fall to 0.
+        ConfigError: fewer than one step.
         DataError: a shape does not fit the model.
     """
-    nodes = tuple(sigmas) if sigmas is not None else sigmas_full(steps)
-    check_nodes(nodes)
     if frames is None:
         frames = 1 if action_maps is None else action_maps.shape[3]
     batch, views_count, channels, height, width = first_latents.shape
@@ -135,7 +116,7 @@ def rollout_full_clip(
         return model(state, levels, action_maps=action_maps, text=text, views=views).velocity
 
     with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
-        return integrate(velocity, latents, nodes)
+        return integrate(velocity, latents, sigmas_full(steps))
 
 
 class BlockCausalSimulator:
@@ -146,38 +127,32 @@ class BlockCausalSimulator:
     block is asked for, so the last block of a rollout costs no write pass.
 
     Args:
-        noise: one source a clip.
-        sink_blocks: blocks kept from the start (the observed frame is block 0).
-        recent_blocks: most recent blocks kept besides; at most what the model was trained on.
+        spec: block size, window and nodes, as the model was trained with.
+        noise: one source per clip.
     """
 
     def __init__(
         self,
         model: WorldModel,
+        spec: CausalSpec,
         *,
         noise: Noise,
-        sigmas: Sequence[float] = CAUSAL_SIGMAS,
-        block_size: int = BLOCK_SIZE,
-        sink_blocks: int = 1,
-        recent_blocks: int = 3,
         views: Sequence[str] = VIEWS,
         bfloat16: bool = False,
     ) -> None:
-        check_nodes(sigmas)
         self.model = model
-        self.sigmas = tuple(sigmas)
-        self.block_size = block_size
+        self.spec = spec
         self.views = tuple(views)
         self.bfloat16 = bfloat16
         self.noise = noise
-        self.cache = KVCache(sink_blocks, recent_blocks)
+        self.cache = spec.new_cache()
         self._unwritten: tuple[Tensor, Tensor | None] | None = None
 
     def start(
         self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 h w"] | None = None
     ) -> None:
         """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
-        self.cache = KVCache(self.cache.sink_blocks, self.cache.recent_blocks)
+        self.cache = self.spec.new_cache()
         self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
 
     @torch.no_grad()
@@ -189,10 +164,10 @@ class BlockCausalSimulator:
         """
         if self._unwritten is None:
             raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
-        if action_maps is not None and action_maps.shape[3] != self.block_size:
+        if action_maps is not None and action_maps.shape[3] != self.spec.block_size:
             raise DataError(
                 "Controls of one block are needed",
-                expected=f"{self.block_size} latent frames",
+                expected=f"{self.spec.block_size} latent frames",
                 got=action_maps.shape[3],
             )
         self._write()
@@ -200,24 +175,17 @@ class BlockCausalSimulator:
         if reference is None:
             raise DataError("The cache lost its first frame", next_step="call start() again")
         views, channels, _, height, width = reference.shape[1:]
-        latents = self.noise.draw((views, channels, self.block_size, height, width), reference.device)
+        latents = self.noise.draw((views, channels, self.spec.block_size, height, width), reference.device)
         velocity = partial(self.model.forward_block, cache=self.cache, action_maps=action_maps, views=self.views)
         with torch.autocast(reference.device.type, torch.bfloat16, enabled=self.bfloat16):
-            latents = integrate(velocity, latents, self.sigmas)
+            latents = integrate(velocity, latents, self.spec.sigmas)
         self._unwritten = (latents, action_maps)
         return latents
 
     def fork(self) -> BlockCausalSimulator:
         """A simulator in the same state that goes on separately: to try several controls from one moment."""
         other = BlockCausalSimulator(
-            self.model,
-            noise=self.noise.copy(),
-            sigmas=self.sigmas,
-            block_size=self.block_size,
-            sink_blocks=self.cache.sink_blocks,
-            recent_blocks=self.cache.recent_blocks,
-            views=self.views,
-            bfloat16=self.bfloat16,
+            self.model, self.spec, noise=self.noise.copy(), views=self.views, bfloat16=self.bfloat16
         )
         other.cache = self.cache.copy()
         other._unwritten = self._unwritten

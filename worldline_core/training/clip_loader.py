@@ -11,7 +11,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,15 +19,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks
-from worldline_core.errors import ArtifactError, DataError
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, WristProjection, collate_tracks
+from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import PRIMARY, Clip, ClipBatch, ClipSource, ReadingConfig
 
 logger = logging.getLogger(__name__)
 
-WristProjection = Literal["current_camera", "clip_start_camera"]
 _ATTEMPTS = 20
 
 
@@ -173,6 +172,8 @@ class ClipLoader:
     Args:
         store: where clips are read from.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
+        tracks: controls; the maps get the width that the tracks were made for.
+        wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``.
     """
 
@@ -184,8 +185,7 @@ class ClipLoader:
         tracks: ActionTracks | None = None,
         text: TextEncoder | None = None,
         frame_rates: Mapping[str, float] | None = None,
-        sigma_px_ref: float = 10.0,
-        wrist_projection: WristProjection = "current_camera",
+        wrist_projection: WristProjection | None = None,
         device: str = "cpu",
     ) -> None:
         self.store = store
@@ -193,8 +193,7 @@ class ClipLoader:
         self.tracks = tracks
         self.text = text
         self.frame_rates = frame_rates or {}
-        self.sigma_px_ref = sigma_px_ref
-        self.wrist_projection: WristProjection = wrist_projection
+        self.wrist_projection: WristProjection | None = wrist_projection
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
 
@@ -237,21 +236,20 @@ class ClipLoader:
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
         """Maps at latent resolution: latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""
+        if self.tracks is None or self.wrist_projection is None:
+            raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
         cut = []
         for clip in clips:
             frames = [clip.start + clip.stride * index for index in latent_frame_indices(clip.num_frames)]
-            tracks = self._episode_tracks(clip.episode_id)
+            if clip.episode_id not in self._tracks:
+                self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
+            tracks = self._tracks[clip.episode_id]
             cut.append(tracks.clip(frames, wrist_projection=self.wrist_projection, start=clip.start))
         _, rows, columns = self.store.latent_shape
         tensors = collate_tracks(cut, views=views).to(self.device)
-        return render_action_maps(tensors, cut[0].image_size, grid_size=(rows, columns), sigma_px_ref=self.sigma_px_ref)
-
-    def _episode_tracks(self, episode_id: str) -> EpisodeTracks:
-        if self.tracks is None:
-            raise ArtifactError("Action maps were asked for, but there are no action tracks.", where=episode_id)
-        if episode_id not in self._tracks:
-            self._tracks[episode_id] = self.tracks.tracks(episode_id)
-        return self._tracks[episode_id]
+        return render_action_maps(
+            tensors, cut[0].image_size, grid_size=(rows, columns), sigma_px_ref=self.tracks.sigma_px_ref
+        )
 
 
 class SkipLog:

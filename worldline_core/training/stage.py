@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from pydantic import Field
@@ -18,6 +18,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, save_checkpoint
+from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch, BatchReader, ClipLoader, ClipReader, SkipLog
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
@@ -203,7 +204,7 @@ class Stage:
         result: TrainingResult,
         *,
         kind: Literal["base", "stage1", "stage2"],
-        action_contract: dict[str, Any],
+        action_contract: ActionContract | None,
         facts: Mapping[str, Any],
     ) -> dict[str, Any]:
         """Write the averaged weights (the first process alone does) and return the counts of the run."""
@@ -243,13 +244,22 @@ class Stage:
         return facts
 
 
+class ValidatedObjective(Protocol):
+    """An objective whose model can be measured on held-out clips."""
+
+    @property
+    def model(self) -> WorldModel: ...
+
+    def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
+
+
 def validation_function(
     loader: ClipLoader,
     clips: ClipSampling,
     splits: Sequence[str],
     trainer: TrainerConfig,
     rows: Sequence[ClipRow],
-    objective: FlowMatchingObjective,
+    objective: ValidatedObjective,
     reading: ReadingConfig | None = None,
 ) -> Callable[[], dict[str, float]] | None:
     """A function that measures the losses on held-out clips: always the same clips, noise and noise levels.

@@ -64,6 +64,6 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
     )
     result = stage.train(objective, stage1_groups(model), loader)
     facts = {"start": stage.start, "text": config.text.model_dump(mode="json")}
-    counts = stage.save(result, kind=config.kind, action_contract={}, facts=facts)
+    counts = stage.save(result, kind=config.kind, action_contract=None, facts=facts)
     parameters = sum(value.numel() for value in model.parameters())
     return {**counts, "parameters": parameters, **result.metrics}

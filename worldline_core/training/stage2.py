@@ -11,12 +11,11 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from worldline_core.actions.action_maps import REFERENCE_CANVAS
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, WristProjection
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
+from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_source import ClipSource
 from worldline_core.training.flow_matching import FlowMatchingObjective, RelationalTerm
 from worldline_core.training.relational import RelationalConfig
 from worldline_core.training.stage import Stage, StageConfig
@@ -30,15 +29,13 @@ class Stage2Config(StageConfig):
     """``start_from``: "stage1" takes a base or Stage I checkpoint, "stage2" goes on with a Stage II checkpoint.
 
     ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
-    ``sigma_px_ref``: width of the action maps' Gaussian on the 384 x 512 canvas (10 at full size; coarse latent
-    grids need more, or a point between two cells vanishes). ``relational``: null trains without these terms.
+    ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
     """
 
     start_from: Literal["stage1", "stage2"] = "stage1"
     action_multiplier: float = Field(default=66.0, gt=0)
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
-    sigma_px_ref: float = Field(default=10.0, gt=0)
-    wrist_projection: Literal["current_camera", "clip_start_camera"] = "current_camera"
+    wrist_projection: WristProjection = "current_camera"
     relational: RelationalConfig | None = RelationalConfig()
 
 
@@ -50,31 +47,13 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
     ]
 
 
-def action_contract(config: Stage2Config, source: ClipSource, fps: float, controls: str) -> dict[str, Any]:
-    """What the maps mean; rollouts refuse controls rendered under another contract."""
-    return {
-        "controls": controls,
-        "maps": "[h, d h, r1 h .. r6 h, g h], arms added",
-        "depth_unit": "m",
-        "rotation": "rot6d, end effector in the camera frame",
-        "gripper": "0 closed, 1 open",
-        "fps": fps,
-        "temporal": "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
-        "sigma_px_ref": config.sigma_px_ref,
-        "reference_canvas": list(REFERENCE_CANVAS),
-        "wrist_projection": config.wrist_projection,
-        "grid_size": list(source.latent_shape[1:]),
-        "tokenizer": source.description["tokenizer"],
-    }
-
-
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for relations.
 
     Clips are cached ``latents``, or frames that ``tokenizer`` encodes on the way.
 
     Raises:
-        CheckpointError: if the checkpoint is of the wrong kind.
+        CheckpointError: if the checkpoint is of the wrong kind, or was trained on maps of another meaning.
         ConfigError: if relational terms are asked for without a teacher.
         DataError: if no clip fits, or one cannot be read.
     """
@@ -91,7 +70,19 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         tracks=tracks,
     )
     model = stage.model
-    loader = stage.loader(tracks=tracks, sigma_px_ref=config.sigma_px_ref, wrist_projection=config.wrist_projection)
+    contract = ActionContract.of_these_maps(
+        controls=tracks.tracks(stage.training_rows[0].episode_id).controls,
+        fps=stage.episodes.rows[0].fps,
+        sigma_px_ref=tracks.sigma_px_ref,
+        wrist_projection=config.wrist_projection,
+        grid_size=stage.source.latent_shape[1:],
+        tokenizer=stage.source.description["tokenizer"],
+    )
+    learnt = read_checkpoint_info(parent).action_contract
+    if learnt is not None:
+        kept = {"sigma_px_ref", "wrist_projection", "tokenizer"}
+        learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
+    loader = stage.loader(tracks=tracks, wrist_projection=config.wrist_projection)
     objective = FlowMatchingObjective(
         model,
         sigma=config.sigma,
@@ -101,8 +92,6 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     )
     groups = stage2_groups(model, config.action_multiplier)
     result = stage.train(objective, groups, loader)
-    controls = tracks.tracks(stage.training_rows[0].episode_id).controls
-    contract = action_contract(config, stage.source, stage.episodes.rows[0].fps, controls)
     facts = {"start": {"kind": stage.parent_kind, "weights_sha256": stage.start}}
     counts = stage.save(result, kind="stage2", action_contract=contract, facts=facts)
     trained = sum(value.numel() for group in groups for value in group.parameters.values())

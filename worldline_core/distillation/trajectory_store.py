@@ -1,0 +1,207 @@
+"""Offline teacher trajectories on disk: shards that are made once, resumed after an interruption, and read at random.
+
+Which clips and which noise a shard holds follows from the seed and the shard's number alone, so a shard that is missing
+is remade with the same bytes. Layout: `shard-00000.safetensors` ... (`nodes`, half precision, axes n k v c u h w;
+`mask`, bytes, axes n v t h w; the clips in the header) and `trajectories.json` (settings and the digest of every shard),
+written last.
+
+Axes: b clips (n in a shard), k nodes, v views, c latent channels, t latent frames, u = t - 1 without the observed one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+from tqdm import tqdm
+
+from worldline_core.distillation.causal_objective import maps_of, with_observed_frame
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.store.digest import digest_file
+from worldline_core.training.clip_loader import Batch, ClipLoader
+from worldline_core.training.clip_source import Clip, ClipBatch
+
+INDEX = "trajectories.json"
+
+MakeShard = Callable[[int], tuple[Sequence[Clip], Tensor, Tensor]]
+"""Clips, their nodes (n k v c u h w) and robot masks (n v t h w) of a shard, by its number."""
+
+
+def shard_path(folder: Path, number: int) -> Path:
+    """File of a shard."""
+    return folder / f"shard-{number:05d}.safetensors"
+
+
+def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dict[str, Any]) -> None:
+    """Make every shard that is not there yet, then the index.
+
+    Args:
+        settings: everything that decides the content (teacher, seed, schedule), JSON values.
+
+    Raises:
+        ArtifactError: the folder holds trajectories made with other settings.
+    """
+    recorded = folder / "settings.json"
+    if recorded.is_file():
+        found = json.loads(recorded.read_text(encoding="utf-8"))
+        if found != settings:
+            raise ArtifactError(
+                "The folder holds trajectories made with other settings",
+                where=folder,
+                expected=settings,
+                got=found,
+                next_step="remove the folder, or use another one",
+            )
+    write_json_atomic(recorded, settings)
+    for number in tqdm(range(shards), desc="teacher trajectories", unit="shard", disable=None):
+        path = shard_path(folder, number)
+        if path.is_file():
+            continue
+        clips, nodes, mask = make(number)
+        header = {"clips": json.dumps([asdict(clip) for clip in clips])}
+        tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
+        write_bytes_atomic(path, save({name: value.contiguous() for name, value in tensors.items()}, metadata=header))
+    index = {
+        "settings": settings,
+        "shards": [digest_file(shard_path(folder, number)) for number in range(shards)],
+    }
+    write_json_atomic(folder / INDEX, index)
+
+
+class TrajectoryStore:
+    """Read access to finished trajectories."""
+
+    def __init__(self, folder: Path, clips: Sequence[tuple[int, int, Clip]]) -> None:
+        self.folder = folder
+        self._clips = list(clips)
+
+    @classmethod
+    def open(cls, folder: Path) -> TrajectoryStore:
+        """Open a finished folder.
+
+        Raises:
+            ArtifactError: it has no index, or a shard is missing or damaged.
+        """
+        if not (folder / INDEX).is_file():
+            raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
+        shards = json.loads((folder / INDEX).read_text(encoding="utf-8"))["shards"]
+        clips: list[tuple[int, int, Clip]] = []
+        for number in range(len(shards)):
+            path = shard_path(folder, number)
+            try:
+                with safe_open(path, framework="pt") as shard:
+                    header = shard.metadata() or {}
+            except (OSError, SafetensorError) as error:
+                raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
+            if "clips" not in header:
+                raise ArtifactError("Not a shard of trajectories", where=path, expected="clips in its header")
+            clips += [(number, row, Clip(**clip)) for row, clip in enumerate(json.loads(header["clips"]))]
+        return cls(folder, clips)
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def clips(self, indices: Sequence[int]) -> tuple[Clip, ...]:
+        """The clips of some trajectories."""
+        return tuple(self._clips[index][2] for index in indices)
+
+    def nodes(self, indices: Sequence[int]) -> Float[Tensor, "b k v c u h w"]:
+        """The states of some trajectories, in single precision."""
+        return self._read("nodes", indices)
+
+    def masks(self, indices: Sequence[int]) -> Float[Tensor, "b v t h w"]:
+        """The robot masks of some trajectories."""
+        return self._read("mask", indices)
+
+    def _read(self, name: str, indices: Sequence[int]) -> Tensor:
+        rows = []
+        for index in indices:
+            number, row, _ = self._clips[index]
+            with safe_open(shard_path(self.folder, number), framework="pt") as shard:
+                rows.append(shard.get_slice(name)[row : row + 1])
+        return torch.cat(rows).float()
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """What distillation adds to a batch; `clean` is the history the teacher saw, observed frame included."""
+
+    nodes: Float[Tensor, "b k v c u h w"]
+    clean: Float[Tensor, "b v c t h w"]
+    mask: Float[Tensor, "b v t h w"]
+
+
+@dataclass(frozen=True)
+class TrajectoryBatch(Batch):
+    """A batch with the teacher's trajectories of its clips."""
+
+    trajectories: Trajectories | None = None
+
+
+def parts_of(batch: Batch) -> tuple[Trajectories, Float[Tensor, "b v a t h w"]]:
+    """Trajectories and action maps of a batch.
+
+    Raises:
+        ConfigError: the batch lacks one of them.
+    """
+    trajectories = batch.trajectories if isinstance(batch, TrajectoryBatch) else None
+    if trajectories is None:
+        raise ConfigError("A batch without teacher trajectories", expected="a batch of TrajectoryLoader")
+    return trajectories, maps_of(batch)
+
+
+class TrajectoryLoader:
+    """Draws trajectories at random; what a step sees depends on (seed, step) alone.
+
+    Args:
+        generated_history: whether the teacher saw its own clean blocks before each block (else the recorded ones).
+    """
+
+    def __init__(
+        self,
+        store: TrajectoryStore,
+        loader: ClipLoader,
+        *,
+        batch_size: int,
+        seed: int,
+        generated_history: bool,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        self.store = store
+        self.loader = loader
+        self.batch_size = batch_size
+        self.seed = seed
+        self.generated_history = generated_history
+        self.rank = rank
+        self.world_size = world_size
+        # A batch has one shape, so its clips have one length: a group is drawn by its size, then clips within it.
+        lengths = [clip.num_frames for clip in store.clips(range(len(store)))]
+        self._groups = [
+            [row for row, length in enumerate(lengths) if length == wanted] for wanted in sorted(set(lengths))
+        ]
+        self._shares = np.array([len(group) for group in self._groups]) / len(store)
+
+    def load(self, index: int) -> TrajectoryBatch:
+        """The batch of micro-step `index` (of this rank)."""
+        random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
+        group = self._groups[int(random.choice(len(self._groups), p=self._shares))]
+        draws = random.integers(len(group), size=self.batch_size * self.world_size)
+        rows = [group[int(draw)] for draw in draws[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]]
+        batch = self.loader.load(ClipBatch(self.store.clips(rows), None))
+        nodes = self.store.nodes(rows).to(self.loader.device)
+        clean = batch.latents
+        if self.generated_history:
+            clean = with_observed_frame(clean[..., :1, :, :], nodes[:, -1])
+        trajectories = Trajectories(nodes, clean, self.store.masks(rows).to(self.loader.device))
+        return TrajectoryBatch(batch.clips, batch.views, batch.latents, batch.action_maps, trajectories=trajectories)
