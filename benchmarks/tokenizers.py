@@ -17,14 +17,13 @@ from torch import Tensor
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.wan_tokenizer import WanTokenizer
+from worldline_core.training.recorded_views import RecordedView, load_views
 from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     clip_of,
-    decoder_batch,
-    load_views,
-    milliseconds,
     reconstruction_metrics,
     select_episodes,
+    video_batch,
 )
 
 
@@ -51,12 +50,12 @@ def small_wan(latent_channels: int = 32) -> WanTokenizer:
     return WanTokenizer(vae)
 
 
-def train_wan(tokenizer: WanTokenizer, videos: list[Tensor], config: TokenizerConfig, seconds: float) -> int:
+def train_wan(tokenizer: WanTokenizer, views: list[RecordedView], config: TokenizerConfig, seconds: float) -> int:
     """Train on reconstruction alone for ``seconds``; returns the steps made."""
     optimizer = torch.optim.AdamW(tokenizer.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
     started, step = time.perf_counter(), 0
     while time.perf_counter() - started < seconds:
-        video = decoder_batch(videos, config, step)
+        _, video = video_batch(views, config, step)
         loss = (tokenizer.decode(tokenizer.encode(video)) - video).abs().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -66,10 +65,26 @@ def train_wan(tokenizer: WanTokenizer, videos: list[Tensor], config: TokenizerCo
     return step
 
 
+def milliseconds(tokenizer: VideoTokenizer, clip: Tensor, repeats: int = 5) -> tuple[float, float]:
+    """Median wall time to encode and to decode one clip [ms]."""
+    with torch.no_grad():
+        latents = tokenizer.encode(clip)
+        tokenizer.decode(latents)
+        times: list[list[float]] = [[], []]
+        for _ in range(repeats):
+            start = time.perf_counter()
+            tokenizer.encode(clip)
+            middle = time.perf_counter()
+            tokenizer.decode(latents)
+            times[0].append((middle - start) * 1e3)
+            times[1].append((time.perf_counter() - middle) * 1e3)
+    return sorted(times[0])[repeats // 2], sorted(times[1])[repeats // 2]
+
+
 def compare(
     patch: PatchTokenizer, wan: WanTokenizer, held_out: list[Tensor], frames: int
 ) -> dict[str, dict[str, float]]:
-    """Metrics and milliseconds a clip (one view) of both tokenizers, and of the linear part alone."""
+    """Metrics and milliseconds per clip (one view) of both tokenizers, and of the linear part alone."""
     clip = clip_of(held_out[0], frames, patch.temporal_compression)
     rows: dict[str, dict[str, float]] = {}
     tokenizers: dict[str, VideoTokenizer] = {"patch": patch, "wan": wan}
@@ -95,14 +110,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     episodes = EpisodeSet.open(options.episodes)
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
     held_out = select_episodes(episodes, (options.held_out_split,), 4, config.seed)
-    videos = load_views(episodes, chosen, config.image_size, 5)
+    views = load_views(episodes, chosen, config.image_size, 5)
     torch.manual_seed(config.seed)
     wan = small_wan()
-    steps = train_wan(wan, videos, config, options.minutes * 60)
+    steps = train_wan(wan, views, config, options.minutes * 60)
     rows = compare(
         PatchTokenizer.load(options.tokenizer),
         wan.eval().requires_grad_(False),
-        load_views(episodes, held_out, config.image_size, 5),
+        [view.frames for view in load_views(episodes, held_out, config.image_size, 5)],
         config.clip_frames,
     )
     print(f"AutoencoderKLWan: {sum(p.numel() for p in wan.parameters()):,} parameters, {steps} steps")

@@ -7,12 +7,17 @@ import torch
 
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.metrics import video_iou
-from worldline_core.evaluation.segmenters import train_segmenter as train
 from worldline_core.evaluation.segmenters.augmentation import augment
 from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-from worldline_core.evaluation.segmenters.train_segmenter import SegmenterConfig, train_segmenter
+from worldline_core.evaluation.segmenters.train_segmenter import (
+    MaskBatch,
+    MaskObjective,
+    SegmenterConfig,
+    train_segmenter,
+)
+from worldline_core.training import trainer
 
 CONFIG = SegmenterConfig(
     widths=(8, 16), steps=4, batch_size=2, checkpoint_every=1, evaluate_splits=("test",), frame_stride=4
@@ -33,19 +38,19 @@ def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeyp
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     result = train_segmenter(CONFIG, {"episodes": training}, whole)
     assert result["videos"] == 4
-    save = train._save_state
+    save = trainer.save_training_state
 
-    def killed(path, step, *rest):
-        save(path, step, *rest)
-        if step == 2:
+    def killed(*arguments):
+        save(*arguments)
+        if arguments[-1]["step"] == 2:
             raise KeyboardInterrupt("killed")
 
-    monkeypatch.setattr(train, "_save_state", killed)
-    with pytest.raises(KeyboardInterrupt, match="killed"):
-        train_segmenter(CONFIG, {"episodes": training}, resumed)
-    monkeypatch.setattr(train, "_save_state", save)
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "save_training_state", killed)
+        with pytest.raises(KeyboardInterrupt, match="killed"):
+            train_segmenter(CONFIG, {"episodes": training}, resumed)
     train_segmenter(CONFIG, {"episodes": training}, resumed)
-    for name in ("model.safetensors", "segmenter.json", "losses.parquet"):
+    for name in ("model.safetensors", "segmenter.json", "metrics.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes()
     description = json.loads((whole / "segmenter.json").read_text())
     assert set(description["metrics"]["test"]) == {"iou", "iou_degraded", "videos"}
@@ -63,7 +68,7 @@ def test_the_network_learns_a_mask():
     network = UNet((8, 16))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
     for _ in range(40):
-        loss = train._loss(network(frames), masks)
+        loss, _ = MaskObjective(network).loss(MaskBatch(("a", "b"), frames, masks), torch.Generator(), 0)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,13 +15,9 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.tokenizer import load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.wan_tokenizer import WAN22_MEAN, WAN22_STD, WanTokenizer
-from worldline_core.training.train_tokenizer import (
-    TokenizerConfig,
-    decoder_batch,
-    disturb,
-    fit_patch_tokenizer,
-    train_decoder,
-)
+from worldline_core.training.fit_tokenizer import fit_patch_tokenizer
+from worldline_core.training.recorded_views import RecordedView
+from worldline_core.training.train_tokenizer import TokenizerConfig, decoder_batch, disturb, train_decoder
 
 
 def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
@@ -37,6 +34,12 @@ def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
                 :, None, None
             ]
     return video * 2 - 1
+
+
+def views(seeds: int, count: int = 6) -> list[RecordedView]:
+    """Scenes of several seeds as they are held in memory for training."""
+    videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(seeds) for v in scenes(count, seed=s)]
+    return [RecordedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +109,7 @@ def test_blocks_decode_as_they_arrive(fitted: PatchTokenizer) -> None:
 
 
 def test_a_short_training_improves_on_the_linear_decode_by_using_the_reference(tmp_path: Path) -> None:
-    videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(2) for v in scenes(seed=s)]
+    videos = views(2)
     tokenizer = fit_patch_tokenizer([scenes()], channels=8, refinement_width=8, refinement_depth=1)
     config = TokenizerConfig(
         steps=25, batch_size=2, clip_frames=9, warmup_steps=2, bfloat16=False, average_decay=0.8, learning_rate=1e-2
@@ -129,7 +132,7 @@ def test_a_short_training_improves_on_the_linear_decode_by_using_the_reference(t
 
 
 def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    videos = [((v + 1) * 127.5).round().to(torch.uint8) for v in scenes(count=3)]
+    videos = views(1, count=3)
     config = TokenizerConfig(steps=5, batch_size=1, clip_frames=9, checkpoint_every=2)
 
     def fresh() -> PatchTokenizer:
@@ -139,10 +142,10 @@ def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path, monkeyp
     whole = fresh()
     train_decoder(whole, videos, config, tmp_path / "whole")
 
-    def failing(videos: list[torch.Tensor], config: TokenizerConfig, step: int) -> torch.Tensor:
+    def failing(tokenizer: PatchTokenizer, views: list[RecordedView], config: TokenizerConfig, step: int) -> Any:
         if step == 3:
             raise KeyboardInterrupt("stopped at step 3")
-        return decoder_batch(videos, config, step)
+        return decoder_batch(tokenizer, views, config, step)
 
     with monkeypatch.context() as patch:
         patch.setattr("worldline_core.training.train_tokenizer.decoder_batch", failing)
@@ -155,10 +158,13 @@ def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path, monkeyp
 
 
 def test_batches_depend_on_the_step_alone_and_disturbance_spares_the_first_frame(fitted: PatchTokenizer) -> None:
-    videos = [((v + 1) * 127.5).round().to(torch.uint8) for v in scenes()]
+    videos = views(1)
     config = TokenizerConfig(batch_size=2, clip_frames=9)
-    assert torch.equal(decoder_batch(videos, config, 7), decoder_batch(videos, config, 7))
-    assert not torch.equal(decoder_batch(videos, config, 7), decoder_batch(videos, config, 8))
+    one, again, other = (decoder_batch(fitted, videos, config, step) for step in (7, 7, 8))
+    assert one.names == again.names
+    assert torch.equal(one.video, again.video)
+    assert torch.equal(one.coarse, again.coarse)
+    assert not torch.equal(one.video, other.video)
     latents = fitted.encode(scenes())
     disturbed = disturb(latents, 0.3, torch.Generator().manual_seed(0))
     assert torch.equal(disturbed[:, :, 0], latents[:, :, 0])

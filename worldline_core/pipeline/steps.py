@@ -146,11 +146,12 @@ _STEPS = (
     ),
     Step(
         "train_tokenizer",
-        1,
+        2,
         "worldline_core.training.train_tokenizer",
         "train_tokenizer",
         "TokenizerConfig",
         ("episodes",),
+        ("start", "held_out"),
         summary="fit the small video tokenizer of the embedded default",
     ),
     Step(
@@ -164,7 +165,7 @@ _STEPS = (
     ),
     Step(
         "train_segmenter",
-        1,
+        2,
         "worldline_core.evaluation.segmenters.train_segmenter",
         "train_segmenter",
         "SegmenterConfig",

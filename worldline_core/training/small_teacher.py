@@ -28,8 +28,8 @@ from torch.nn import functional
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.training.recorded_views import RecordedView, load_views
 from worldline_core.training.trainer import (
     Objective,
     OptimizerConfig,
@@ -220,32 +220,16 @@ class MaskedVideoObjective(Objective[FrameBatch]):
         return self.teacher.masked_loss(batch.frames, hidden), {}
 
 
-class FrameClips:
-    """Recordings held in memory at the teacher's size, and deterministic batches from them."""
-
-    def __init__(self, episodes: EpisodeSet, chosen: Sequence[int], config: TeacherConfig, seed: int) -> None:
-        self.config = config
-        self.seed = seed
-        self.names: list[str] = []
-        self.videos: list[np.ndarray] = []
-        for position in chosen:
-            row = episodes.rows[position]
-            for view in row.views:
-                video = frames_to_video(episodes.frames(position, view), config.shape.image_size)
-                self.names.append(f"{row.episode_id}/{view}")
-                self.videos.append(((video + 1) * 127.5).round().to(torch.uint8).numpy())
-
-    def load(self, index: int) -> FrameBatch:
-        """Batch ``index``: a pure function of the seed and the index."""
-        random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
-        names, frames = [], []
-        for _ in range(self.config.trainer.batch_size):
-            number = int(random.integers(len(self.videos)))
-            start = int(random.integers(self.videos[number].shape[1] - self.config.clip_frames + 1))
-            names.append(self.names[number])
-            frames.append(self.videos[number][:, start : start + self.config.clip_frames])
-        stacked = torch.from_numpy(np.stack(frames)).to(self.config.trainer.device)
-        return FrameBatch(tuple(names), stacked.float() / 255.0)
+def teacher_batch(views: Sequence[RecordedView], config: TeacherConfig, seed: int, index: int) -> FrameBatch:
+    """Batch ``index``: a pure function of the seed and the index."""
+    random = np.random.Generator(np.random.Philox(key=[seed, index]))
+    names, frames = [], []
+    for _ in range(config.trainer.batch_size):
+        view = views[int(random.integers(len(views)))]
+        start = int(random.integers(view.frames.shape[1] - config.clip_frames + 1))
+        names.append(view.name)
+        frames.append(view.frames[:, start : start + config.clip_frames])
+    return FrameBatch(tuple(names), torch.stack(frames).to(config.trainer.device).float() / 255.0)
 
 
 def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -272,25 +256,26 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
     teacher.initialise(torch.Generator().manual_seed(config.trainer.seed))
     teacher.to(config.trainer.device).train()
     objective = MaskedVideoObjective(teacher, config.hidden)
-    training = FrameClips(episodes, chosen, config, config.trainer.seed)
-    validation = FrameClips(episodes, held_out, config, VALIDATION_SEED)
+    training = load_views(episodes, chosen, config.shape.image_size, config.clip_frames)
+    validation = load_views(episodes, held_out, config.shape.image_size, config.clip_frames)
 
     def validate() -> dict[str, float]:
         total = 0.0
         for index in range(config.trainer.validation_batches):
             generator = step_generator(VALIDATION_SEED, index, config.trainer.device)
             with autocast(config.trainer):
-                total += objective.loss(validation.load(index), generator, 0)[0].item()
+                batch = teacher_batch(validation, config, VALIDATION_SEED, index)
+                total += objective.loss(batch, generator, 0)[0].item()
         return {"loss": total / max(1, config.trainer.validation_batches)}
 
     result = train(
         config.trainer,
         groups=[ParameterGroup("teacher", dict(teacher.named_parameters()))],
         objective=objective,
-        load=training.load,
+        load=lambda index: teacher_batch(training, config, config.trainer.seed, index),
         validate=validate,
         output=output,
-        identity={"config": config.model_dump(mode="json"), "episodes": training.names},
+        identity={"config": config.model_dump(mode="json"), "episodes": [view.name for view in training]},
         title="teacher",
     )
     weights = {name: value.to("cpu", torch.float16).contiguous() for name, value in sorted(result.average.items())}

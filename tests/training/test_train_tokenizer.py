@@ -1,0 +1,63 @@
+"""The train_tokenizer step: from scratch, from another tokenizer, measured on another set."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from worldline_core.errors import ArtifactError
+from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.pipeline.steps import get_step
+from worldline_core.training.train_tokenizer import TokenizerConfig, train_tokenizer
+
+CONFIG = TokenizerConfig(
+    image_size=(32, 32),
+    channels=8,
+    refinement_width=4,
+    refinement_depth=1,
+    held_out_episodes=1,
+    clip_frames=9,
+    fit_clips=6,
+    steps=3,
+    batch_size=1,
+)
+
+
+@pytest.fixture(scope="module")
+def trained(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    train_tokenizer(CONFIG, {"episodes": world.episodes}, folder)
+    return folder
+
+
+def test_the_step_writes_a_tokenizer_its_losses_and_its_metrics(trained: Path) -> None:
+    metrics = json.loads((trained / "metrics.json").read_text())
+    assert metrics["training_episodes"] == 6
+    assert metrics["training_views"] == 18
+    assert metrics["held_out"]["psnr/decoded"] > 10
+    rows = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["step"] == 3
+    assert PatchTokenizer.load(trained).latent_channels == 8
+
+
+def test_a_decoder_is_trained_further_on_the_bases_of_its_start(world: Any, trained: Path, tmp_path: Path) -> None:
+    inputs = {"episodes": world.episodes, "start": trained, "held_out": world.episodes}
+    get_step("train_tokenizer").check_inputs(inputs)
+    metrics = train_tokenizer(CONFIG, inputs, tmp_path)
+    before, after = PatchTokenizer.load(trained), PatchTokenizer.load(tmp_path)
+    assert after.encoder_digest == before.encoder_digest
+    assert not torch.equal(after.refinement.leave.bias, before.refinement.leave.bias)
+    assert metrics["held_out_episodes"] == 1
+    # A state of this training is no state of another start.
+    with pytest.raises(ArtifactError, match=r"belongs to another run[\s\S]*give it the start"):
+        train_tokenizer(CONFIG, {"episodes": world.episodes}, tmp_path)
+
+
+def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> None:
+    train_tokenizer(CONFIG.model_copy(update={"steps": 0}), {"episodes": world.episodes}, tmp_path)
+    assert not (tmp_path / "metrics.jsonl").exists()
+    assert PatchTokenizer.load(tmp_path).latent_channels == 8
