@@ -1,19 +1,16 @@
-"""Full-frame metrics, frame by frame: PSNR and SSIM (appendix "Full-frame metrics" of the paper).
+"""Metrics of predicted videos, frame by frame; means over time are taken by the caller, per trajectory and view.
 
-The conditioning frame counts like every other. Means are taken over time by the caller, per trajectory and view.
+Full frame: PSNR and SSIM (appendix "Full-frame metrics" of the paper). The conditioning frame counts like every other.
 
-Robot-mask IoU by the paper's rules (appendix "Robot-mask IoU"; docs/method.md section 6). Head view only.
+Robot-mask IoU, head view only (appendix "Robot-mask IoU"). A frame in which both masks are empty is left out; one in
+which only one is empty counts 0. A video whose masks are empty in every frame is left out.
 
-A frame in which both masks are empty is left out; one in which only one is empty counts 0. Valid frames are averaged
-within a video, then videos are averaged. A video whose masks are empty in every frame is left out.
-
-End-effector error: how far from the commanded place the gripper appears in a predicted video.
-
-The paper has no such metric; this is this project's definition. Around the projected tool centre of a frame a patch of
-the *true* frame is taken, and the place where it fits the *predicted* frame best (normalised correlation) is searched
-within a radius. The distance from that place to the projected point is the error [px of the recording's frame]. A
-gripper that correlates with nothing in reach counts with the search radius. True videos score 0 by construction; a
-video in which the robot does not move scores about the distance it should have moved, at most the radius.
+End-effector error: how far from the commanded place the gripper appears. The paper has no such metric. Around the
+projected tool centre of a frame a patch of the *true* frame is taken, and the place where it fits the *predicted* frame
+best (normalised correlation) is searched within a radius. The distance from that place to the projected point is the
+error [px of the recording's frame]. A gripper that correlates with nothing within reach counts with the search radius.
+True videos score 0 by construction; a video in which the robot does not move scores about the distance it should have
+moved, at most the radius.
 """
 
 from __future__ import annotations
@@ -35,6 +32,10 @@ from worldline_core.errors import DataError
 QUANTISATION_MSE = 1.0 / (12.0 * 255.0**2)
 MAX_PSNR_DB = -10.0 * math.log10(QUANTISATION_MSE)
 
+PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the gripper and some of what is behind it
+MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
+SEARCH_FRACTION = 0.25  # search radius, of the frame height
+MIN_CORRELATION = 0.4
 _WINDOW = 11
 _WINDOW_SIGMA = 1.5
 _K1, _K2 = 0.01, 0.03
@@ -121,12 +122,6 @@ def video_iou(true: np.ndarray, predicted: np.ndarray) -> float | None:
     values = frame_iou(true, predicted)
     valid = values[~np.isnan(values)]
     return float(valid.mean()) if valid.size else None
-
-
-PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the gripper and some of what is behind it
-MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
-SEARCH_FRACTION = 0.25  # search radius, of the frame height
-MIN_CORRELATION = 0.4
 
 
 def end_effector_error(true: np.ndarray, predicted: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -5,20 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
-
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.rollout.rollout_set import RolloutSet
 
 ROLLOUT_PREFIX = "rollouts."
 TRUE_METHOD = "true"
+
+
+@dataclass(frozen=True)
+class SeenVideo:
+    """One recorded or predicted video, as judges and selectors are given it.
+
+    Attributes:
+        frames: by view, uint8 (n, h, w, 3); the views are synchronised.
+        num_frames: of the shortest view.
+        points: (num_frames, arms, 2) projected tool centres in the head view [px], NaN where not valid; or None.
+    """
+
+    frames: Mapping[str, np.ndarray]
+    num_frames: int
+    points: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -30,8 +42,7 @@ class Recordings:
 
     @classmethod
     def open(cls, root: Path) -> Recordings:
-        from worldline_core.data.episodes.episode_set import EpisodeSet
-
+        """The recordings of an EpisodeSet's folder."""
         episodes = EpisodeSet.open(root)
         return cls(episodes, {row.episode_id: index for index, row in enumerate(episodes.rows)})
 
@@ -59,6 +70,24 @@ class Recordings:
         frames = self.episodes.frames(self.position[episode_id], view)
         return _leading(frames, num_frames, f"recorded video of {episode_id}, view {view}")
 
+    def seen_video(
+        self,
+        episode_id: str,
+        wanted: Sequence[str],
+        *,
+        rollout: RolloutSet | None,
+        seed: int,
+        tracks: ActionTracks | None,
+    ) -> SeenVideo:
+        """The recorded video of an episode in the ``wanted`` views, or its prediction in ``rollout``."""
+        frames = {
+            view: self.frames(episode_id, view) if rollout is None else rollout.frames(episode_id, view, seed)
+            for view in self.views(episode_id, wanted)
+        }
+        count = min(len(video) for video in frames.values())
+        points = None if tracks is None else tool_points(tracks, episode_id, "head", count)
+        return SeenVideo(frames, count, points)
+
     def robot_masks(self, episode_id: str, view: str, num_frames: int | None = None) -> np.ndarray | None:
         """Exact bool masks (n, h, w) where the recording carries them, otherwise None."""
         masks = self.episodes.robot_masks(self.position[episode_id], view)
@@ -77,8 +106,6 @@ def _leading(values: np.ndarray, count: int | None, where: str) -> np.ndarray:
 
 def open_tracks(root: Path | None) -> ActionTracks | None:
     """The ActionTracks of an optional input."""
-    from worldline_core.actions.episode_tracks import ActionTracks
-
     return None if root is None else ActionTracks.open(root)
 
 
@@ -96,8 +123,6 @@ def open_rollouts(inputs: Mapping[str, Path]) -> dict[str, RolloutSet]:
 
     Raises: ArtifactError without any.
     """
-    from worldline_core.rollout.rollout_set import RolloutSet
-
     sets = {
         name.removeprefix(ROLLOUT_PREFIX): RolloutSet.open(path)
         for name, path in sorted(inputs.items())

@@ -1,11 +1,7 @@
-"""Scores: one tidy table, one value a row, and a summary with intervals.
+"""Scores: one tidy table, one value per row, and a summary with seeded bootstrap intervals and paired differences.
 
-A row's ``value`` is already the mean over time of one trajectory, view and seed. Summaries weight trajectory-view
-pairs equally and resample trajectories.
-
-Intervals over trajectories: seeded bootstrap and paired differences.
-
-A trajectory is the unit of resampling: its views, seeds and frames are not independent of each other.
+A row's ``value`` is already the mean over time of one trajectory, view and seed. Summaries weight trajectory-view pairs
+equally. Trajectories are what is resampled: their views, seeds and frames are not independent of each other.
 """
 
 from __future__ import annotations
@@ -57,7 +53,7 @@ def bootstrap_mean(
     weight = np.ones_like(sample) if weights is None else np.asarray(weights, dtype=np.float64)
     if sample.ndim != 1 or sample.size == 0 or not np.isfinite(sample).all() or weight.shape != sample.shape:
         raise DataError(
-            "A bootstrap needs finite values, one a trajectory",
+            "A bootstrap needs finite values, one per trajectory",
             expected="a non-empty, finite vector (and weights of the same length)",
             got=f"shape {sample.shape}, weights {weight.shape}, {int((~np.isfinite(sample)).sum())} not finite",
         )

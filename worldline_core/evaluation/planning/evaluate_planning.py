@@ -2,9 +2,7 @@
 
 Every method's videos of the same banks go through the same brackets. Labels stay sealed: they are opened once all
 choices of all methods are on disk. The recorded videos are chosen from too (method ``true``): that is the selector's
-own ceiling.
-
-After the choices: opening the sealed labels, success against the number of candidates, gain over direct execution.
+own ceiling. Reported are success against the number of candidates and the gain over direct execution.
 """
 
 from __future__ import annotations
@@ -13,27 +11,48 @@ import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field
+from tqdm import tqdm
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, Score, bootstrap_mean, write_scores
-from worldline_core.evaluation.vlm.vlm_config import VLMConfig
+from worldline_core.evaluation.planning.bracket import choose, describe, shown_order
+from worldline_core.evaluation.planning.selectors import (
+    CandidateVideo,
+    MeasuredSelector,
+    Selector,
+    ShownFrames,
+    VLMSelector,
+    planning_indices,
+)
+from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts, open_tracks
+from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, Score, bootstrap_mean, write_scores, write_table
+from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
+from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
-
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode_set import EpisodeRow
-    from worldline_core.evaluation.planning.selectors import CandidateVideo, Selector
-    from worldline_core.evaluation.recordings import Recordings
-
 
 CHOICES_FILE = "choices.parquet"
 SEALED_FILE = "sealed_outcomes.parquet"
+DIRECT = "direct_execution"
+_CHOICE_SCHEMA = pa.schema(
+    [
+        ("method", pa.string()),
+        ("bank", pa.string()),
+        ("run", pa.int32()),
+        ("budget", pa.int32()),
+        ("episode_id", pa.string()),
+        ("trace", pa.string()),
+    ]
+)
 
 
 class PlanningConfig(StrictModel):
@@ -41,9 +60,7 @@ class PlanningConfig(StrictModel):
 
     selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()
-    segmenter: Literal["learned", "colour", "sam3"] = Field(
-        default="learned", description="used by the measured selector"
-    )
+    segmenter: SegmenterName = Field(default="learned", description="used by the measured selector")
     sam3_weights: Path | None = None
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
     budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
@@ -60,12 +77,9 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     Inputs: banks, rollouts.<method>; tracks and segmenter where the selector uses them.
     Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json.
     """
-    from tqdm import tqdm
-
-    from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
-
     recordings = Recordings.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
+    tracks = open_tracks(inputs.get("tracks"))
     banks = list_banks(recordings.episodes.rows)
     selector = open_selector(config, inputs.get("segmenter"))
     choices: list[dict[str, Any]] = []
@@ -73,10 +87,11 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
         for bank, rows in tqdm(banks.items(), desc=f"evaluate_planning {method}", unit="bank", disable=None):
             part = output / "run" / "parts" / method / f"{bank}.json"
             if not part.exists():
-                load = _Loader(config, recordings, inputs.get("tracks"), rollouts.get(method), method, rows)
+                load = _Candidates(config, recordings, tracks, rollouts.get(method), method, rows)
                 write_json_atomic(part, _choose_in_bank(config, selector, bank, rows, load))
             choices += [{"method": method, "bank": bank, **choice} for choice in json.loads(part.read_text())]
-    _write_choices(output, choices)
+    table = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
+    write_table(output / CHOICES_FILE, table, _CHOICE_SCHEMA)
     # Only now: nothing above has read, or could read, how any candidate ended.
     outcomes = read_outcomes(
         inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
@@ -109,26 +124,18 @@ def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
 def open_selector(config: PlanningConfig, segmenter: Path | None) -> Selector:
     """The selector that the config names."""
     if config.selector == "measured":
-        from worldline_core.evaluation.planning.selectors import MeasuredSelector
-        from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-
         return MeasuredSelector(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
-    from worldline_core.evaluation.planning.selectors import VLMSelector
-    from worldline_core.evaluation.vlm.vlm_config import open_vlm
-
     return VLMSelector(open_vlm(config.selector, config.vlm))
 
 
 def _choose_in_bank(
-    config: PlanningConfig, selector: Selector, bank: str, rows: list[EpisodeRow], load: _Loader
+    config: PlanningConfig, selector: Selector, bank: str, rows: list[EpisodeRow], load: _Candidates
 ) -> list[dict[str, Any]]:
-    """One choice a run and budget; budgets larger than the bank are left out.
+    """One choice per run and budget; budgets larger than the bank are left out.
 
     The paper samples a new bank for every run. Here a run is another order of the same bank (the first one is the
     recorded order), which changes what the smaller budgets contain.
     """
-    from worldline_core.evaluation.planning.bracket import choose, describe, shown_order
-
     results = []
     for run in range(config.runs):
         numbers = list(range(len(rows)))
@@ -141,81 +148,48 @@ def _choose_in_bank(
     return results
 
 
-class _Loader:
-    """Videos of one bank's candidates, decoded once."""
+class _Candidates:
+    """Videos of one bank's candidates by one method, decoded once."""
 
     def __init__(
         self,
         config: PlanningConfig,
         recordings: Recordings,
-        tracks: Path | None,
-        rollout: Any | None,
+        tracks: ActionTracks | None,
+        rollout: RolloutSet | None,
         method: str,
         rows: list[EpisodeRow],
     ) -> None:
-        from worldline_core.evaluation.recordings import open_tracks
-
-        self.config, self.recordings, self.rollout, self.method, self.rows = config, recordings, rollout, method, rows
-        self.tracks = open_tracks(tracks)
+        self.config, self.recordings, self.tracks, self.rollout, self.rows = config, recordings, tracks, rollout, rows
         self.kept: dict[int, CandidateVideo] = {}
-        if rollout is not None:
-            missing = [row.episode_id for row in rows if row.episode_id not in rollout.episode_ids]
-            if missing:
-                raise ArtifactError(
-                    "A method has not predicted every candidate of a bank",
-                    where=f"method {method}, bank {rows[0].bank}",
-                    got=f"{len(missing)} missing, for example {missing[0]}",
-                    next_step="roll out all candidates with this method",
-                )
+        predicted = {row.episode_id for row in rows} if rollout is None else set(rollout.episode_ids)
+        missing = [row.episode_id for row in rows if row.episode_id not in predicted]
+        if missing:
+            raise ArtifactError(
+                "A method has not predicted every candidate of a bank",
+                where=f"method {method}, bank {rows[0].bank}",
+                got=f"{len(missing)} missing, for example {missing[0]}",
+                next_step="roll out all candidates with this method",
+            )
 
     def __call__(self, candidate: int) -> CandidateVideo:
-        from worldline_core.evaluation.planning.selectors import CandidateVideo, ShownFrames, planning_indices
-        from worldline_core.evaluation.recordings import tool_points
-
+        """The frames that are shown of a candidate (its number in the bank)."""
         if candidate not in self.kept:
             row = self.rows[candidate]
-            videos = {
-                view: (
-                    self.recordings.frames(row.episode_id, view)
-                    if self.rollout is None
-                    else self.rollout.frames(row.episode_id, view, self.rollout.seeds(row.episode_id)[0])
-                )
-                for view in self.recordings.views(row.episode_id, self.config.views)
-            }
-            count = min(len(video) for video in videos.values())
-            indices = planning_indices(count)
-            points = None if self.tracks is None else tool_points(self.tracks, row.episode_id, "head", count)
+            seed = 0 if self.rollout is None else self.rollout.seeds(row.episode_id)[0]
+            video = self.recordings.seen_video(
+                row.episode_id, self.config.views, rollout=self.rollout, seed=seed, tracks=self.tracks
+            )
+            indices = planning_indices(video.num_frames)
             self.kept[candidate] = CandidateVideo(
                 label="",
-                shown=ShownFrames({view: video[list(indices)] for view, video in videos.items()}),
+                shown=ShownFrames({view: frames[list(indices)] for view, frames in video.frames.items()}),
                 indices=indices,
                 fps=row.fps,
-                total_frames=count,
-                points=None if points is None else points[list(indices)],
+                total_frames=video.num_frames,
+                points=None if video.points is None else video.points[list(indices)],
             )
         return self.kept[candidate]
-
-
-def _write_choices(output: Path, choices: list[dict[str, Any]]) -> None:
-    import pyarrow as pa
-
-    from worldline_core.evaluation.scores import write_table
-
-    schema = pa.schema(
-        [
-            ("method", pa.string()),
-            ("bank", pa.string()),
-            ("run", pa.int32()),
-            ("budget", pa.int32()),
-            ("episode_id", pa.string()),
-            ("trace", pa.string()),
-        ]
-    )
-    rows = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
-    write_table(output / CHOICES_FILE, rows, schema)
-
-
-DIRECT = "direct_execution"
 
 
 def read_outcomes(path: Path, episode_ids: Sequence[str]) -> dict[str, bool]:

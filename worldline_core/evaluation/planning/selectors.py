@@ -1,10 +1,7 @@
-"""The selector: whoever compares candidate videos. It sees letters and pictures, never identities or outcomes.
+"""Selectors compare candidate videos. They see letters and pictures, never identities or outcomes.
 
-The embedded default selector: ranks candidates by the measured judge's facts, softened.
-
-A selector that asks a vision-language model, with the paper's prompts.
-
-Prompts P1 and P2 of the paper's appendix "Embodied Planning"; their content is kept as printed.
+`MeasuredSelector` (default) ranks by the measured judge's facts with soft thresholds; `VLMSelector` asks a
+vision-language model by the prompts P1 and P2 of the paper's appendix "Embodied Planning", kept as printed.
 """
 
 from __future__ import annotations

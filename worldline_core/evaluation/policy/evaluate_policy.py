@@ -1,9 +1,8 @@
 """The step evaluate_policy: does a judge who sees only predicted videos agree with what really happened?
 
 Judged are the same trajectories for every method, as many successes as failures in every split and task family. The
-recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling.
-
-Accuracy of verdicts: pooled per seed, averaged over seeds; by split and task family; with intervals.
+recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling. Accuracy is pooled per seed
+and averaged over seeds, by split and task family, with intervals.
 """
 
 from __future__ import annotations
@@ -13,25 +12,41 @@ import logging
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
+import pyarrow as pa
 from pydantic import Field
+from tqdm import tqdm
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
-from worldline_core.evaluation.vlm.vlm_config import VLMConfig
+from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.evaluation.policy.judge import Judge, Judgement, Trajectory, judge_trajectory
+from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
+from worldline_core.evaluation.policy.vlm_judge import VLMJudge
+from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts, open_tracks
+from worldline_core.evaluation.scores import (
+    SUMMARY_FILE,
+    Score,
+    bootstrap_mean,
+    paired_difference,
+    write_scores,
+    write_table,
+)
+from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
+from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
 from worldline_core.store.atomic import write_json_atomic
-
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode import Episode
-    from worldline_core.evaluation.policy.judge import Judge
-
 
 logger = logging.getLogger(__name__)
 
 DECISIONS_FILE = "decisions.parquet"
 _OUTCOMES = ("success", "failure")
+_ALL = "all"
+_COLUMNS = (
+    "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "instruction", "outcome",
+    "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
+)  # fmt: skip
+_INTEGERS = {"seed", "answers", "malformed_answers"}
 
 
 class PolicyEvaluationConfig(StrictModel):
@@ -39,7 +54,7 @@ class PolicyEvaluationConfig(StrictModel):
 
     judge: Literal["measured", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()
-    segmenter: Literal["learned", "colour", "sam3"] = Field(default="learned", description="used by the measured judge")
+    segmenter: SegmenterName = Field(default="learned", description="used by the measured judge")
     sam3_weights: Path | None = None
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
     splits: tuple[str, ...] = ("test", "ood_test")
@@ -55,11 +70,6 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
     Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json.
     """
-    from tqdm import tqdm
-
-    from worldline_core.evaluation.policy.judge import Trajectory, judge_trajectory
-    from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts, open_tracks, tool_points
-
     recordings = Recordings.open(inputs["episodes"])
     rollouts = open_rollouts(inputs)
     tracks = open_tracks(inputs.get("tracks"))
@@ -76,18 +86,11 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
         for method, seed in videos:
             part = output / "run" / "parts" / method / f"{name}.{seed}.json"
             if not part.exists():
-                frames = {
-                    view: (
-                        recordings.frames(name, view)
-                        if method == TRUE_METHOD
-                        else rollouts[method].frames(name, view, seed)
-                    )
-                    for view in recordings.views(name, config.views)
-                }
-                count = min(len(video) for video in frames.values())
-                points = None if tracks is None else tool_points(tracks, name, "head", count)
-                trajectory = Trajectory(episode.instruction, frames, episode.fps, points)
-                write_json_atomic(part, _verdict(judge_trajectory(judge, trajectory), count))
+                video = recordings.seen_video(
+                    name, config.views, rollout=rollouts.get(method), seed=seed, tracks=tracks
+                )
+                trajectory = Trajectory(episode.instruction, video.frames, episode.fps, video.points)
+                write_json_atomic(part, _verdict(judge_trajectory(judge, trajectory), video.num_frames))
             verdict = json.loads(part.read_text())
             if verdict["num_frames"] < episode.num_video_frames:
                 too_short[method] += 1  # the outcome may lie after the end of this video
@@ -100,8 +103,6 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
 
 def choose_trajectories(config: PolicyEvaluationConfig, episodes: Sequence[Episode]) -> list[Episode]:
     """As many successes as failures in every split and task family, drawn with the seed; sorted by episode."""
-    import numpy as np
-
     groups: dict[tuple[str, str], dict[str, list[Episode]]] = defaultdict(lambda: {name: [] for name in _OUTCOMES})
     for episode in episodes:
         if episode.split in config.splits and episode.outcome in _OUTCOMES:
@@ -123,17 +124,11 @@ def choose_trajectories(config: PolicyEvaluationConfig, episodes: Sequence[Episo
 def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
     """The judge that the config names."""
     if config.judge == "measured":
-        from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-        from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-
         return MeasuredEvidenceJudge(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
-    from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-    from worldline_core.evaluation.vlm.vlm_config import open_vlm
-
     return VLMJudge(open_vlm(config.judge, config.vlm))
 
 
-def _verdict(judgement: Any, num_frames: int) -> dict[str, Any]:
+def _verdict(judgement: Judgement, num_frames: int) -> dict[str, Any]:
     return {
         "num_frames": num_frames,
         "success": judgement.success,
@@ -168,13 +163,7 @@ def _row(method: str, seed: int, episode: Episode, verdict: dict[str, Any]) -> d
 def _write(
     config: PolicyEvaluationConfig, rows: list[dict[str, Any]], too_short: dict[str, int], judge: str, output: Path
 ) -> dict[str, Any]:
-    import pyarrow as pa
-
-    from worldline_core.evaluation.scores import SUMMARY_FILE, Score, write_scores, write_table
-
-    integers = {"seed", "answers", "malformed_answers"}
-    names = list(_SCHEMA_ORDER)
-    schema = pa.schema([(name, pa.int32() if name in integers else pa.string()) for name in names])
+    schema = pa.schema([(name, pa.int32() if name in _INTEGERS else pa.string()) for name in _COLUMNS])
     rows = sorted(rows, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
     write_table(output / DECISIONS_FILE, rows, schema)
     write_scores(
@@ -194,15 +183,6 @@ def _write(
     return {"trajectories": summary["trajectories"], "judge": judge, "accuracy": overall}
 
 
-_SCHEMA_ORDER = (
-    "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "instruction", "outcome",
-    "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
-)  # fmt: skip
-
-
-ALL = "all"
-
-
 def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
     """Accuracy of every method and group, and differences between methods.
 
@@ -215,14 +195,14 @@ def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, se
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
-        names = (ALL, row["split"], row["task_family"], f"{row['split']}/{row['task_family']}")
+        names = (_ALL, row["split"], row["task_family"], f"{row['split']}/{row['task_family']}")
         for name in dict.fromkeys(names):
             groups[row["method"], name].append(row)
     methods: dict[str, dict[str, Any]] = defaultdict(dict)
     by_trajectory: dict[str, dict[str, float]] = {}
     for (method, group), members in sorted(groups.items()):
         per_trajectory, per_seed = _means(members, "episode_id"), _means(members, "seed")
-        if group == ALL:
+        if group == _ALL:
             by_trajectory[method] = per_trajectory
         interval = bootstrap_mean(list(per_trajectory.values()), resamples=resamples, seed=seed)
         confusion = {"true_success": 0, "false_success": 0, "true_failure": 0, "false_failure": 0}

@@ -1,16 +1,11 @@
-"""Evidence schemas of the task families (prompts P3..P5 of the paper).
+"""Evidence of the task families, which family an instruction belongs to, and the rules that decide from evidence.
 
-A fact is true, false, or null (hidden in every view). An answer that cannot be parsed becomes evidence in which every
-fact is null: it is counted, and rules never take null for success.
+Schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view). An answer that cannot be
+parsed becomes evidence in which every fact is null; it is counted.
 
-Instruction to task family: which evidence is asked for (appendix "Evidence-based trajectory evaluation").
-
-Placing is a state change: what counts is where the object ends. The paper does not print its router; this one goes by
-the verbs.
-
-Deterministic rules from evidence to a decision (appendix "Evidence-based trajectory evaluation").
-
-Only facts that are stated decide: a null is never taken for the favourable value, and a wrong object or a drop fails.
+Router and rules: appendix "Evidence-based trajectory evaluation". Placing is a state change: what counts is where the
+object ends. The paper does not print its router; this one goes by the verbs. Only facts that are stated decide: a null
+is never taken for the favourable value, and a wrong object or a drop fails.
 """
 
 from __future__ import annotations
@@ -88,39 +83,12 @@ SCHEMAS: dict[EvidenceFamily, type[GraspEvidence] | type[LiftEvidence] | type[St
 }
 
 
-_STATE_CHANGE = [
-    "place",
-    "put",
-    "set",
-    "insert",
-    "stack",
-    "drop",
-    "pour",
-    "fold",
-    "open",
-    "close",
-    "press",
-    "push",
-    "pull",
-    "click",
-    "turn",
-    "rotate",
-    "switch",
-    "slide",
-    "move",
-    "hang",
-    "scoop",
-    "transfer",
-    "sweep",
-    "wipe",
-    "plug",
-    "screw",
-    "hand",
-    "give",
-    "pass",
-    "arrange",
-    "sort",
-]
+_STATE_CHANGE = (
+    "place", "put", "set", "insert", "stack", "drop", "pour", "fold",
+    "open", "close", "press", "push", "pull", "click", "turn", "rotate",
+    "switch", "slide", "move", "hang", "scoop", "transfer", "sweep", "wipe",
+    "plug", "screw", "hand", "give", "pass", "arrange", "sort",
+)  # fmt: skip
 _LIFT = ("lift", "pick", "raise", "hold up", "take")
 _GRASP = ("grasp", "grab", "grip", "seize", "hold")
 
@@ -139,7 +107,7 @@ def route(instruction: str) -> EvidenceFamily:
     return "grasp" if _contains(text, _GRASP) else "state_change"
 
 
-def _contains(text: str, words: list[str] | tuple[str, ...]) -> bool:
+def _contains(text: str, words: tuple[str, ...]) -> bool:
     endings = r"(?:s|es|ed|ing|ping|ting|ding)?"
     return any(re.search(rf"\b{re.escape(word.rstrip('e'))}e?{endings}\b", text) for word in words)
 

@@ -1,11 +1,8 @@
-"""The judge: whoever turns observations into evidence. Deciding is left to the rules.
+"""Judging one video: a judge states evidence, rules decide, and unsuccessful verdicts are verified.
 
-One trajectory's verdict: first pass, then conditional verification (appendix "Verification of unsuccessful predictions").
-
-A success of the first pass stands. Otherwise: six late groups at higher resolution where the views are several;
-logical reconciliation for state changes; a twelve-frame motion check for lifts and state changes.
-
-Which frames of a video a judge sees (appendix "Observation sampling" and "Verification").
+Which frames a judge sees: appendix "Observation sampling". A success of the first pass stands. Otherwise (appendix
+"Verification of unsuccessful predictions"): six late groups at higher resolution where there are several views; logical
+reconciliation for state changes; a twelve-frame motion check for lifts and state changes.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """The embedded default judge: the same evidence schemas, filled by measuring instead of by a language model.
 
-It follows things that the instruction names by colour. What it cannot see is null, like for any other judge.
-
-From measurements to the facts of the evidence schemas, and to a soft score for ranking.
-
-Thresholds and widths were chosen on training recordings only.
-
-One video and its instruction to one measurement: shared by the measured judge and the measured selector.
+It follows things that the instruction names by colour. What it cannot see is null, as for any other judge. `measure` and
+`score` also serve the measured selector of planning. Thresholds and widths were chosen on training recordings only.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A judge that asks a vision-language model, with the paper's prompts.
+"""A judge that asks a vision-language model.
 
 Prompts P3, P4 and P5 of the paper's appendix "Policy Evaluation"; their content is kept as printed.
 """
@@ -157,7 +157,7 @@ class VLMJudge:
     def inspect_motion(
         self, trajectory: Trajectory, indices: tuple[int, ...], earlier: str
     ) -> Extracted[MotionEvidence]:
-        """P5: one video a view."""
+        """P5: one video per view."""
         parts: list[Part] = []
         for view, frames in trajectory.frames.items():
             parts += [

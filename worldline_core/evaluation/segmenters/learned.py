@@ -1,9 +1,7 @@
-"""The learned segmenter: a small U-Net on single frames.
+"""The learned segmenter: a small U-Net on single frames, one robot logit per pixel.
 
 It sees neither points nor other frames, so it cannot know where the robot ought to be: what it marks in a predicted
 video is what that video shows.
-
-A small U-Net: one RGB frame in, one robot logit a pixel out.
 """
 
 from __future__ import annotations
@@ -25,6 +23,9 @@ from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metrics import frames_to_unit
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
+WEIGHTS_FILE = "model.safetensors"
+DESCRIPTION_FILE = "segmenter.json"
+_BATCH = 64
 _GROUPS = 8
 
 
@@ -75,11 +76,6 @@ def _double_convolution(cin: int, cout: int) -> nn.Sequential:
         nn.GroupNorm(_GROUPS, cout),
         nn.SiLU(),
     )
-
-
-WEIGHTS_FILE = "model.safetensors"
-DESCRIPTION_FILE = "segmenter.json"
-_BATCH = 64
 
 
 class LearnedSegmenter:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
 from worldline_core.evaluation.recordings import Recordings, tool_points
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.model.lpips import LPIPS
-
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.rollout.rollout_set import RolloutSet
 
 HEAD = "head"
 FrameValues = dict[str, list[float | None]]

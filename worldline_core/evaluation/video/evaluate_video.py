@@ -3,8 +3,7 @@
 Two robot IoUs are reported. ``robot_iou`` follows the paper: one segmenter masks the true and the predicted video
 independently of each other. ``robot_iou_exact`` compares the predicted video's mask with the recording's exact one.
 How good the segmenter itself is shows in the rows of the method ``true``: its masks of true frames against exact ones.
-
-Metrics against time: means over trajectories of every frame, to see drift along a rollout.
+Means over trajectories of every frame show drift along a rollout.
 """
 
 from __future__ import annotations
@@ -16,32 +15,45 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import pyarrow as pa
+import torch
 from pydantic import Field
+from tqdm import tqdm
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import UnavailableError
-from worldline_core.evaluation.scores import write_table
+from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
+from worldline_core.evaluation.scores import SUMMARY_FILE, Score, summarise, write_scores, write_table
+from worldline_core.evaluation.segmenters.segmenter import Segmenter, SegmenterName, open_segmenter
+from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
+from worldline_core.model.lpips import LPIPS, load_lpips
 from worldline_core.store.atomic import write_json_atomic
-
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode import Episode
-    from worldline_core.evaluation.segmenters.segmenter import Segmenter
-
 
 logger = logging.getLogger(__name__)
 
 BY_FRAME_FILE = "by_frame.parquet"
+_BY_FRAME_SCHEMA = pa.schema(
+    [
+        ("method", pa.string()),
+        ("split", pa.string()),
+        ("view", pa.string()),
+        ("metric", pa.string()),
+        ("frame", pa.int32()),
+        ("mean", pa.float64()),
+        ("count", pa.int32()),
+    ]
+)
 
 
 class VideoEvaluationConfig(StrictModel):
     """What evaluate_video measures."""
 
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
-    segmenters: tuple[Literal["learned", "colour", "sam3"], ...] = Field(
+    segmenters: tuple[SegmenterName, ...] = Field(
         default=("learned",), min_length=1, description="the first one names the metrics without a suffix"
     )
     sam3_weights: Path | None = Field(default=None, description="local folder of SAM 3 weights")
@@ -57,16 +69,9 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     """Measure every RolloutSet against the recordings.
 
     Inputs: episodes, tracks, rollouts.<method> (one or more), segmenter (the folder of the learned one).
-    Output: scores.parquet (one row a method, episode, view, seed and metric), by_frame.parquet (means over
+    Output: scores.parquet (one row per method, episode, view, seed and metric), by_frame.parquet (means over
     trajectories of each frame), summary.json.
     """
-    from tqdm import tqdm
-
-    from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
-    from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-    from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
-
     recordings = Recordings.open(inputs["episodes"])
     tracks = ActionTracks.open(inputs["tracks"])
     rollouts = open_rollouts(inputs)
@@ -107,12 +112,10 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
 
 @contextmanager
 def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
-    """One thread a core, each an episode at a time: decoding, GrabCut and small networks do not fill the cores alone.
+    """One thread per core, each an episode at a time: decoding, GrabCut and small networks do not fill the cores alone.
 
     Networks run on one thread then, so that results do not depend on the number of cores.
     """
-    import torch
-
     count = 1 if on_gpu else torch.get_num_threads()
     pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(torch.get_num_threads() // count,))
     try:
@@ -121,9 +124,7 @@ def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _open_lpips(folder: Path | None) -> tuple[Any | None, str | None]:
-    from worldline_core.model.lpips import load_lpips
-
+def _open_lpips(folder: Path | None) -> tuple[LPIPS | None, str | None]:
     try:
         return load_lpips(folder), None
     except UnavailableError as error:
@@ -138,10 +139,6 @@ def _write(
     lpips_reason: str | None,
     output: Path,
 ) -> dict[str, Any]:
-    from worldline_core.evaluation.recordings import TRUE_METHOD
-    from worldline_core.evaluation.scores import SUMMARY_FILE, Score, summarise, write_scores
-    from worldline_core.evaluation.video.episode_measurement import finite_mean
-
     scores: list[Score] = []
     by_frame: list[tuple[str, str, str, str, list[float | None]]] = []
     for method, episode, content in records:
@@ -185,19 +182,6 @@ def _write(
     return {"episodes": summary["num_episodes"], "methods": summary["methods"], "scores": len(scores)}
 
 
-BY_FRAME_SCHEMA = pa.schema(
-    [
-        ("method", pa.string()),
-        ("split", pa.string()),
-        ("view", pa.string()),
-        ("metric", pa.string()),
-        ("frame", pa.int32()),
-        ("mean", pa.float64()),
-        ("count", pa.int32()),
-    ]
-)
-
-
 def write_by_frame(path: Path, videos: Iterable[tuple[str, str, str, str, Sequence[float | None]]]) -> None:
     """Average per-frame values over videos.
 
@@ -210,15 +194,7 @@ def write_by_frame(path: Path, videos: Iterable[tuple[str, str, str, str, Sequen
             if value is not None:
                 cells[method, split, view, metric, frame].append(value)
     rows = [
-        {
-            "method": method,
-            "split": split,
-            "view": view,
-            "metric": metric,
-            "frame": frame,
-            "mean": sum(values) / len(values),
-            "count": len(values),
-        }
-        for (method, split, view, metric, frame), values in sorted(cells.items())
+        dict(zip(_BY_FRAME_SCHEMA.names, (*key, sum(values) / len(values), len(values)), strict=True))
+        for key, values in sorted(cells.items())
     ]
-    write_table(path, rows, BY_FRAME_SCHEMA)
+    write_table(path, rows, _BY_FRAME_SCHEMA)

@@ -1,6 +1,6 @@
-"""What is shown to a vision-language model: one user message of text, images and videos.
+"""What a vision-language model is shown (one user message of text, images and videos), and how its answer is read.
 
-Reading a model's JSON answer: tolerant of what surrounds it, strict about what it says.
+Reading a JSON answer is tolerant of what surrounds it and strict about what it says.
 """
 
 from __future__ import annotations
