@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode, EpisodeDescription
-from worldline_core.data.episodes.recorded_poses import camera_pose, rejected_as
+from worldline_core.data.episodes.episode import ARRAYS, Episode, EpisodeDescription
+from worldline_core.data.episodes.recorded_poses import rejected_as
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.plain_files import parse_json, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.cameras import intrinsics, lens
+from worldline_core.data.mcap.cameras import CalibratedCameras
 from worldline_core.data.mcap.file import McapFile, Stream, read_streams
 from worldline_core.data.mcap.images import EpisodeImages, ImageTrack
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
 from worldline_core.data.mcap.writer import EPISODE_METADATA, FORMAT_VERSION
-from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
 READABLE_VERSIONS = (1, FORMAT_VERSION)
@@ -90,18 +89,14 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         for transform in message:
             poses.setdefault(transform.child, []).append(transform)
 
-    cameras: dict[str, CameraTrack] = {}
-    lenses: dict[str, Distortion] = {}
+    cameras = CalibratedCameras()
     for view in moving:
-        topic = f"/{view}/calibration"
+        topic, frame = f"/{view}/calibration", f"{view}_camera"
         (calibration,) = _all_of(streams, topic, 1, file).values
-        where = f"{file.shown}, topic {topic}"
-        K, (height, width) = intrinsics(calibration, rectified=False, where=where)
-        pose = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
-        cameras[view] = CameraTrack.from_pose(view, K, camera_pose(view, pose, where=where), width=width, height=height)
-        distortion = lens(calibration, view, rectified=False, where=where)
-        if distortion is not None:
-            lenses[view] = distortion
+        camera_poses = _poses(poses, frame, num_frames if moving[view] else 1, file)
+        cameras.calibrate(
+            view, calibration, camera_poses, frame=f"{file.shown}, frame {frame}", topic=f"{file.shown}, topic {topic}"
+        )
     tools = [_poses(poses, f"tool_{arm}", num_frames, file) for arm in range(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
@@ -112,17 +107,17 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         state=state,
         action=action,
         timestamps=np.array(joints["state"].log_ns, dtype=np.float64) / 1e9,
-        cameras=cameras,
+        cameras=cameras.tracks,
         T_base_ee=np.stack(tools, axis=1) if tools else None,
         gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
         video_frames=about["video_frames"],
     )
-    reader = EpisodeImages(file, images, cameras, {view: f"/{view}/calibration" for view in moving})
+    reader = EpisodeImages(file, images, cameras.tracks, {view: f"/{view}/calibration" for view in moving})
 
     def robot_masks(view: str) -> np.ndarray | None:
         return np.stack([image[..., 0] > 127 for image in masks[view].frames(file)]) if view in masks else None
 
-    return LoadedEpisode(episode, views, reader, robot_masks, lenses)
+    return LoadedEpisode(episode, views, reader, robot_masks, cameras.lenses)
 
 
 def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:

@@ -130,7 +130,11 @@ class Timing:
             return np.array(stream.log_ns, np.int64)
         if not stream.headed:
             return np.array(stream.log_ns, np.int64) - self.to_clock_ns
-        return np.array(stream.stamps_ns, np.int64) + round(self.offsets_ms.get(stream.topic, 0.0) * 1e6)
+        return np.array(stream.stamps_ns, np.int64) + self.offset_ns(stream.topic)
+
+    def offset_ns(self, topic: str) -> int:
+        """What is added to a topic's header times."""
+        return round(self.offsets_ms.get(topic, 0.0) * 1e6)
 
     def notes(self) -> dict[str, str | float | int]:
         """What an episode's conventions say about its clocks."""

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldline_core.data.episodes.episode import Episode, Outcome
-from worldline_core.data.episodes.recorded_poses import repair_notes
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap import timing as resampling
-from worldline_core.data.mcap.cameras import TransformTree, camera_tracks, read_calibration, read_tree
+from worldline_core.data.mcap.cameras import CalibratedCameras, fixed_or_moving, read_calibration, read_tree
 from worldline_core.data.mcap.file import READING_MARGIN_NS, McapFile, Stream, read_streams
 from worldline_core.data.mcap.images import EpisodeImages, ImageTrack, spoiled_frames
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind
@@ -78,11 +77,11 @@ def read_topics_episode(
         )
         for view, topics in config.views.items()
     }
-    calibrations = {view: read_calibration(file, streams, topics) for view, topics in config.views.items()}
+    read = {view: read_calibration(file, streams, topics) for view, topics in config.views.items()}
+    calibrations = {view: calibration for view, calibration in read.items() if calibration is not None}
     frames = {
         view: (config.views[view].frame or calibration.frame or streams[config.views[view].image].frame).lstrip("/")
         for view, calibration in calibrations.items()
-        if calibration is not None
     }
     tree = read_tree(config, file, streams, timing, start_log, [*frames.values(), *robot.frames])
     clock = timing.to_clock_ns
@@ -95,13 +94,21 @@ def read_topics_episode(
     ]
     grid = _grid(config, file, images, robot, moving, extent)
     chosen = {view: _chosen_images(config, file, view, arrivals, grid) for view, arrivals in images.items()}
-    cameras, recorded, lenses = camera_tracks(config, tree, calibrations, frames, grid, file)
+    cameras = CalibratedCameras()
+    for view, frame in frames.items():
+        topics = config.views[view]
+        poses = fixed_or_moving(tree.poses(config.base_frame, frame, grid))
+        cameras.calibrate(
+            view, calibrations[view], poses, frame=f"{file.shown}, frame {frame}",
+            topic=f"{file.shown}, topic {topics.calibration}", rectified=topics.rectified,
+        )  # fmt: skip
     state, action, outside = robot.vectors(grid)
     tools = robot.tools(tree, config.base_frame, grid)
     errors = {f"image {view}": TimeError.of(arrivals.times_ns, grid) for view, arrivals in images.items()}
     errors |= robot.time_errors(grid)
     if moving:
         errors |= {"transforms": max((TimeError.of(times, grid) for times in moving), key=lambda error: error.max_ms)}
+    arrivals = [*images.values(), *robot.arrivals()]
     episode = Episode(
         episode_id=episode_id,
         source=config.label,
@@ -115,7 +122,7 @@ def read_topics_episode(
         state=state.astype(np.float32),
         action=action.astype(np.float32),
         timestamps=(grid - grid[0]) / 1e9,
-        cameras=cameras,
+        cameras=cameras.tracks,
         T_base_ee=tools,
         gripper=None if tools is None else state[:, robot.gripper_columns],
         primary_view=config.timing_view,
@@ -125,11 +132,13 @@ def read_topics_episode(
             **timing.notes(),
             **_resampling_notes(errors),
             "interpolation_error_rad": round(robot.prediction_error_rad(), 9),
-            **_message_notes([*images.values(), *robot.arrivals()], tree),
+            "messages_out_of_order": sum(each.disordered for each in arrivals) + tree.disordered,
+            "messages_repeated": sum(each.repeated for each in arrivals),
+            "messages_lost": sum(each.lost for each in arrivals),
             "repeated_images": sum(int(len(numbers) - len(np.unique(numbers))) for numbers in chosen.values()),
             "gripper_overshoot": outside,
             "action": "commanded" if robot.commanded else "repeats the state: no commands are recorded",
-            **repair_notes({view: pose.repair for view, pose in recorded.items()}),
+            **cameras.notes(),
         },
     )
     around = (
@@ -140,8 +149,9 @@ def read_topics_episode(
         view: _track(streams[topics.image], images[view], chosen[view], around, file)
         for view, topics in config.views.items()
     }
-    reader = EpisodeImages(file, tracks, cameras, {v: topics.calibration for v, topics in config.views.items()})
-    return LoadedEpisode(episode, tuple(config.views), reader, distortions=lenses)
+    topics_of = {view: topics.calibration for view, topics in config.views.items()}
+    reader = EpisodeImages(file, tracks, cameras.tracks, topics_of)
+    return LoadedEpisode(episode, tuple(config.views), reader, distortions=cameras.lenses)
 
 
 def _streams(
@@ -283,12 +293,4 @@ def _resampling_notes(errors: Mapping[str, TimeError]) -> dict[str, str | float 
             },
             sort_keys=True,
         ),
-    }
-
-
-def _message_notes(arrivals: list[Arrivals], tree: TransformTree) -> dict[str, str | float | int]:
-    return {
-        "messages_out_of_order": sum(each.disordered for each in arrivals) + tree.disordered,
-        "messages_repeated": sum(each.repeated for each in arrivals),
-        "messages_lost": sum(each.lost for each in arrivals),
     }
