@@ -150,7 +150,7 @@ class EpisodeDescription(EpisodeLabels):
 
     state_names: tuple[str, ...] | None = None
     state_kind: str = "joints"
-    conventions: Mapping[str, str | float | int] = field(default_factory=dict)
+    conventions: Mapping[str, str | float | int | bool] = field(default_factory=dict)
 
     def described(self) -> dict[str, Any]:
         """The fields as JSON values: what MCAP files and episodes that wait for their set hold."""

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import ARRAYS, VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode import ARRAYS, VIEWS, CameraTrack, Episode, EpisodeDescription
 from worldline_core.data.episodes.fingerprint import fingerprint
 from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.lerobot.v3_writer import EpisodeVideo
 from worldline_core.data.video.thumbnails import ViewThumbnails, write_thumbnails
 from worldline_core.errors import DataError
 
@@ -108,7 +109,7 @@ def _description(
 
 
 class Part:
-    """One waiting episode, read lazily."""
+    """One waiting episode. Its description is read at once (`part["split"]`, `part["fingerprint"]`), its arrays when asked for."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -118,55 +119,54 @@ class Part:
         return self.description[key]
 
     @cached_property
-    def arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> dict[str, np.ndarray]:
         with np.load(self.folder / "arrays.npz", allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
 
-    @property
-    def views(self) -> list[str]:
-        return [view for view, _, _ in self["views"]]
+    @cached_property
+    def episode(self) -> Episode:
+        """The episode as the set stores it: its times follow from its rate."""
+        arrays: dict[str, Any] = self._arrays
+        cameras = {
+            view: CameraTrack(view, arrays[f"K.{view}"], arrays[f"pose.{view}"], width, height)
+            for view, (width, height) in self["cameras"].items()
+        }
+        return Episode(
+            **EpisodeDescription.arguments(self.description),
+            **{name: arrays[name] for name in ARRAYS if name in arrays},
+            timestamps=np.arange(self["num_frames"]) / self["fps"],
+            cameras=cameras,
+            video_frames=self["video_frames"],
+        )
 
-    @property
-    def image_sizes(self) -> dict[str, tuple[int, int]]:
-        """(height, width) by view."""
-        return {view: (height, width) for view, height, width in self["views"]}
+    @cached_property
+    def videos(self) -> dict[str, EpisodeVideo]:
+        """By view, in the set's order."""
+        return {
+            view: EpisodeVideo(
+                path=self.folder / f"{view}.mp4",
+                size=(height, width),
+                histogram=self._arrays[f"histogram.{view}"],
+                thumbnails=self.folder / f"{view}.arrow",
+                **self["videos"][view],
+            )
+            for view, height, width in self["views"]
+        }
 
-    def video(self, view: str) -> Path:
-        return self.folder / f"{view}.mp4"
-
-    def copied(self, view: str) -> bool:
-        """Whether a view's video holds the packets of the recording, and so shares no file with other episodes."""
-        return bool(self["videos"][view]["copied"])
-
-    def thumbnails(self, view: str) -> Path:
-        """Where the thumbnails of a copied video lie (`thumbnail_cache`)."""
-        return self.folder / f"{view}.arrow"
-
-    def mask(self, view: str) -> np.ndarray:
-        """bool (N, H, W)."""
-        shape = self.description["masks"][view]
-        bits = np.unpackbits(self.arrays[f"mask.{view}"], count=int(np.prod(shape)))
-        return bits.reshape(shape).astype(bool)
-
-    def camera(self, view: str) -> CameraTrack:
-        width, height = self.description["cameras"][view]
-        return CameraTrack(view, self.arrays[f"K.{view}"], self.arrays[f"pose.{view}"], width, height)
+    def masks(self) -> dict[str, np.ndarray]:
+        """bool (N, H, W) by view."""
+        return {
+            view: np.unpackbits(self._arrays[f"mask.{view}"], count=int(np.prod(shape))).reshape(shape).astype(bool)
+            for view, shape in self["masks"].items()
+        }
 
     @property
     def signature(self) -> tuple[Any, ...]:
         """Episodes with equal signatures fit into one LeRobot dataset."""
-        names = self["state_names"]
-        return (
-            self["embodiment"],
-            self["fps"],
-            tuple(
-                (*item, self["videos"][item[0]]["codec"], self["videos"][item[0]]["pixel_format"])
-                for item in self["views"]
-            ),
-            self.arrays["state"].shape[1],
-            None if names is None else tuple(names),
-            self["state_kind"],
-        )
+        episode = self.episode
+        videos = tuple((view, video.size, video.codec, video.pixel_format) for view, video in self.videos.items())
+        columns = episode.state.shape[1]
+        return episode.embodiment, episode.fps, videos, columns, episode.state_names, episode.state_kind
 
 
 def read_parts(folder: Path) -> list[Part]:

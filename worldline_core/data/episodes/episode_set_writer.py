@@ -36,7 +36,7 @@ from worldline_core.data.episodes.episode_parts import (
 from worldline_core.data.episodes.sidecar import write_sidecar
 from worldline_core.data.episodes.view_recording import RecordedView, VideoMode, VideoSettings
 from worldline_core.data.guards.source_paths import safe_name
-from worldline_core.data.lerobot.v3_writer import DatasetEpisode, EpisodeVideo, write_dataset
+from worldline_core.data.lerobot.v3_writer import DatasetEpisode, write_dataset
 from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
@@ -209,7 +209,7 @@ class EpisodeSetWriter:
         rows: list[EpisodeRow] = []
         used: dict[str, int] = {}
         for members in groups.values():
-            embodiment = members[0]["embodiment"]
+            embodiment = members[0].episode.embodiment
             used[embodiment] = used.get(embodiment, 0) + 1
             name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
             dataset = self.root / "datasets" / name
@@ -238,47 +238,35 @@ def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
 
 
 def _dataset_episode(part: Part) -> DatasetEpisode:
-    videos = {
-        view: EpisodeVideo(
-            path=part.video(view),
-            size=part.image_sizes[view],
-            codec=part["videos"][view]["codec"],
-            pixel_format=part["videos"][view]["pixel_format"],
-            copied=part["videos"][view]["copied"],
-            histogram=part.arrays[f"histogram.{view}"],
-            thumbnails=part.thumbnails(view),
-        )
-        for view in part.views
-    }
+    episode = part.episode
     return DatasetEpisode(
-        instruction=part["instruction"],
-        embodiment=part["embodiment"],
-        fps=part["fps"],
-        num_frames=part["video_frames"],
-        state=part.arrays["state"][: part["video_frames"]],
-        action=part.arrays["action"][: part["video_frames"]],
-        state_names=part["state_names"],
-        videos=videos,
+        instruction=episode.instruction,
+        embodiment=episode.embodiment,
+        fps=episode.fps,
+        num_frames=episode.num_video_frames,
+        state=episode.state[: episode.num_video_frames],
+        action=episode.action[: episode.num_video_frames],
+        state_names=None if episode.state_names is None else list(episode.state_names),
+        videos=part.videos,
     )
 
 
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
-    views = tuple(part.views)
-    uncalibrated = any(view not in part["cameras"] for view in views)
-    stage2_reason = "missing_view" if len(views) < 2 else "missing_calibration" if uncalibrated else None
-    if part["state_kind"] == "none":
-        stage2_reason = "missing_actions"
+    episode, views = part.episode, tuple(part.videos)
+    reason = "missing_view" if len(views) < 2 else "missing_calibration" if set(views) - set(episode.cameras) else None
+    if episode.state_kind == "none":
+        reason = "missing_actions"
     return EpisodeRow(
-        **{name: part[name] for name in LABELS},
+        **{name: getattr(episode, name) for name in LABELS},
         dataset=dataset,
         episode_index=episode_index,
         start=0,
-        stop=part["num_frames"],
-        num_frames=part["num_frames"],
-        video_frames=part["video_frames"],
+        stop=episode.num_frames,
+        num_frames=episode.num_frames,
+        video_frames=episode.num_video_frames,
         views=views,
-        stage1_ok=part["primary_view"] in views,
-        stage2_ok=stage2_reason is None,
-        stage2_reason=stage2_reason,
-        conventions=json.dumps(part["conventions"], sort_keys=True),
+        stage1_ok=episode.primary_view in views,
+        stage2_ok=reason is None,
+        stage2_reason=reason,
+        conventions=json.dumps(dict(episode.conventions), sort_keys=True),
     )

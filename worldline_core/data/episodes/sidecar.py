@@ -57,8 +57,8 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
     folder = root / FOLDER
     cameras, masks, trajectories = [], [], []
     for index, part in enumerate(parts):
-        for view in part["cameras"]:
-            camera = part.camera(view)
+        episode = part.episode
+        for view, camera in episode.cameras.items():
             cameras.append(
                 {
                     "episode_index": index,
@@ -70,14 +70,13 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
                     "T_base_camera": camera.T_base_camera.reshape(-1).tolist(),
                 }
             )
-        for view in part["masks"]:
-            mask = part.mask(view)
+        for view, mask in part.masks().items():
             bits = zlib.compress(np.packbits(mask).tobytes(), 9)
             masks.append({"episode_index": index, "view": view, "shape": list(mask.shape), "bits": bits})
-        arms = part.arrays["T_base_ee"].shape[1] if "T_base_ee" in part.arrays else 0
-        if arms or part["video_frames"] != part["num_frames"]:
-            values = {name: part.arrays[name].reshape(-1).tolist() for name in ARRAYS if name in part.arrays}
-            trajectories.append({"episode_index": index, "num_frames": part["num_frames"], "num_arms": arms, **values})
+        arms = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
+        if arms or episode.num_video_frames != episode.num_frames:
+            values = {name: array.reshape(-1).tolist() for name, array in episode.arrays().items()}
+            trajectories.append({"episode_index": index, "num_frames": episode.num_frames, "num_arms": arms, **values})
     write_table_atomic(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
     if masks:
         write_table_atomic(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
@@ -88,14 +87,15 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
 
 def contract(part: Part) -> dict[str, Any]:
     """Units and conventions of a dataset, stated once."""
+    episode = part.episode
     return {
         "version": CONTRACT_VERSION,
-        "embodiment": part["embodiment"],
-        "fps": part["fps"],
-        "views": {view: {"height": size[0], "width": size[1]} for view, size in part.image_sizes.items()},
-        "state_kind": part["state_kind"],
-        "state_names": part["state_names"],
-        "action": "none" if part["state_kind"] == "none" else "commanded targets, same layout as the state",
+        "embodiment": episode.embodiment,
+        "fps": episode.fps,
+        "views": {view: {"height": video.size[0], "width": video.size[1]} for view, video in part.videos.items()},
+        "state_kind": episode.state_kind,
+        "state_names": episode.state_names,
+        "action": "none" if episode.state_kind == "none" else "commanded targets, same layout as the state",
         "units": {"angle": "rad", "length": "m", "time": "s", "image": "px"},
         "gripper": "0 closed .. 1 open",
         "camera_axes": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",

@@ -84,9 +84,9 @@ class TransformTree:
         """
         for transform, time_ns in zip(transforms, times_ns, strict=True):
             parent, child = transform.parent, transform.child
-            edge = self._edges.setdefault(
-                child, _Edge(parent, child, f"{self._where}, {parent} -> {child}", self._max_disorder_s)
-            )
+            if child not in self._edges:
+                self._edges[child] = _Edge(parent, child, f"{self._where}, {parent} -> {child}", self._max_disorder_s)
+            edge = self._edges[child]
             if edge.parent != parent:
                 raise RejectedInputError(
                     "invalid_extrinsics",
@@ -208,10 +208,11 @@ def read_tree(
 
     tree = read_static(config.static_transforms, None)
     for stream in (streams[topic] for topic in config.transforms if topic in streams):
+        offset_ns = timing.offset_ns(stream.topic)
         for transforms, time_ns in zip(stream.values, timing.times_ns(stream), strict=True):
             times = [int(time_ns)] * len(transforms)
             if timing.source == "header":  # every transform of a message has its own
-                times = [transform.stamp_ns + timing.offset_ns(stream.topic) for transform in transforms]
+                times = [transform.stamp_ns + offset_ns for transform in transforms]
             tree.add(transforms, times, static=False)
     if start_ns is not None and not all(tree.connected(config.base_frame, frame) for frame in wanted):
         tree.complete(read_static(config.transforms, start_ns))
