@@ -234,7 +234,7 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
 
 
 def _embodiment_list(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment_check import format_list, list_embodiments
+    from worldline_core.geometry.embodiment_listing import format_list, list_embodiments
 
     rows = list_embodiments()
     if arguments.json:
@@ -247,7 +247,7 @@ def _embodiment_list(arguments: argparse.Namespace) -> None:
 
 def _embodiment_show(arguments: argparse.Namespace) -> None:
     from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_check import describe_embodiment
+    from worldline_core.geometry.embodiment_listing import describe_embodiment
 
     print(describe_embodiment(load_embodiment(arguments.name, arguments.description)))
 

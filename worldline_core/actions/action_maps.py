@@ -67,7 +67,7 @@ def render_action_maps(
     Gaussian that lies inside. Float32 maps equal the equation to 1e-6 (for values up to 8: it is their rounding),
     float64 ones to 1e-12.
 
-    The Gaussian is a product of a row and a column profile, so the cost is that of one small matrix product a frame
+    The Gaussian is a product of a row and a column profile, so the cost is that of one small matrix product per frame
     and view. Differentiable in uv, depth, rot6d and gripper; runs on the device of the tracks. The profiles are
     computed in float64 (they are small), the products in `dtype`.
 

@@ -87,7 +87,7 @@ def _below(link: str, parents: dict[str, str]) -> list[str]:
 def tool_capsules(
     T_base_tool: Float[Tensor, "n a 4 4"], length: float = DEFAULT_TOOL_LENGTH_M, radius: float = DEFAULT_TOOL_RADIUS_M
 ) -> tuple[Float[Tensor, "n s 2 3"], Float[Tensor, " s"]]:
-    """One capsule an arm, from the tool back along its z axis: all that a source without joints tells."""
+    """One capsule per arm, from the tool back along its z axis: all that a source without joints tells."""
     tip = T_base_tool[..., :3, 3]
     back = tip - length * T_base_tool[..., :3, 2]
     return torch.stack([back, tip], dim=-2), torch.full((T_base_tool.shape[1],), radius, dtype=torch.float64)

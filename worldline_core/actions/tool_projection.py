@@ -91,7 +91,7 @@ def _project(
     cameras = torch.where(calibrated[..., None, None], cameras, eye)
     intrinsics = torch.where(calibrated[..., None, None], intrinsics, eye[:3, :3])
 
-    # One product a frame turns the x axis, the y axis and the origin of all tools into all cameras: rows are those of
+    # One product per frame turns the x axis, the y axis and the origin of all tools into all cameras: rows are those of
     # R_camera_base of each view, columns those of each tool. The third axis and the last row are never needed.
     R_base_camera, origin = cameras[..., :3, :3], cameras[..., :3, 3]
     turns = rearrange(R_base_camera, "... v j i -> ... (v i) j")

@@ -115,11 +115,11 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
 
 def set_headline(found: SetDiagnosis) -> str:
     """The conclusion over a source in one line."""
-    asis = next(e.score for e in found.ranked if e.mistake == "none")
+    as_recorded = next(e.score for e in found.ranked if e.mistake == "none")
     start = f"source {found.source}, {found.num_episodes} episodes together: {words(found.verdict)}"
     if found.verdict == "explained":
-        return f"{start} by {found.best.mistake} (score {found.best.score:.1f}, as recorded {asis:.1f})"
-    return f"{start} (score as recorded {asis:.1f})"
+        return f"{start} by {found.best.mistake} (score {found.best.score:.1f}, as recorded {as_recorded:.1f})"
+    return f"{start} (score as recorded {as_recorded:.1f})"
 
 
 def votes_text(found: SetDiagnosis) -> str:

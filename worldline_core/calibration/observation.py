@@ -170,6 +170,6 @@ def _arms(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]
             "Recorded tool poses and embodiment differ in the number of arms",
             where=f"episode {episode.episode_id}, embodiment {kinematics.embodiment.name}",
             expected=f"{len(arms)} arms",
-            got=f"{episode.T_base_ee.shape[1]} tool poses a frame",
+            got=f"{episode.T_base_ee.shape[1]} tool poses per frame",
         )
     return tuple(arms)

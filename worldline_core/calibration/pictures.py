@@ -106,7 +106,7 @@ def diagnosis_picture(
     moments: int = MOMENTS,
     tile_height: int = TILE_HEIGHT,
 ) -> Picture:
-    """One picture an episode: left as recorded, right as repaired, the same frames on both sides.
+    """One picture per episode: left as recorded, right as repaired, the same frames on both sides.
 
     Args:
         recorded: the episode as its source wrote it.
@@ -187,21 +187,21 @@ def _seen_note(tracks: EpisodeTracks) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """The verdict in one line, with the numbers that decide."""
-    asis = diagnosis.none.score
+    as_recorded = diagnosis.none.score
     match diagnosis.verdict:
         case "explained":
             return (
-                f"explained by {diagnosis.best.mistake}: score {diagnosis.best.score:.1f}, as recorded {asis:.1f}"
+                f"explained by {diagnosis.best.mistake}: score {diagnosis.best.score:.1f}, as recorded {as_recorded:.1f}"
                 "  (0 is healthy)"
             )
         case "unexplained":
             terms = sorted(diagnosis.none.evidence.items(), key=lambda item: item[1])[:2]
             worst = ", ".join(f"{name} {value:.1f}" for name, value in terms)
-            return f"unexplained: score {asis:.1f} as recorded, and no reading is good; worst are {worst}"
+            return f"unexplained: score {as_recorded:.1f} as recorded, and no reading is good; worst are {worst}"
         case "too_little_evidence":
             return "too little evidence: this recording does not show enough to judge its calibration"
         case _:
-            return f"consistent: score {asis:.1f} as recorded (0 is healthy)"
+            return f"consistent: score {as_recorded:.1f} as recorded (0 is healthy)"
 
 
 def departures_text(conventions: RecordedConventions) -> list[str]:

@@ -254,7 +254,7 @@ def chain_from_tree(tree: TreeBody) -> Chain:
     """A `pytorch_kinematics` chain whose frames are the bodies and sites of the tree.
 
     MuJoCo turns a body about each of its joints in order, at the joint's position: T_body J1 J2 ..., with
-    J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame a joint, and a last
+    J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame per joint, and a last
     fixed one where a joint lies off the body's origin; the last frame bears the body's name.
     """
     return Chain(_frame(tree), dtype=torch.float64)
