@@ -63,7 +63,7 @@ class FilteredClip:
 
     @property
     def reasons(self) -> list[str]:
-        """All headings that the clip belongs under."""
+        """Every heading of the page that the clip is shown under."""
         named = [self.reason] if self.reason else [*self.cut_by, *([self.stage2_reason] if self.stage2_reason else [])]
         return named or [KEPT]
 
@@ -191,23 +191,23 @@ def dropped_frames(clip: FilteredClip, findings: Sequence[Finding], count: int) 
             bands[reason] = bands.get(reason, np.zeros(count, dtype=bool)) | (bad & lost)
     rest = lost & ~np.logical_or.reduce([*bands.values(), np.zeros(count, dtype=bool)])
     if rest.any():
-        # Healthy frames that went with the dropped ones: of an episode that is condemned whole, or too few in a row.
+        # Healthy frames that went with the dropped ones: of an episode that is dropped whole, or too few in a row.
         bands[LOST_WITH_THEM] = rest
     return bands
 
 
 def deciding_curve(finding: Finding) -> tuple[str, Curve]:
-    """Of a detector's curves the one whose threshold best parts the frames that it dropped from the others."""
+    """Of a detector's curves the one whose threshold best separates the frames that it dropped from the others."""
     bad = finding.verdict.bad_frames
 
-    def parted(name: str) -> float:
+    def separation(name: str) -> float:
         curve = finding.verdict.curves[name]
         if bad is None or bad.all() or not bad.any():
             return 0.0
         above = curve.values > curve.threshold
         return abs(float(above[bad].mean() - above[~bad].mean()))
 
-    name = max(finding.verdict.curves, key=parted)
+    name = max(finding.verdict.curves, key=separation)
     return name, finding.verdict.curves[name]
 
 
