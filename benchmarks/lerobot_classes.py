@@ -323,6 +323,21 @@ def weight_lines() -> list[str]:
     ]
 
 
+def write_v21(folder: Path, episodes: int) -> None:
+    """A dataset of version 2.1 at folder/set, with all that LeRobot's conversion asks for."""
+    from tools.corrupted import lerobot_v21
+
+    folder.mkdir()
+    lerobot_v21.write(folder / "set", episodes, 0, np.random.default_rng(0))
+    meta = folder / "set" / "meta"
+    info = json.loads((meta / "info.json").read_text())
+    (meta / "info.json").write_text(json.dumps(info | {"total_chunks": 1, "total_videos": 2 * episodes}))
+    vector = {name: [0.0] * 14 for name in ("min", "max", "mean", "std")} | {"count": [24]}
+    stats = {"observation.state": vector, "action": vector}
+    lines = [json.dumps({"episode_index": number, "stats": stats}) for number in range(episodes)]
+    (meta / "episodes_stats.jsonl").write_text("\n".join(lines))
+
+
 def line(what: str, ours: str, lerobot: str) -> str:
     return f"{what:<46} {ours:<36} {lerobot}"
 
@@ -334,8 +349,6 @@ def cost(result: Result) -> str:
 
 
 def compare(work: Path, episodes: int) -> None:
-    from tools.corrupted import lerobot_v21
-
     print(line("", "ours", "LeRobot's classes"), flush=True)
     both = ("ours", "lerobot")
 
@@ -375,10 +388,7 @@ def compare(work: Path, episodes: int) -> None:
     )
     row("  and one frame of each episode", {who: cost(read[who]) for who in both})
     for who in both:
-        (work / who / "v21").mkdir()
-        lerobot_v21.write(work / who / "v21" / "set", episodes, 0, np.random.default_rng(0))
-        path = work / who / "v21" / "set" / "meta" / "info.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"total_chunks": 1, "total_videos": 2 * episodes}))
+        write_v21(work / who / "v21", episodes)
     row("read v2.1 / convert it to v3", {who: cost(measured(f"convert {who}", work / who, episodes)) for who in both})
     for what, damage in HOSTILE.items():
         found = {}
@@ -386,7 +396,7 @@ def compare(work: Path, episodes: int) -> None:
             folder = work / who / re.sub(r"\W+", "_", what)
             shutil.copytree(work / who / "a" / "dataset", folder / "dataset")
             damage(folder / "dataset")
-            result = measured(f"hostile {who}", folder, episodes, timeout=90)
+            result = measured(f"hostile {who}", folder, episodes, timeout=240)
             found[who] = result.get("failed") or f"read: {result['frames']}"
         row(what, found)
     print("\n".join(weight_lines()))

@@ -273,8 +273,9 @@ def _doctor(arguments: argparse.Namespace) -> None:
     findings = examine_machine(Path.cwd())
     if arguments.json:
         import json
+        from dataclasses import asdict
 
-        print(json.dumps(findings, indent=1))
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
     else:
         print(format_findings(findings))
 

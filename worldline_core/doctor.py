@@ -9,14 +9,29 @@ import platform
 import shutil
 import urllib.error
 import urllib.request
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from worldline_core.shipped import SHIPPED, project_path
 
 
-def examine_machine(project: Path) -> list[dict[str, Any]]:
-    """One finding a line: name, status ("ok", "missing", "optional"), what was found, and what to do."""
+@dataclass(frozen=True)
+class Finding:
+    """What one look at the machine found.
+
+    Attributes:
+        next_step: what the user can do about it; empty where nothing need be done.
+    """
+
+    name: str
+    status: Literal["ok", "missing", "optional"]
+    found: str
+    next_step: str = ""
+
+
+def examine_machine(project: Path) -> list[Finding]:
+    """What the project needs, in the order of a report."""
     return [
         _system(),
         _memory(),
@@ -32,102 +47,98 @@ def examine_machine(project: Path) -> list[dict[str, Any]]:
     ]
 
 
-def format_findings(findings: list[dict[str, Any]]) -> str:
+def format_findings(findings: list[Finding]) -> str:
     """A table for people."""
     marks = {"ok": "ok      ", "missing": "MISSING ", "optional": "optional"}
-    width = max(len(finding["name"]) for finding in findings)
-    lines = [f"{marks[finding['status']]} {finding['name']:<{width}}  {finding['found']}" for finding in findings]
-    advice = [f"  {finding['name']}: {finding['next_step']}" for finding in findings if finding["next_step"]]
+    width = max(len(finding.name) for finding in findings)
+    lines = [f"{marks[finding.status]} {finding.name:<{width}}  {finding.found}" for finding in findings]
+    advice = [f"  {finding.name}: {finding.next_step}" for finding in findings if finding.next_step]
     return "\n".join(lines + (["", "What you can do:", *advice] if advice else []))
 
 
-def _finding(name: str, status: str, found: str, next_step: str = "") -> dict[str, Any]:
-    return {"name": name, "status": status, "found": found, "next_step": next_step}
-
-
-def _system() -> dict[str, Any]:
+def _system() -> Finding:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return _finding(
+    return Finding(
         "system", "ok", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores"
     )
 
 
-def _memory() -> dict[str, Any]:
+def _memory() -> Finding:
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     advice = "" if total >= 6 else "the tiny preset needs about 6 GiB; lower batch sizes with --set"
-    return _finding("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
+    return Finding("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
 
 
-def _disk(project: Path) -> dict[str, Any]:
+def _disk(project: Path) -> Finding:
     free = shutil.disk_usage(project).free / 2**30
-    return _finding(
+    return Finding(
         "disk", "ok" if free >= 10 else "missing", f"{free:.0f} GiB free", "" if free >= 10 else "free some space"
     )
 
 
-def _accelerator() -> dict[str, Any]:
+def _accelerator() -> Finding:
     import torch
 
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
-        return _finding(
+        return Finding(
             "accelerator",
             "ok",
             f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}",
         )
-    return _finding(
+    return Finding(
         "accelerator", "optional", f"none; torch {torch.__version__} on the CPU",
         "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more",
     )  # fmt: skip
 
 
-def _bfloat16() -> dict[str, Any]:
+def _bfloat16() -> Finding:
     import torch
 
     fast = (
         bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
         and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     )
-    return _finding("CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower")
+    return Finding("CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower")
 
 
-def _codec() -> dict[str, Any]:
+def _codec() -> Finding:
     import av
 
     missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
     if missing:
-        return _finding(
+        return Finding(
             "video codecs", "missing", f"PyAV {av.__version__} without {', '.join(missing)}", "reinstall av from PyPI"
         )
-    return _finding("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
+    return Finding("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
 
 
-def _decoder() -> dict[str, Any]:
+def _decoder() -> Finding:
     from worldline_core.data.video.frame_decoder import describe_decoders
 
     found = describe_decoders()
     status = "optional" if found["next_step"] else "ok"
     reason = f" (torchcodec: {found['torchcodec']})" if found["next_step"] else ""
-    return _finding("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
+    return Finding("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
 
 
-def _packages() -> list[dict[str, Any]]:
+def _packages() -> list[Finding]:
     extras = {"mujoco": "sim (worldline record)", "h5py": "hdf5 (HDF5 sources)"}
     findings = []
     for package, purpose in extras.items():
         present = importlib.util.find_spec(package) is not None
         advice = "" if present else f"uv sync --extra {purpose.split()[0]}"
         findings.append(
-            _finding(f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice)
+            Finding(f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice)
         )
     return findings
 
 
-def _software_gl() -> dict[str, Any]:
+def _software_gl() -> Finding:
     libraries = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
     if libraries:
-        return _finding("headless GL", "ok", ", ".join(libraries))
-    return _finding(
+        return Finding("headless GL", "ok", ", ".join(libraries))
+    return Finding(
         "headless GL",
         "optional",
         "none",
@@ -135,13 +146,13 @@ def _software_gl() -> dict[str, Any]:
     )
 
 
-def _weights(project: Path) -> list[dict[str, Any]]:
+def _weights(project: Path) -> list[Finding]:
     findings = []
     for name in ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter"):
         folder = project_path(project, SHIPPED / "models" / name)
         present = any(folder.glob("*.safetensors"))
         findings.append(
-            _finding(
+            Finding(
                 f"weights {name}",
                 "ok" if present else "missing",
                 str(folder.relative_to(project) if folder.is_relative_to(project) else folder) if present else "absent",
@@ -157,23 +168,23 @@ def _weights(project: Path) -> list[dict[str, Any]]:
     ):
         present = (hub / f"models--{repository.replace('/', '--')}").is_dir()
         findings.append(
-            _finding(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
+            Finding(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
                      "" if present else "only the full-size preset needs it; download it where a hub is reachable")
         )  # fmt: skip
     return findings
 
 
-def _prefect_api() -> dict[str, Any]:
+def _prefect_api() -> Finding:
     url = os.environ.get("PREFECT_API_URL")
     if not url:
-        return _finding("Prefect API", "ok", "none set: flows start a temporary server")
+        return Finding("Prefect API", "ok", "none set: flows start a temporary server")
     if not url.startswith(("http://", "https://")):
-        return _finding("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
+        return Finding("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
     try:
         with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=3) as answer:  # noqa: S310 - scheme checked above
-            return _finding("Prefect API", "ok", f"{url} answers {answer.status}")
+            return Finding("Prefect API", "ok", f"{url} answers {answer.status}")
     except (urllib.error.URLError, TimeoutError) as error:
-        return _finding(
+        return Finding(
             "Prefect API",
             "missing",
             f"{url}: {error}",

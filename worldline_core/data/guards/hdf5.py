@@ -124,23 +124,14 @@ class Hdf5File:
         exact = raw.dtype.kind != "f"
         return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
 
-    def width(self, key: str) -> int:
-        """Columns of a dataset (N, columns); 1 for (N,).
+    def columns(self, key: str, length: int | None) -> np.ndarray:
+        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D).
 
-        Raises: RejectedInputError: missing_column, length_mismatch (another number of axes), unreadable, too_large,
-            path_traversal.
+        Raises: as `array`.
         """
-        shape = self._dataset(key).shape
-        if len(shape) not in (1, 2):
-            check_shape("Dataset", f"{self._path}, {key}", shape, (None, None))
-        return int(shape[1]) if len(shape) == 2 else 1
-
-    def is_flat(self, key: str) -> bool:
-        """Whether a dataset has one axis.
-
-        Raises: RejectedInputError as `width`.
-        """
-        return self._dataset(key).ndim == 1
+        flat = self._dataset(key).ndim == 1
+        values = self.array(key, (length,) if flat else (length, None))
+        return values.reshape(len(values), -1)
 
     def text(self, key: str) -> str | None:
         """A text stored as a dataset of one entry; None where there is none.

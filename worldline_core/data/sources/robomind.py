@@ -153,18 +153,17 @@ class RobomindSource:
         overshoot, length = 0, None
         for arm in self._layout.arms:
             key = arm.joints.format(track=track)
-            width = file.width(key)
-            if width not in arm.widths:
+            values = file.columns(key, length)
+            if values.shape[1] not in arm.widths:
                 raise RejectedInputError(
                     "length_mismatch",
                     "Joints have another number of columns than this robot's",
                     where=f"{path}, {key}",
                     expected=" or ".join(map(str, arm.widths)),
-                    got=width,
+                    got=values.shape[1],
                     next_step="check curate.sources[].layout: each robot has a folder and a layout of its own",
-                    evidence={"expected": list(arm.widths), "found": width},
+                    evidence={"expected": list(arm.widths), "found": values.shape[1]},
                 )
-            values = file.array(key, (length, width))
             length = len(values)
             blocks.append(values[:, arm.start : arm.start + arm.num_joints])
             if arm.gripper is not None and span is not None:
@@ -177,17 +176,16 @@ class RobomindSource:
     def _gripper(self, file: Hdf5File, path: AnyPath, place: tuple[str, int], track: Track, length: int) -> np.ndarray:
         """(N, 1) raw readings."""
         key, column = place[0].format(track=track), place[1]
-        width = file.width(key)
-        if self._layout.version == 2 and width != 1:
+        values = file.columns(key, length)
+        if self._layout.version == 2 and values.shape[1] != 1:
             raise RejectedInputError(
                 "invalid_gripper",
                 "End effector is no gripper of one value",
                 where=f"{path}, {key}",
                 expected="1 value per frame",
-                got=f"{width} (a dexterous hand?)",
-                evidence={"values": width},
+                got=f"{values.shape[1]} (a dexterous hand?)",
+                evidence={"values": values.shape[1]},
             )
-        values = file.array(key, (length,) if file.is_flat(key) else (length, width)).reshape(length, -1)
         return values[:, column : column + 1]
 
     def _check_compression(self, file: Hdf5File, path: AnyPath) -> None:
