@@ -29,7 +29,7 @@ class PublishedFile:
 
     Attributes:
         path: where it lies in the published copy.
-        place: whether it belongs to the set, or to the card that was made for the publication.
+        place: content belongs to the set, card to the dataset card that is made for the publication.
     """
 
     path: str

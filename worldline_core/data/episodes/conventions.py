@@ -26,7 +26,7 @@ from worldline_core.geometry.rotations import (
 from worldline_core.geometry.transforms import rigid_inverse
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-# What an episode must have for a convention to say anything about it.
+# What an episode must have for a convention to apply to it.
 _NEEDS = {
     **dict.fromkeys(("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size"), "a calibrated camera"),
     "camera_lag_frames": "a calibrated camera that moves",
@@ -48,12 +48,12 @@ def arm_blocks(episode: Episode) -> tuple[tuple[int, ...], ...]:
 
 
 def check_applicable(episode: Episode, fields: Iterable[str]) -> None:
-    """Raises: RejectedInputError (convention_not_applicable) for the first field that says nothing about the episode."""
+    """Raises: RejectedInputError (convention_not_applicable) for the first field that does not apply to the episode."""
     for field in fields:
         if not applicable(episode, field):
             raise RejectedInputError(
                 "convention_not_applicable",
-                "The episode has nothing that a declared convention speaks of",
+                "The episode has nothing that a declared convention applies to",
                 where=f"episode {episode.episode_id}, conventions.{field}",
                 expected=_NEEDS[field],
                 got=f"state {episode.state_kind}, {len(episode.cameras)} cameras, "
@@ -64,7 +64,7 @@ def check_applicable(episode: Episode, fields: Iterable[str]) -> None:
 
 
 def applicable(episode: Episode, field: str) -> bool:
-    """Whether the episode has what a field of `RecordedConventions` speaks of."""
+    """Whether a field of `RecordedConventions` applies to the episode."""
     need = _NEEDS[field]
     if need == "a calibrated camera":
         return bool(episode.cameras)
@@ -84,7 +84,7 @@ def applicable(episode: Episode, field: str) -> bool:
 class RecordedConventions(StrictModel):
     """How a source wrote its numbers where it departs from the contract; the default says: as the contract.
 
-    One field for each usual mistake; each is the config line that repairs it.
+    One field per common mistake; setting it is the configuration line that repairs it.
     """
 
     extrinsics: Literal["camera_to_base", "base_to_camera"] = Field(

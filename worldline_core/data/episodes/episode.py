@@ -195,7 +195,7 @@ class Episode(EpisodeDescription):
         num_frames = len(self.timestamps)
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise RejectedInputError(
-                "wrong_fps", "Frame rate is no rate", where=where, expected="frames a second", got=repr(self.fps)
+                "wrong_fps", "Frame rate is not positive", where=where, expected="frames per second", got=repr(self.fps)
             )
         if self.state.ndim != 2 or len(self.state) != num_frames or num_frames == 0:
             raise DataError(

@@ -179,7 +179,7 @@ class EpisodeSet:
         return dataset.frames(row.episode_index, IMAGE_PREFIX + view, [row.start + index for index in wanted])
 
     def clip(self, i: int, view: str) -> VideoClip:
-        """Where the frames of a view of row i lie, cut to its segment, for those who decode themselves.
+        """The encoded video of a view of row i, cut to its segment, for callers that decode it themselves.
 
         Raises: DataError when the view is missing.
         """
@@ -189,8 +189,7 @@ class EpisodeSet:
         return replace(whole, num_frames=row.video_frames, skip=row.start)
 
     def thumbnails(self, i: int, view: str) -> ViewThumbnails:
-        """Small grey images of a view of row i: those that curation left beside the set, else made from its video. They are
-        the same either way.
+        """Small grey images of a view of row i: the ones that curation stored, or, with the same result, made from its video.
 
         Raises: DataError when the view or the file is missing, or the video is truncated.
         """

@@ -1,4 +1,4 @@
-"""Poses as they were recorded, made rigid or refused at the door: the maths is in geometry, here it becomes reasons.
+"""Recorded poses made rigid, or refused with a reason; the mathematics is in geometry.
 
 A rotation up to 1e-3 off an orthonormal one is given the nearest rotation, and the episode's conventions say how many
 were and by how much; a worse one puts the episode into quarantine.
@@ -126,7 +126,7 @@ def with_rigid_poses(episode: Episode) -> Episode:
         if pose.repair.count:
             cameras[view] = replace(camera, T_base_camera=pose.T_base_camera)
     tools = episode.T_base_ee
-    # A pose that is not a number is the business of `check_values`, which says where it is.
+    # Poses that are not finite are reported by `check_values`, with their place.
     if tools is not None and np.isfinite(tools).all():
         with rejected_as("invalid_tool_pose", where, _deviation(tools)):
             tools, repairs["tool poses"] = repair_rotations(tools, "tool poses")

@@ -1,7 +1,7 @@
-"""One view of an episode on its way into a set: decoded once, and on that occasion stored, made small and counted.
+"""One view of an episode is written into a set: in one pass over its pictures it gets its video, thumbnails and statistics.
 
-Where nothing changes in the picture the video is copied without encoding; else its pictures are encoded as they come.
-Either way one picture is in memory at a time.
+Where no pixel changes the video is copied without encoding; otherwise its pictures are encoded. Either way one picture is in
+memory at a time.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class VideoSettings:
 
 @dataclass(frozen=True)
 class RecordedView:
-    """The pictures of one view as they were recorded, and what becomes of them.
+    """The pictures of one view as they were recorded, and how they are stored.
 
     Attributes:
-        images: uint8 (H, W, 3) RGB, one by one; each call begins again.
-        num_frames: how many there must be.
-        clip: the video they lie in, where they are a video as it is.
-        step: every how many-th picture is kept.
+        images: uint8 (H, W, 3) RGB, one by one; each call starts from the first.
+        num_frames: expected number of pictures.
+        clip: the encoded video, where the pictures are exactly its frames.
+        step: every `step`-th picture is kept.
         image_size: (height, width) they are brought to by `fit`; None keeps theirs.
     """
 
@@ -63,7 +63,7 @@ class RecordedView:
 
 @dataclass(frozen=True)
 class StoredView:
-    """A view's video in a set, and what was learnt while it was written.
+    """A view's video in a set, and what was measured while it was written.
 
     Attributes:
         size: (height, width).

@@ -1,7 +1,7 @@
 """One MCAP file: checked before it is unpacked, its topics, and the messages of some of them in the order of the file.
 
-The library believes a chunk: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, 255 bytes for one.
-So every chunk is looked at first. Records (https://mcap.dev/spec): an opcode, a length of 8 bytes, then the record.
+The library trusts a chunk's header: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, up to 255
+bytes per byte. So the size of every chunk is checked first. Records (https://mcap.dev/spec): an opcode, a length of 8 bytes, then the record.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _LZ4_RATIO = 255
 
 
 READING_MARGIN_NS = 10**9
-"""Messages from so long before and after an episode are read too: they may be of its time, and instants lie between two."""
+"""Messages logged up to this long before and after an episode are read too: their own time may lie within it, and the instants at
+its ends need a message on both sides."""
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * 8 + 29
 
@@ -288,7 +289,7 @@ def _check_chunk(stream: BinaryIO, length: int, where: object) -> None:
         except zstandard.ZstdError as error:
             raise _damaged(where, str(error)) from error
     elif compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES:
-        # Its stated size binds nobody; only when it is this long can it unpack to too much.
+        # An lz4 frame may unpack to more than it states; only a frame of this length can unpack to too much.
         stream.seek(-len(head), 1)
         unpacked = _lz4_size(stream.read(packed_length), where)
     if unpacked > MAX_CHUNK_BYTES:

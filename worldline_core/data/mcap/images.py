@@ -22,7 +22,7 @@ from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.messages import EncodedImage, Kind, RawImage
 
 _CODECS = {"h264": "h264", "h265": "hevc"}
-# ROS and Foxglove name -> bytes a pixel, and how OpenCV turns it into RGB.
+# ROS and Foxglove name -> bytes per pixel, and OpenCV's conversion to RGB.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -38,8 +38,8 @@ class ImageTrack:
 
     Attributes:
         start_ns, stop_ns: log times within which the topic's messages were counted; None: the whole file.
-        order: (n,) which message, counted as they lie in the file, is the i-th in time.
-        chosen: (t,) which image, counted in time, is each frame; ascending, an image may repeat.
+        order: (n,) index, in the order of the file, of the message that is i-th in time.
+        chosen: (t,) index, in order of time, of the image of each frame; ascending, an image may repeat.
         key_frames: of a video, (n,) in order of time, whether decoding can begin there.
     """
 
@@ -165,8 +165,8 @@ class EpisodeImages:
 def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
     """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
 
-    A decoder conceals the loss of a message without a word and shows something else until the next key frame, so the loss
-    is told from the times.
+    After a lost message a decoder raises no error and shows wrong pictures until the next key frame, so the loss is detected
+    from the times of the messages.
     """
     lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
@@ -217,7 +217,7 @@ def _lost_frame(where: str, number: int | None) -> RejectedInputError:
         "truncated_video",
         "Video frames are missing or damaged",
         where=where if number is None else f"{where}, frame {number}",
-        expected="one frame a message, each decodable from those before it",
+        expected="one frame per message, each decodable from those before it",
         next_step="cut the recording at the damage",
         evidence={"frame": number},
     )

@@ -216,7 +216,7 @@ def _calibration(raw: Any) -> Calibration:
 
 
 def _joints(raw: Any) -> Joints:
-    if _has(raw, "joints"):  # foxglove.JointStates: one record a joint, its readings optional
+    if _has(raw, "joints"):  # foxglove.JointStates: one record per joint, its readings optional
         joints = list(_get(raw, "joints"))
         readings = {
             field: tuple(float(_get(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)

@@ -1,8 +1,8 @@
 """Times of messages, and measurements at their own times brought to instants of a fixed rate.
 
 A message has up to three times: the one it states itself (header), the one when it was published and the one when the
-recorder wrote it (log). header <= log, and their least difference over a topic is the offset between the clocks plus the
-shortest way of a message, so topics whose least differences disagree were stamped by clocks that disagree (Paxson, On
+recorder wrote it (log). header <= log, and their smallest difference over a topic is the offset between the clocks plus the
+shortest transport time of a message, so topics whose smallest differences disagree were stamped by clocks that disagree (Paxson, On
 calibrating measurements of packet transit times, 1998). Its change over time is the drift of the clock.
 
 The error of an instant is its distance in time to the nearest measurement. For what is interpolated, the error in value is
@@ -23,7 +23,7 @@ from worldline_core.data.mcap.file import Stream
 
 TimeSource = Literal["header", "log", "publish"]
 _DRIFT_BINS = 8
-# A shorter recording shows a way's jitter, not a drift.
+# In a shorter recording the jitter of transport hides the drift.
 _MIN_DRIFT_SECONDS = 30.0
 
 
@@ -55,10 +55,10 @@ def _drift(header_ns: np.ndarray, delay_ms: np.ndarray) -> float | None:
 
 @dataclass(frozen=True)
 class Timing:
-    """How messages of one episode are put in time.
+    """How the messages of one episode get their times.
 
     Attributes:
-        to_clock_ns: what is taken from a log time to get the time on the clock that counts.
+        to_clock_ns: what is subtracted from a log time to get a time on the clock of the headers.
         clocks: what the stamps of each topic say about its clock.
         skew_ms: largest difference between the least delays of two topics.
         headerless: topics that are timed by their log time because their messages state none.
@@ -123,7 +123,7 @@ class Timing:
         return cls(source, offsets_ms, shift, clocks, skew, headerless if source == "header" else ())
 
     def times_ns(self, stream: Stream) -> np.ndarray:
-        """(n,) when the messages of a topic are of, on the clock that counts."""
+        """(n,) times of a topic's messages [ns] on the clock that `source` chooses."""
         if self.source == "publish":
             return np.array(stream.publish_ns, np.int64)
         if self.source == "log":
@@ -175,8 +175,8 @@ class Arrivals:
         order: (n,) which message of the topic, counted as they lie in the file, each one is.
         disordered: messages that lie behind a later one in the file.
         repeated: messages left out because another one has the same time.
-        lost: messages missing by the rate: the lesser of what intervals beyond 1.5 times the median leave out and what the
-            whole time would have held, since jitter makes long intervals too.
+        lost: messages missing by the rate: the smaller of two estimates, from intervals longer than 1.5 times the median
+            and from the whole duration, since jitter makes long intervals too.
         median_step_ns: 0 for a single message.
     """
 
@@ -344,6 +344,6 @@ def largest_prediction_error(times_ns: np.ndarray, values: np.ndarray) -> float:
 
 
 def instants(start_ns: int, stop_ns: int, fps: float) -> np.ndarray:
-    """(t,) start, start + 1 / fps, ... up to stop; a nanosecond of rounding is forgiven. Empty when stop < start."""
+    """(t,) start, start + 1 / fps, ... up to stop; an error of a nanosecond from rounding is tolerated. Empty when stop < start."""
     count = int(np.floor((stop_ns - start_ns) * fps / 1e9 + 1e-6)) + 1
     return start_ns + np.round(np.arange(max(count, 0)) * (1e9 / fps)).astype(np.int64)

@@ -37,7 +37,7 @@ class Segment:
     """An episode inside of a file.
 
     Attributes:
-        name: what tells it from others of the file; empty for a whole file.
+        name: distinguishes it from others of the file; empty for a whole file.
         start_ns, stop_ns: log times; None: from the beginning, to the end.
         relative: the times are counted from the file's first message.
         fault: why it cannot be read, where that is known already.
@@ -157,7 +157,7 @@ def read_topics_episode(
 def _streams(
     config: McapTopicsSourceConfig, file: McapFile, start_log: int | None, stop_log: int | None
 ) -> dict[str, Stream]:
-    """Every topic that the episode needs; transforms are optional here, who needs one will miss it.
+    """Every topic that the episode needs. Transforms are optional here: a missing one is reported where a pose needs it.
 
     Raises: RejectedInputError: missing_topic for one that is not in the file, or silent during the episode.
     """
@@ -191,7 +191,7 @@ def _grid(
     moving: list[np.ndarray],
     extent: tuple[int | None, int | None],
 ) -> np.ndarray:
-    """(t,) instants [ns]: from the first image of the primary view that all topics have begun by, to where one ends.
+    """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first topic ends.
 
     Raises: RejectedInputError: time_gap for a topic that is silent for too long, too_short.
     """
@@ -201,7 +201,7 @@ def _grid(
     stop = max(times[-1] for times in named.values()) if extent[1] is None else extent[1]
     of_images = {f"topic {topics.image}" for topics in config.views.values()}
     for name, times in named.items():
-        # What may be missing between two images is decided by how far instants are from the nearest one.
+        # Gaps between images are judged in `_chosen_images`, by the distance of instants from the nearest image.
         max_gap = float("inf") if name in of_images else config.max_gap_s
         check_gaps(times, int(start), int(stop), max_gap, config.max_trim_s, f"{file.shown}, {name}")
     everything = [*named.values(), *moving]
@@ -264,7 +264,7 @@ def _chosen_images(
 def _track(
     stream: Stream, arrivals: Arrivals, chosen: np.ndarray, around: tuple[int | None, int | None], file: McapFile
 ) -> ImageTrack:
-    """Raises: RejectedInputError (truncated_video) for frames of a video that a lost message spoils."""
+    """Raises: RejectedInputError (truncated_video) for video frames that depend on a lost message."""
     keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
     if keys is not None:
         spoiled = spoiled_frames(arrivals.times_ns, arrivals.median_step_ns, keys)[chosen]
