@@ -28,8 +28,8 @@ import numpy as np
 
 from tools.labelled_clips import FAULTS, HARMLESS, Clip
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.filters.examine import inspect
 from worldline_core.filters.filter_config import FilterConfig

@@ -27,8 +27,8 @@ from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, fi
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
-from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import jpeg_bytes

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from worldline_core.actions.render_actions import RenderActionsConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import DataError
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.pipeline.steps import run_step

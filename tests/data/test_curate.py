@@ -19,9 +19,9 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video.decode import resize_masks
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
+from worldline_core.geometry.cameras import ImageTransform
 
 Make = Callable[..., tuple]
 
@@ -62,7 +62,8 @@ def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path, sampl
     assert np.array_equal(episode.cameras["left_wrist"].T_base_camera, expected.T_base_camera)
     mask = curated.robot_masks(0, "head")
     assert mask is not None
-    assert np.array_equal(mask, resize_masks(samples[0][2]["head"], (16, 24)))
+    head = samples[0][2]["head"]
+    assert np.array_equal(mask, ImageTransform.of(head.shape[1:]).resize((16, 24)).masks(head))
     assert str(tmp_path) not in json.dumps([row.__dict__ for row in curated.rows])
 
 

@@ -18,7 +18,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.video_folder import caption_table
-from worldline_core.data.video.decode import frame_times
+from worldline_core.data.video.clip import frame_times
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig

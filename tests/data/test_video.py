@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.data.video.decode import decode_segment, decode_video, video_size
+from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.data.video.encoder import X264_PARAMETERS, VideoEncoder, concatenate_videos, encode_video
+from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 from worldline_core.errors import DataError
 
 
@@ -81,9 +82,9 @@ def test_frames_of_a_joined_video_are_found_exactly(tmp_path: Path, fps: float, 
     assert np.array_equal(decode_video(joined, 28), np.concatenate(single))
     first = 0
     for (_, count), expected in zip(parts, single, strict=True):
-        assert np.array_equal(decode_segment(joined, first / fps, count, fps), expected)
+        assert np.array_equal(decode_frames(VideoClip(joined, count, fps, first / fps)), expected)
         wanted = [count - 1, 0, 3, 3]
-        assert np.array_equal(decode_segment(joined, first / fps, count, fps, wanted), expected[wanted])
+        assert np.array_equal(decode_frames(VideoClip(joined, count, fps, first / fps), wanted), expected[wanted])
         first += count
 
 
@@ -96,8 +97,8 @@ def test_a_truncated_video_names_file_and_frame_counts(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"(?s)truncated.*cut\.mp4.*24 frames.*got: \d+ frames"):
         decode_video(path, 24)
     with pytest.raises(DataError, match=r"(?s)truncated.*cut\.mp4"):
-        decode_segment(path, 0.0, 24, 8.0)
-    assert len(decode_segment(path, 0.0, 24, 8.0, [0, 1, 2])) == 3  # what is left is still readable
+        decode_frames(VideoClip(path, 24, 8.0, 0.0))
+    assert len(decode_frames(VideoClip(path, 24, 8.0, 0.0), [0, 1, 2])) == 3  # what is left is still readable
 
 
 def test_a_file_that_is_no_video_and_one_that_is_missing(tmp_path: Path) -> None:
@@ -113,7 +114,7 @@ def test_a_video_of_another_length_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"(?s)too many frames.*expected: 5 frames.*got: 12 frames"):
         decode_video(tmp_path / "v.mp4", 5)
     with pytest.raises(DataError, match="outside of the clip"):
-        decode_segment(tmp_path / "v.mp4", 0.0, 12, 8.0, [12])
+        decode_frames(VideoClip(tmp_path / "v.mp4", 12, 8.0, 0.0), [12])
 
 
 def test_what_cannot_be_encoded_is_refused(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from worldline_core.data.episodes.view_recording import RecordedView, VideoSetti
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, open_video, read_clip
 from worldline_core.data.video.copy import clip_copy
-from worldline_core.data.video.decode import decode_segment, decode_video
 from worldline_core.data.video.encoder import concatenate_videos, encode_video
+from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 
 FPS = 30.0
 ENCODERS = {
@@ -88,9 +88,11 @@ def test_a_whole_file_is_copied_packet_by_packet(tmp_path: Path, kind: str) -> N
     assert packets(tmp_path / "copy.mp4") == packets(source)
     assert np.array_equal(own_decode(tmp_path / "copy.mp4"), expected)
     # Each frame lies at its place on the grid, and is found there alone as well.
-    assert np.array_equal(decode_segment(tmp_path / "copy.mp4", 0.0, 40, FPS), expected)
+    assert np.array_equal(decode_frames(VideoClip(tmp_path / "copy.mp4", 40, FPS, 0.0)), expected)
     for number in range(40):
-        assert np.array_equal(decode_segment(tmp_path / "copy.mp4", 0.0, 40, FPS, [number])[0], expected[number])
+        assert np.array_equal(
+            decode_frames(VideoClip(tmp_path / "copy.mp4", 40, FPS, 0.0), [number])[0], expected[number]
+        )
     first = (tmp_path / "copy.mp4").read_bytes()
     copied(VideoClip.whole_file(source, 40, FPS), tmp_path / "again.mp4")
     assert (tmp_path / "again.mp4").read_bytes() == first
@@ -103,7 +105,7 @@ def test_times_that_start_late_or_are_uneven_are_put_on_the_grid(tmp_path: Path,
     seen = copied(VideoClip.whole_file(source, 26, FPS), tmp_path / "copy.mp4")
     assert seen is not None
     assert np.array_equal(seen, expected)
-    assert np.array_equal(decode_segment(tmp_path / "copy.mp4", 0.0, 26, FPS), expected)
+    assert np.array_equal(decode_frames(VideoClip(tmp_path / "copy.mp4", 26, FPS, 0.0)), expected)
 
 
 @pytest.mark.parametrize("kind", ["h264", "h264_b_frames", "av1"])
@@ -142,7 +144,7 @@ def test_every_frame_of_a_foreign_file_is_found_by_its_time(tmp_path: Path, kind
     source = write(tmp_path / "source.mp4", kind, scene(50))
     expected = own_decode(source)
     for number in range(50):
-        assert np.array_equal(decode_segment(source, 0.0, 50, FPS, [number])[0], expected[number])
+        assert np.array_equal(decode_frames(VideoClip(source, 50, FPS, 0.0), [number])[0], expected[number])
 
 
 def test_clips_of_this_project_are_copied_out_of_their_joined_file(tmp_path: Path) -> None:

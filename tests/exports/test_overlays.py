@@ -30,7 +30,7 @@ from worldline_core.actions.overlays import (
     heat_layer,
     picture_pixel,
 )
-from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import DataError
 from worldline_core.pictures.labels import text_width_px
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.overlays import heat_picture
-from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import (
     fit_text,

@@ -13,7 +13,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from worldline_core.actions.overlays import ARM_COLOURS
-from worldline_core.data.video.decode import decode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.report.inspect import inspect
 from worldline_core.store.atomic import write_json_atomic

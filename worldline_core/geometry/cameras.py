@@ -55,6 +55,7 @@ def valid_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
 
 
 CameraAxes = Literal["opencv", "opengl"]
+Fit = Literal["stretch", "letterbox", "crop"]
 """`opencv` is x right, y down, z forward; `opengl` (also Blender, MuJoCo, USD) is x right, y up, z backward."""
 _OPENCV_FROM: dict[str, np.ndarray] = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 
@@ -193,6 +194,18 @@ class ImageTransform:
         for step in self.steps:
             result = step.affine @ result
         return result
+
+    def fitted(self, image_size: tuple[int, int] | None, fit: Fit = "stretch") -> ImageTransform:
+        """Then bring to a size: stretched, whole with black bars, or filled and cut at the sides. None changes nothing."""
+        if image_size is None:
+            return self
+        match fit:
+            case "stretch":
+                return self.resize(image_size)
+            case "letterbox":
+                return self.letterbox(image_size)
+            case "crop":
+                return self.centre_crop(image_size)
 
     def resize(self, image_size: tuple[int, int]) -> ImageTransform:
         """Then resize; the aspect ratio may change."""

@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from worldline_core.data.video.decode import decode_video
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.atomic import atomic_path
 

@@ -1,9 +1,8 @@
 """Files of object stores: listed, and copied to this machine when they are read, within a bound.
 
 Locations are `universal_pathlib` paths; credentials and endpoints come from the environment of the store's own library
-(`AWS_*`, or fsspec's `FSSPEC_<PROTOCOL>_<OPTION>`), never from a configuration that ends up in a manifest.
-
-Faults that pass: those of a network or of a busy store, not of the data. Only they are retried.
+(`AWS_*`, or fsspec's `FSSPEC_<PROTOCOL>_<OPTION>`), never from a configuration that ends up in a manifest. Only
+transient faults are retried: those of a network or of a busy store, not of the data.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ _PASSING_CLASSES = frozenset(
         ("httpx", "TransportError"),
     }
 )
-"""By name, so that nobody has to install the libraries of a store that is not used."""
+"""By name, so that the libraries of a store that is not used need not be installed."""
 
 
 class UnreachableInputError(UnavailableError):
@@ -228,7 +227,7 @@ _CHANGE_MARKS = (
     "mtime",
     "created",
 )
-"""What stores say of a file that differs when its content does; the first that one has is taken."""
+"""Attributes by which stores tell that a file's content changed; the first one present is taken."""
 
 
 def remote_digest(root: AnyPath) -> str:

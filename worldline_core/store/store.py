@@ -4,12 +4,9 @@
 the step's name and version, its config, and the digests of its inputs: nothing else decides whether work is done
 again. Unfinished work lives in ``<key>.partial/`` and is continued by the next call.
 
-One worker at a time on an artifact; the lock dies with its process.
-
-Several processes that torchrun started on one step: the first owns the artifact, the others help it to be made.
-
-Only the first takes the lock and finishes the artifact; it announces itself in a small file beside the lock, so that a
-helper neither waits for a lock that is never freed nor joins work that another command is doing.
+One process at a time works on an artifact; the lock ends with its process. Of several processes that torchrun started
+on one step the first owns the artifact and the others help. It announces itself in a small file beside the lock, so
+that a helper neither waits for a lock that is never freed nor joins work that another command is doing.
 """
 
 from __future__ import annotations

@@ -16,15 +16,16 @@ from worldline_core.errors import ConfigError
 if TYPE_CHECKING:
     from worldline_core.geometry.embodiment import Embodiment
 
-# No joint of a manipulator turns further; larger numbers are degrees or encoder ticks.
 MAX_JOINT_RAD = 4 * np.pi
+"""No joint of a manipulator turns further; larger numbers are degrees or encoder ticks."""
 _GRIPPER_MARGIN = 0.05
 
 
 def check_split(episode: Episode) -> None:
     """Raises: ConfigError when an episode for evaluation only is given a split that trains or selects a model.
 
-    That is one of an evaluation-only layout, one declared so, and any whose source or robot is called DROID. The layout is noted in the episode itself, so a set that was made of such recordings earlier is refused as well.
+    For evaluation only are episodes of an evaluation-only layout, those declared so, and any whose source or robot is
+    called DROID. The layout is noted in the episode, so a set made of such recordings earlier is refused as well.
     """
     layout = episode.conventions.get("layout")
     called = says_droid(episode.source, episode.embodiment)
@@ -160,7 +161,7 @@ def check_camera(episode: Episode, camera: CameraTrack) -> None:
 
 
 def stride_to(episode: Episode, fps: float | None) -> int:
-    """Every how many frames to keep for the wanted rate.
+    """The stride that brings an episode to the wanted rate.
 
     Raises: RejectedInputError (wrong_fps) when the recorded rate is no whole multiple of it.
     """

@@ -11,8 +11,8 @@ from worldline_core.data.curation.source_weights import SourceSampling
 from worldline_core.data.episodes.instructions import InstructionConfig
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.sources.open import SourceConfig
-from worldline_core.data.video.decode import Fit
 from worldline_core.data.video.encoder import PixelFormat
+from worldline_core.geometry.cameras import Fit
 
 
 class CurateConfig(StrictModel):

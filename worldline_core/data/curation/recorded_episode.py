@@ -1,18 +1,11 @@
-"""One recorded episode: checked, brought to the wanted rate and size.
-
-What the configuration says of a recorded episode: its split, its instruction, its primary view.
-
-Which view stands for an episode in single-view training (Stage I), and why.
-
-In this order: the configured view, the one that the source declares, the head's, the one that shows most motion.
-"""
+"""One recorded episode: checked, brought to the wanted rate and size, and described as the configuration asks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -31,59 +24,11 @@ from worldline_core.data.episodes.instructions import with_instruction
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.video.decode import fitted
 from worldline_core.data.video.thumbnails import ViewThumbnails
-
-if TYPE_CHECKING:
-    from worldline_core.data.video.thumbnails import ViewThumbnails
-
+from worldline_core.geometry.cameras import ImageTransform
 
 PRIMARY_VIEW_REASON = "primary_view_reason"
 Why = Literal["configured", "head", "most_motion"]
-
-
-def with_primary_view(
-    episode: Episode, configured: str | None, views: Sequence[str], thumbnails: Mapping[str, ViewThumbnails]
-) -> Episode:
-    """The episode with its primary view, and in its conventions why, unless the source's own declaration holds.
-
-    A configured view that the episode lacks is its choice all the same: it then stays out of Stage I, as the configuration
-    asks. Of views with equal motion the last by name is taken.
-    """
-    if configured is not None:
-        return _chosen(episode, configured, "configured")
-    if episode.primary_view in views:
-        return episode
-    if "head" in views:
-        return _chosen(episode, "head", "head")
-    return _chosen(episode, max(views, key=lambda view: (motion(thumbnails[view]), view)), "most_motion")
-
-
-def motion(view: ViewThumbnails) -> float:
-    """Mean absolute change between the moments of a view, in grey levels of 255, over at most 64 moments."""
-    step = max(1, len(view.gray) // 64)
-    moments = view.gray[::step].astype(np.int16)
-    return float(np.abs(np.diff(moments, axis=0)).mean()) if len(moments) > 1 else 0.0
-
-
-def _chosen(episode: Episode, view: str, why: Why) -> Episode:
-    return replace(episode, primary_view=view, conventions={**episode.conventions, PRIMARY_VIEW_REASON: why})
-
-
-def described(
-    config: CurateConfig, episode: Episode, views: Sequence[str], thumbnails: Mapping[str, ViewThumbnails]
-) -> Episode:
-    """The episode as the set describes it. Its outcome is left alone, and nothing here depends on it.
-
-    Args:
-        views: views that the set keeps. thumbnails: of these.
-
-    Raises: ConfigError when a recording for evaluation only is given a training split.
-    """
-    primary = with_primary_view(episode, config.primary_view, views, thumbnails)
-    result = with_split(with_instruction(primary, config.instructions), config.splits)
-    check_split(result)
-    return result
 
 
 def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
@@ -118,12 +63,12 @@ def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
 
 @dataclass(frozen=True)
 class PreparedEpisode:
-    """An episode at the wanted rate and size, ready to be written; its images are read while they are.
+    """An episode at the wanted rate and size, ready to be written; its images are read while they are written.
 
     Attributes:
         frames: by view.
         masks: by view, bool (N, H, W), of the views that have them.
-        described: the episode as the configuration describes it, once the thumbnails of its views are there.
+        described: the episode as the configuration describes it, given the thumbnails of its views.
     """
 
     episode: Episode
@@ -165,9 +110,9 @@ def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpis
     for view in views:
         mask = loaded.robot_masks(view)
         if mask is not None:
-            masks[view] = fitted(mask.shape[1:3], config.image_size, config.fit).masks(mask[::step])
+            masks[view] = ImageTransform.of(mask.shape[1:3]).fitted(config.image_size, config.fit).masks(mask[::step])
     cameras = {
-        view: camera.transformed(fitted((camera.height, camera.width), config.image_size, config.fit))
+        view: camera.transformed(ImageTransform.of((camera.height, camera.width)).fitted(config.image_size, config.fit))
         for view in views
         if (camera := episode.cameras.get(view)) is not None
     }
@@ -178,3 +123,48 @@ def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpis
         cameras=cameras,
     )
     return PreparedEpisode(prepared, frames, masks, partial(described, config, prepared, tuple(views)))
+
+
+def described(
+    config: CurateConfig, episode: Episode, views: Sequence[str], thumbnails: Mapping[str, ViewThumbnails]
+) -> Episode:
+    """The episode as the set describes it: its split, instruction and primary view. None of them depends on its outcome.
+
+    Args:
+        views: views that the set keeps. thumbnails: of these.
+
+    Raises: ConfigError when a recording for evaluation only is given a training split.
+    """
+    primary = with_primary_view(episode, config.primary_view, views, thumbnails)
+    result = with_split(with_instruction(primary, config.instructions), config.splits)
+    check_split(result)
+    return result
+
+
+def with_primary_view(
+    episode: Episode, configured: str | None, views: Sequence[str], thumbnails: Mapping[str, ViewThumbnails]
+) -> Episode:
+    """The episode with the view that stands for it in single-view training (Stage I), and in its conventions why.
+
+    In this order: the configured view, the one that the source declares, the head's, the one that shows most motion (of
+    equal ones the last by name). An episode that lacks the configured view stays out of Stage I, as the configuration
+    asks.
+    """
+    if configured is not None:
+        return _chosen(episode, configured, "configured")
+    if episode.primary_view in views:
+        return episode
+    if "head" in views:
+        return _chosen(episode, "head", "head")
+    return _chosen(episode, max(views, key=lambda view: (motion(thumbnails[view]), view)), "most_motion")
+
+
+def motion(view: ViewThumbnails) -> float:
+    """Mean absolute change between the moments of a view, in grey levels of 255, over at most 64 moments."""
+    step = max(1, len(view.gray) // 64)
+    moments = view.gray[::step].astype(np.int16)
+    return float(np.abs(np.diff(moments, axis=0)).mean()) if len(moments) > 1 else 0.0
+
+
+def _chosen(episode: Episode, view: str, why: Why) -> Episode:
+    return replace(episode, primary_view=view, conventions={**episode.conventions, PRIMARY_VIEW_REASON: why})

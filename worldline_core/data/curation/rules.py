@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ CURATION_FILE = "curation.json"
 
 
 class Described(Protocol):
-    """What the rules read of a waiting episode: the entries of its part.json."""
+    """A waiting episode, by the entries of its part.json."""
 
     def __getitem__(self, key: str) -> Any: ...
 
@@ -38,19 +39,11 @@ class CurationFindings:
     leakage_action: str
 
     def as_json(self) -> dict[str, Any]:
-        counts: dict[str, int] = {}
-        for row in self.rows:
-            counts[row.reason] = counts.get(row.reason, 0) + 1
         return {
-            "reasons": counts,
+            "reasons": dict(Counter(row.reason for row in self.rows)),
             "scene_leaks": [leak.as_json() for leak in self.leaks],
             "leakage_action": self.leakage_action,
         }
-
-
-def select_episodes(config: CurateConfig, parts: Sequence[Described]) -> list[QuarantineRow]:
-    """Episodes that the rules over the whole set take out; see `curation_findings`."""
-    return list(curation_findings(config, parts).rows)
 
 
 def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> CurationFindings:
@@ -162,7 +155,7 @@ def _near_duplicate(parts: Sequence[Described], left: Sequence[int], found: Near
 
 
 def _crossing(part: Described, original: Described) -> dict[str, Any]:
-    """Both splits, where a copy lies on the other side."""
+    """Both splits, where a copy is in another split than its original."""
     if part["split"] == original["split"]:
         return {}
     return {"split": part["split"], "split_of_original": original["split"]}
@@ -177,7 +170,7 @@ def _scene_view(part: Described, seen: Fingerprint) -> SceneView:
 
 
 def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[SceneLeak]) -> dict[int, QuarantineRow]:
-    """Learning episodes of scenes that are tested on under another name; what tests stays as it is."""
+    """Training and validation episodes of scenes that are tested on under another name; test episodes stay."""
     by_scene: dict[str, SceneLeak] = {}
     for leak in sorted(leaks, key=lambda leak: (leak.distance, leak.testing_scene)):
         by_scene.setdefault(leak.learning_scene, leak)

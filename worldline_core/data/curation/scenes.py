@@ -1,6 +1,7 @@
-"""Splits by scene: a scene belongs to one split, drawn from its name, so that new scenes never move old ones.
+"""Splits by scene, and scenes that leak across the split.
 
-One scene under two names, on both sides of the split: found by the first image of the primary view.
+A scene belongs to one split, drawn from its name, so that new scenes never move old ones. A scene that is both learnt
+from and tested on under two names is found by the first image of the primary view.
 """
 
 from __future__ import annotations

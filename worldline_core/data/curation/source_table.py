@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -58,10 +59,7 @@ def write_source_table(
     table: list[SourceFacts] = []
     for number, (source, identities) in enumerate(zip(config.sources, listed, strict=True)):
         own = config.for_source(number)
-        reasons: dict[str, int] = {}
-        for identity in identities:
-            if identity in reason_of:
-                reasons[reason_of[identity]] = reasons.get(reason_of[identity], 0) + 1
+        reasons = Counter(reason_of[identity] for identity in identities if identity in reason_of)
         table.append(
             SourceFacts(
                 source.label,

@@ -1,4 +1,4 @@
-"""How often each source is drawn in training: a weight an episode by its source, as `ClipSampling.source_weights` takes it.
+"""How often each source is drawn in training: a weight per episode by source, as `ClipSampling.source_weights` takes it.
 
 Sampling by hours alone lets the largest source drown the others; equal shares repeat the smallest ones too often. A
 power between them, share ~ hours ** alpha, is what multilingual and multi-robot training use (Conneau et al. 2020).
@@ -37,7 +37,7 @@ def source_weights(rows: Sequence[EpisodeRow], sampling: SourceSampling) -> dict
 
     Raises: ConfigError when given shares leave a source out, name an unknown one, or are not positive.
     """
-    hours, counts = _hours(rows), _counts(rows)
+    hours, counts = _hours_and_counts(rows)
     if not counts:
         return {}
     if sampling.shares is None:
@@ -57,7 +57,7 @@ def source_weights(rows: Sequence[EpisodeRow], sampling: SourceSampling) -> dict
 
 def write_source_weights(output: Path, rows: Sequence[EpisodeRow], sampling: SourceSampling) -> None:
     """Write source_weights.json: hours, episodes, weight and share of each source that trains."""
-    weights, hours, counts = source_weights(rows, sampling), _hours(rows), _counts(rows)
+    weights, (hours, counts) = source_weights(rows, sampling), _hours_and_counts(rows)
     total = sum(counts.values())
     table = {
         source: {
@@ -85,19 +85,12 @@ def read_source_weights(root: Path) -> dict[str, float]:
         raise DataError("Table of sampling weights is damaged", where=str(path), got=str(error)) from error
 
 
-def _trains(rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
-    return [row for row in rows if row.split == TRAINING_SPLIT and row.stage1_ok]
-
-
-def _hours(rows: Sequence[EpisodeRow]) -> dict[str, float]:
+def _hours_and_counts(rows: Sequence[EpisodeRow]) -> tuple[dict[str, float], dict[str, int]]:
+    """Hours of video and number of episodes by source, of the episodes that train."""
     hours: dict[str, float] = {}
-    for row in _trains(rows):
-        hours[row.source] = hours.get(row.source, 0.0) + row.video_frames / row.fps / 3600
-    return hours
-
-
-def _counts(rows: Sequence[EpisodeRow]) -> dict[str, int]:
     counts: dict[str, int] = {}
-    for row in _trains(rows):
-        counts[row.source] = counts.get(row.source, 0) + 1
-    return counts
+    for row in rows:
+        if row.split == TRAINING_SPLIT and row.stage1_ok:
+            hours[row.source] = hours.get(row.source, 0.0) + row.video_frames / row.fps / 3600
+            counts[row.source] = counts.get(row.source, 0) + 1
+    return hours, counts

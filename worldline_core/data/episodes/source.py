@@ -16,8 +16,8 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
-from worldline_core.data.video.decode import Fit
 from worldline_core.errors import CalibrationError
+from worldline_core.geometry.cameras import Fit
 from worldline_core.geometry.distortion import Distortion, DistortionModel
 
 EVALUATION_LAYOUTS = ("droid annotation", "robotwin")

@@ -18,9 +18,9 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.lerobot.statistics import ImageSampler
 from worldline_core.data.video.clip import VideoClip, damaged_frame, open_video, read_clip
 from worldline_core.data.video.copy import clip_copy
-from worldline_core.data.video.decode import Fit, fitted
 from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat, VideoEncoder
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
+from worldline_core.geometry.cameras import Fit, ImageTransform
 
 VideoMode = Literal["auto", "encode"]
 
@@ -99,7 +99,7 @@ def _copied(recorded: RecordedView, path: Path, fps: float) -> StoredView | None
         return None
     with open_video(recorded.clip.path) as (container, stream):
         size = stream.height, stream.width
-        if fitted(size, recorded.image_size, recorded.fit).steps:
+        if ImageTransform.of(size).fitted(recorded.image_size, recorded.fit).steps:
             return None
         copy = clip_copy(recorded.clip, container, stream)
         if copy is None:
@@ -128,7 +128,7 @@ def _encoded(recorded: RecordedView, path: Path, fps: float, video: VideoSetting
                 small.add(luma, full_range=full_range)
                 image = rgb()
                 if encoder is None or transform is None:
-                    transform = fitted(image.shape[:2], recorded.image_size, recorded.fit)
+                    transform = ImageTransform.of(image.shape[:2]).fitted(recorded.image_size, recorded.fit)
                     encoder = VideoEncoder(
                         path,
                         transform.image_size,

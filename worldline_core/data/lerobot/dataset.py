@@ -22,8 +22,8 @@ from worldline_core.data.guards.plain_files import read_json_lines, read_table
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file
 from worldline_core.data.lerobot.metadata import INDEX, EpisodeTable, read_info, whole_number
-from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import decode_segment, video_size
+from worldline_core.data.video.clip import VideoClip, video_size
+from worldline_core.data.video.frame_decoder import decode_frames
 from worldline_core.errors import DataError
 
 VERSION = "v3.0"
@@ -208,7 +208,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         Raises: DataError when the video is missing, truncated or too short.
         """
         clip = self.clip(episode_index, key)
-        return decode_segment(clip.path, clip.start_time, clip.num_frames, self.fps, indices)
+        return decode_frames(clip, indices)
 
 
 class LeRobotV21Dataset(LeRobotDataset):

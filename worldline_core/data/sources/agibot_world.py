@@ -34,8 +34,7 @@ from worldline_core.data.sources.agibot_gesim import (
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
-from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import video_size
+from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
 View = Literal["head", "left_wrist", "right_wrist"]

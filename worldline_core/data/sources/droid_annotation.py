@@ -25,8 +25,7 @@ from worldline_core.data.guards.plain_files import read_json, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError, check_length, check_rate, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
 from worldline_core.data.sources.ids import by_number, file_ids
-from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import frame_times, video_size
+from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 _GRIPPER = GripperRange(closed=1.0, open=0.0)

@@ -25,8 +25,7 @@ from worldline_core.data.guards.plain_files import read_json, read_json_lines, r
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.ids import file_ids, printable
-from worldline_core.data.video.clip import VideoClip
-from worldline_core.data.video.decode import frame_times, video_size
+from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
 
 MAX_CAPTION_BYTES = 1 << 16

@@ -1,6 +1,6 @@
-"""The encoded video of one view of an episode: where it lies, and its pictures one after the other.
+"""The encoded video of one view of an episode: where it lies, what its file says, and its pictures one after the other.
 
-A picture keeps the decoder's frame: grey values cost nothing, colours only where they are asked for.
+A picture keeps the decoder's frame: grey values cost nothing, colours are converted only when they are asked for.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _LUMA_FIRST = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
 )
 _FULL_RANGE = frozenset(("yuvj420p", "yuvj422p", "yuvj444p", "yuvj440p"))
-# Further from the place of a frame than this share of a frame is not that frame.
 FRAME_TOLERANCE = 0.25
+"""A decoded frame is the wanted one when their times differ by less than this share of a frame's duration."""
 _BOUNDED = {"max_pixels": str(MAX_PIXELS)}
 _MAX_STREAMS = 16
 
@@ -156,6 +156,42 @@ def undecodable(path: AnyPath, error: object) -> RejectedInputError:
         got=str(error),
         next_step="copy the file again; it may be truncated",
     )
+
+
+def video_size(path: AnyPath) -> tuple[int, int, float]:
+    """(height, width, frames per second) from the container, without decoding.
+
+    Raises: DataError when the file is missing or not a video.
+    """
+    with open_video(path) as (_, stream):
+        rate = stream.average_rate or stream.base_rate or Fraction(0)
+        return stream.height, stream.width, float(rate)
+
+
+def frame_times(path: AnyPath) -> np.ndarray:
+    """(N,) float64 presentation times [s] of a video's frames from the first one's, in the order of presentation.
+
+    A packet of video is one frame; those that an edit list cuts away are marked and left out.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no video, or frames without a time),
+        truncated_video.
+    """
+    with open_video(path) as (container, stream):
+        base = stream.time_base or Fraction(1, 1000)
+        ticks = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+    timed = [tick for tick in ticks if tick is not None]
+    if not ticks:
+        raise undecodable(path, "no frames")
+    if len(timed) < len(ticks):
+        raise RejectedInputError(
+            "unreadable",
+            "Frames of the video have no time",
+            where=str(path),
+            expected=f"{len(ticks)} frames with a time",
+            got=f"{len(timed)}",
+        )
+    ordered = np.sort(np.asarray(timed, dtype=np.int64))
+    return (ordered - ordered[0]) * float(base)
 
 
 def seek_before(container: InputContainer, stream: VideoStream, time: float) -> Iterator[VideoFrame]:

@@ -2,13 +2,8 @@
 
 Axis legend: frames are `uint8 (N, H, W, 3)`, RGB, first frame first.
 
-Encoding is single-threaded libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key frame, and
-presentation order equals file order: clips can be joined without encoding again and found by frame number.
-
-Packets of H.264 and H.265 as mp4 holds them: every NAL unit behind its length.
-
-FFmpeg's bitstream filters hand packets on with start codes (Annex B). Its mp4 writer stores them like that when the stream's
-header is one of lengths; its decoders do not mind, while other players, and the joining of LeRobot's tools, do.
+Encoding is single-threaded libx264 without B-frames, so the same frames give the same bytes, each clip starts at a key
+frame, and presentation order equals file order: clips can be joined without encoding again and found by frame number.
 """
 
 from __future__ import annotations
@@ -33,7 +28,10 @@ _START_CODE = b"\x00\x00\x01"
 
 
 def length_prefixed(packet: Packet, stream: VideoStream) -> Packet:
-    """The packet with lengths in the place of start codes, or itself where it has none.
+    """The packet as mp4 holds H.264 and H.265: with the length before each NAL unit instead of a start code.
+
+    FFmpeg's bitstream filters give packets with start codes (Annex B), and its mp4 writer stores them unchanged even
+    when the stream's header announces lengths. FFmpeg decodes that; other players and LeRobot's tools do not.
 
     Args:
         stream: whose header (avcC, hvcC: it begins with 1) says that lengths are expected.

@@ -1,8 +1,8 @@
-"""Exact frames of recordings for training, by one of two decoders that give the same bytes.
+"""Exact frames of recordings, by one of two decoders that give the same bytes.
 
-``torchcodec`` uses the machine's FFmpeg libraries, ``pyav`` carries its own. Either way a frame is found by its
-presentation time, so a frame beside the wanted one is an error and never returned. Decoders keep a bounded number of
-files open: clips of joined videos come from the same files again and again.
+`torchcodec` uses the machine's FFmpeg libraries, `pyav` carries its own. Either way a frame is found by its presentation
+time, so a neighbouring frame is an error and never returned. Decoders keep a bounded number of files open: clips of
+joined videos come from the same files again and again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import av.error
 import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
-from worldline_core.data.guards.source_paths import local_file
+from worldline_core.data.guards.source_paths import AnyPath, local_file
 from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, undecodable, wrong_count
 from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import DataError, UnavailableError
@@ -106,7 +106,7 @@ def torchcodec_name() -> str:
     return f"torchcodec {torchcodec.__version__} (FFmpeg {torchcodec.ffmpeg_major_version})"
 
 
-def frame_times(clip: VideoClip, indices: Sequence[int]) -> list[float]:
+def _frame_times(clip: VideoClip, indices: Sequence[int]) -> list[float]:
     """Presentation times [s] of a clip's frames.
 
     Raises:
@@ -183,7 +183,7 @@ class PyavDecoder:
         self._files: _OpenFiles[_PyavFile] = _OpenFiles(open_files, _PyavFile.close)
 
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
-        times = frame_times(clip, indices)
+        times = _frame_times(clip, indices)
         found = 0
         try:
             file = self._files.get(clip, _PyavFile)
@@ -201,7 +201,7 @@ class PyavDecoder:
                     return
         except av.error.FFmpegError as error:
             self._files.drop(clip)
-            raise undecodable(clip.path, error) from error
+            raise wrong_count(clip.path, len(times), found, str(error)) from error
         self._files.drop(clip)
         raise _lost_frame(clip, len(times), found)
 
@@ -224,7 +224,7 @@ class TorchcodecDecoder:
         self.exact_files: set[str] = set()
 
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
-        times = frame_times(clip, indices)
+        times = _frame_times(clip, indices)
         done = 0
         while done < len(times):
             decoder = self._files.get(clip, self._opened)
@@ -281,3 +281,39 @@ def describe_decoders() -> dict[str, Any]:
         "torchcodec": fault or "loads",
         "next_step": "" if fault is None else FFMPEG_ADVICE,
     }
+
+
+def decode_video(path: AnyPath, expected_frames: int | None = None) -> np.ndarray:
+    """All frames of a video, uint8 (N, H, W, 3), with PyAV.
+
+    Raises: RejectedInputError naming the file and the frame counts when it is truncated, undecodable or of another length.
+    """
+    frames: list[np.ndarray] = []
+    try:
+        with open_video(path) as (container, stream):
+            frames += (f.to_ndarray(format="rgb24") for f in seek_before(container, stream, 0.0) if f.pts is not None)
+    except RejectedInputError as error:
+        if error.reason != "truncated_video":
+            raise
+        raise wrong_count(path, expected_frames, len(frames), str(error.got)) from error
+    if not frames or (expected_frames is not None and len(frames) != expected_frames):
+        raise wrong_count(path, expected_frames, len(frames))
+    return np.stack(frames)
+
+
+def decode_frames(clip: VideoClip, indices: Sequence[int] | None = None) -> np.ndarray:
+    """Exact frames of one clip, uint8 (len, H, W, 3), with PyAV.
+
+    Args:
+        indices: frame numbers inside the clip, in any order, also repeated; None for all.
+
+    Raises: DataError when an index lies outside of the clip; RejectedInputError when a frame cannot be decoded.
+    """
+    wanted = range(clip.num_frames) if indices is None else [int(index) for index in indices]
+    ordered = sorted(set(wanted))
+    decoder = PyavDecoder(open_files=1)
+    try:
+        frames = dict(zip(ordered, decoder.frames(clip, ordered), strict=True))
+    finally:
+        decoder.close()
+    return np.stack([frames[index] for index in wanted])

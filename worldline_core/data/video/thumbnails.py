@@ -1,11 +1,9 @@
 """Small grey pictures of a view and its sharpness: all that filters and fingerprints look at.
 
-They come from the luma plane of the decoded video; no colour picture is made for them.
-
-Thumbnails that curation left beside a set, so that filtering need not decode the same videos again.
-
-They lie in the set's `run/thumbnails`, which belongs to no digest: without them everything is computed again from the
-stored videos, to the same bytes. Each names the digest of the video that it was made from and is not used for another one.
+They come from the luma plane of the decoded video; no colour picture is made for them. Curation leaves them in the set's
+`run/thumbnails`, so that filtering need not decode the same videos again. That folder belongs to no digest: without it
+everything is computed from the stored videos, to the same bytes. Each file names the digest of its video and is not used
+for another one.
 """
 
 from __future__ import annotations
@@ -133,8 +131,8 @@ def _sharpness(luma: np.ndarray) -> float:
     return cv2.norm(laplacian, cv2.NORM_L2SQR) / laplacian.size - mean**2
 
 
-# Raised whenever thumbnails of the same video come out differently.
 _VERSION = "1"
+"""Raised whenever thumbnails of the same video come out differently."""
 _SUFFIX = ".arrow"
 
 

@@ -18,11 +18,11 @@ from torch.nn import functional
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.decode import resize_frames, resize_masks
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metrics import frames_to_unit, video_iou
 from worldline_core.evaluation.segmenters.augmentation import augment, degrade
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
+from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.training.trainer import (
     Objective,
     OptimizerConfig,
@@ -181,8 +181,9 @@ def _load(episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] |
     masks = episodes.robot_masks(index, HEAD)
     if masks is None:
         return None
-    frames = resize_frames(episodes.frames(index, HEAD)[::stride], size)
-    return MaskedVideo(episodes.rows[index].episode_id, frames, resize_masks(masks[::stride], size))
+    frames = episodes.frames(index, HEAD)[::stride]
+    resized = ImageTransform.of((frames.shape[1], frames.shape[2])).fitted(size)
+    return MaskedVideo(episodes.rows[index].episode_id, resized.frames(frames), resized.masks(masks[::stride]))
 
 
 def _measure(episodes: EpisodeSet, config: SegmenterConfig, state: Mapping[str, Tensor]) -> dict[str, Any]:
