@@ -15,9 +15,9 @@ from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
+from worldline_core.report.filters import CUT, QUARANTINED, episode_of, filter_refusals, first_of_each_episode
 from worldline_core.report.inspect import inspect
 from worldline_core.report.inspect_filters import FilteredSet
-from worldline_core.report.refusals import CUT, QUARANTINED, episode_of, filter_refusals, first_of_each_episode
 from worldline_core.store.artifact_files import read_rows
 from worldline_core.store.atomic import write_json_atomic
 

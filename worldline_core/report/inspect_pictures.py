@@ -17,7 +17,7 @@ from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenl
 from worldline_core.pictures.labels import Picture, png_bytes
 from worldline_core.report.actions import episode_overlay
 from worldline_core.report.episode_sheet import MOMENTS, episode_rows, one_of_each
-from worldline_core.report.refusals import episode_of
+from worldline_core.report.filters import episode_of
 from worldline_core.store.artifact_files import linked_folder, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
 
