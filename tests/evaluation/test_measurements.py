@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from tests.evaluation.conftest import make_film
-from worldline_core.evaluation.policy.coloured_things import (
+from worldline_core.evaluation.policy.measured_judge import score
+from worldline_core.evaluation.policy.measurements import (
+    LATE_COUNT,
     ColouredThing,
     OwnColour,
     colour_share,
     likeness,
+    measure_lift,
     named_things,
     own_colour,
 )
-from worldline_core.evaluation.policy.measured_judge import score
-from worldline_core.evaluation.policy.measurements import LATE_COUNT, measure_lift
 
 CUBE = ColouredThing("red", "cube")
 

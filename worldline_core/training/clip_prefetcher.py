@@ -1,8 +1,8 @@
 """Processes that read clips ahead of training, in the order that training asks for them.
 
 Micro-step i belongs to process i modulo their number, and to one of a fixed number of slots in memory that all processes
-share: the order does not depend on which process is faster, and no more than the slots is ever held. The slots are used
-again and again, because the page faults of fresh shared memory cost about as much as decoding into it.
+share: the order does not depend on which process is faster, and memory is bounded by the slots. Slots are reused, because
+the page faults of fresh shared memory cost about as much as decoding into it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from worldline_core.errors import TrainingError, WorldLineError
 from worldline_core.training.clip_loader import ClipReader, ReadBatch, SkippedClip
 from worldline_core.training.clip_source import ClipBatch
 
-_PATIENCE_SECONDS = 5.0
+_JOIN_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a process says of a micro-step; the clips themselves lie in the slot."""
+    """What a process reports of a micro-step; the clips themselves lie in the slot."""
 
     index: int
     batch: ClipBatch
@@ -105,7 +105,7 @@ class ClipPrefetcher:
         for _, connection in workers:
             connection.close()
         for process, _ in workers:
-            process.join(_PATIENCE_SECONDS)
+            process.join(_JOIN_SECONDS)
             if process.is_alive():
                 process.terminate()
                 process.join()
@@ -140,7 +140,7 @@ class ClipPrefetcher:
         """Ask for everything that there is a slot for while ``index`` is in use."""
         end = index + self._slots if self._stop is None else min(index + self._slots, max(self._stop, index + 1))
         for ahead in range(self._sent, end):
-            # A process that has ended is said to have when its answer is missed: earlier ones are still to be read.
+            # That a process has ended is reported when its answer is missing: earlier answers can still be read.
             with suppress(BrokenPipeError, ConnectionResetError):
                 self._worker(ahead)[1].send((ahead, self._offset(ahead)))
             self._outstanding.append(ahead)
@@ -151,7 +151,7 @@ class ClipPrefetcher:
         try:
             answer_index, answer = connection.recv()
         except (EOFError, ConnectionResetError):
-            process.join(_PATIENCE_SECONDS)
+            process.join(_JOIN_SECONDS)
             code = process.exitcode
             clips = "; ".join(str(clip) for clip in self._reader.sampler.clips(index).clips)
             self.close()
@@ -167,7 +167,7 @@ class ClipPrefetcher:
         return answer
 
     def _restart(self, index: int) -> None:
-        """Another place in the order: what is still being read is awaited and dropped."""
+        """Continue at another micro-step: what is still being read is awaited and dropped."""
         while self._outstanding:
             self._receive(self._outstanding[0])
         self._first = self._sent = index

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from safetensors.torch import save_file
 from torch import Tensor
+from tqdm import tqdm
 
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.latent_store import (
@@ -25,10 +30,6 @@ from worldline_core.training.latent_store import (
     single_key,
     write_store_index,
 )
-
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode_index import EpisodeRow
-    from worldline_core.data.episodes.episode_set import EpisodeSet
 
 
 class EncodeLatentsConfig(StrictModel):
@@ -135,12 +136,6 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
     Raises:
         DataError: if no episode is selected, or frames and index disagree.
     """
-    from tqdm import tqdm
-
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
-    from worldline_core.model.video_tokenizer import frames_to_video
-
     episodes = EpisodeSet.open(inputs["episodes"])
     tokenizer = load_tokenizer(inputs["tokenizer"])
     if isinstance(tokenizer, torch.nn.Module):

@@ -126,12 +126,3 @@ class RelationalScales:
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from a training state."""
         self.ratios = {name: float(value) for name, value in state.items()}
-
-
-def student_tokens_to_grid(
-    tokens: Tensor, views: int, frames: int, rows: int, columns: int
-) -> Float[Tensor, "b v t h w d"]:
-    """Model features to a grid; accepts the token sequence ``b (t v h w) d`` or a grid."""
-    if tokens.ndim == 6:
-        return tokens
-    return rearrange(tokens, "b (t v h w) d -> b v t h w d", v=views, t=frames, h=rows, w=columns)

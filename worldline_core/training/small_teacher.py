@@ -1,10 +1,8 @@
-"""The small frozen video encoder of the embedded default: a masked-video transformer trained on the recordings.
+"""The small frozen video encoder of the embedded default, and the train_teacher step that trains it on the recordings.
 
-It reads 64 x 96 video in tubelets (the first frame alone, then groups of four frames, as the tokenizer does) and is
-trained by masked prediction: a part of the tubelets is hidden, and their normalised pixels are predicted from the
-rest. Its features are the normalised outputs of its last four blocks, concatenated, as with the full-size teacher.
-
-The train_teacher step: the small video encoder of the embedded default learns from the training recordings.
+A masked-video transformer: it reads 64 x 96 video in tubelets (the first frame alone, then groups of four frames, as the
+tokenizer does); part of the tubelets is hidden, and their normalised pixels are predicted from the rest. Its features are
+the normalised outputs of its last four blocks, concatenated, as with the full-size teacher.
 """
 
 from __future__ import annotations

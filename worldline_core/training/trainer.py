@@ -33,7 +33,7 @@ from worldline_core.training.training_state import (
 )
 
 # The first process makes the offline trajectories alone: at full size that takes hours while the others wait.
-_PATIENCE = timedelta(hours=24)
+_PROCESS_TIMEOUT = timedelta(hours=24)
 
 
 def join_processes(device: str) -> tuple[int, int]:
@@ -47,12 +47,12 @@ def join_processes(device: str) -> tuple[int, int]:
         on_gpu = torch.device(device).type == "cuda"
         if on_gpu:
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-        torch.distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PATIENCE)
+        torch.distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PROCESS_TIMEOUT)
     return rank, world_size
 
 
 def wait_for_all() -> None:
-    """Return once every process has come here; at once when there is only this one."""
+    """Return once every process has called this; at once when there is only one."""
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
 

@@ -1,4 +1,4 @@
-"""Frozen video encoders that teach relations, and the cache of what they say about a clip.
+"""Frozen video encoders whose features the relational terms compare with, and a cache of the features of clips.
 
 ``SmallVideoTeacher`` is the embedded default (trained by the train_teacher step); ``VJepa2Teacher`` is V-JEPA 2 from a
 local folder. Neither is ever used with random weights.
@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.small_teacher import DESCRIPTION, load_small_teacher
@@ -117,8 +118,6 @@ class TeacherFeatures:
     """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
 
     def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
-        from worldline_core.data.episodes.episode_set import EpisodeSet
-
         self.teacher = teacher
         self.episodes = EpisodeSet.open(episodes)
         self.cached_clips = cached_clips

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from worldline_core.evaluation.policy.coloured_things import named_things
 from worldline_core.evaluation.policy.evidence import (
     SCHEMAS,
     Evidence,
@@ -34,6 +33,7 @@ from worldline_core.evaluation.policy.measurements import (
     measure_lift,
     measure_place,
     measure_push,
+    named_things,
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 

@@ -33,7 +33,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Video:
-    """Chosen frames (n, h, w, 3) of a clip; ``indices`` are their numbers in it, at ``fps`` frames a second."""
+    """Chosen frames (n, h, w, 3) of a clip; ``indices`` are their numbers in it, recorded at ``fps`` [1/s]."""
 
     frames: np.ndarray
     indices: tuple[int, ...]
