@@ -87,7 +87,7 @@ def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megab
         path = root / DATA_PATH.format(chunk_index=file // _CHUNK_SIZE, file_index=file % _CHUNK_SIZE)
         write_table_atomic(path, table.slice(begin, end - begin), rows_per_group=[lengths[index] for index in members])
     for index, episode in enumerate(episodes):
-        statistics = _episode_statistics(episode, table.slice(int(starts[index]), lengths[index]))
+        statistics = _statistics([episode], table.slice(int(starts[index]), lengths[index]))
         row: dict[str, Any] = {
             "episode_index": index,
             "tasks": [episode.instruction],
@@ -105,7 +105,7 @@ def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megab
         rows.append(row)
     write_table_atomic(root / _EPISODES_PATH, pa.Table.from_pylist(rows))
     write_table_atomic(root / "meta" / "tasks.parquet", _tasks_table(instructions))
-    write_json_atomic(root / "meta" / "stats.json", as_json(_dataset_statistics(episodes, table)))
+    write_json_atomic(root / "meta" / "stats.json", as_json(_statistics(episodes, table)))
     write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions), video_megabytes, fps))
 
 
@@ -146,7 +146,7 @@ def _data_table(episodes: Sequence[DatasetEpisode], starts: np.ndarray, task_of:
 
 
 def _video_files(episodes: Sequence[DatasetEpisode], view: str, megabytes: int) -> list[list[DatasetEpisode]]:
-    """Which episodes share a file: those encoded here up to a size, none where the video was copied as it was recorded.
+    """Which episodes share a file: those encoded here up to a size; a video that was copied as it was recorded has its own.
 
     Copied videos may differ in parameter sets, and have frames stored out of order: joined they could not be found again
     exactly.
@@ -213,18 +213,13 @@ def _column(table: pa.Table, name: str) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _episode_statistics(episode: DatasetEpisode, table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
+def _statistics(episodes: Sequence[DatasetEpisode], table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
+    """Feature -> statistics over these episodes, whose rows are the table's."""
     statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
-    for view in episode.videos:
-        statistics[IMAGE_PREFIX + view] = image_statistics([episode.videos[view].histogram], episode.num_frames)
-    return statistics
-
-
-def _dataset_statistics(episodes: Sequence[DatasetEpisode], table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
-    statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
+    num_frames = sum(episode.num_frames for episode in episodes)
     for view in episodes[0].videos:
         histograms = [episode.videos[view].histogram for episode in episodes]
-        statistics[IMAGE_PREFIX + view] = image_statistics(histograms, sum(episode.num_frames for episode in episodes))
+        statistics[IMAGE_PREFIX + view] = image_statistics(histograms, num_frames)
     return statistics
 
 
