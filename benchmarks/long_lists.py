@@ -35,9 +35,10 @@ def write(folder: Path, kind: str, count: int) -> None:
     if kind == "index":
         rows = [
             EpisodeRow(
-                f"episode-{n:07d}", f"datasets/robot-{n % 5}", n, 0, 900, 900, 900, 30.0, "source", "ur5e_pair",
-                f"scene-{n % 5000}", "lift", f"task {n % 3500}", "success", "train",
-                ("head", "left_wrist", "right_wrist"), None, None, "head",
+                episode_id=f"episode-{n:07d}", dataset=f"datasets/robot-{n % 5}", episode_index=n, start=0, stop=900,
+                num_frames=900, video_frames=900, fps=30.0, source="source", embodiment="ur5e_pair",
+                scene=f"scene-{n % 5000}", task_family="lift", instruction=f"task {n % 3500}", outcome="success",
+                split="train", views=("head", "left_wrist", "right_wrist"),
             )
             for n in range(count)
         ]  # fmt: skip

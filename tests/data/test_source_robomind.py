@@ -290,6 +290,8 @@ def test_texts_and_attributes(tmp_path: Path) -> None:
 
 
 def test_the_shipped_configurations_are_complete(project_root: Path) -> None:
-    for file in sorted((project_root / "configs/sources").glob("robomind*.yaml")):
+    files = sorted((project_root / "configs/sources").glob("robomind*.yaml"))
+    assert files
+    for file in files:
         for source in yaml.safe_load(file.read_text())["curate"]["sources"]:
             RobomindSourceConfig.model_validate(source)

@@ -128,7 +128,7 @@ def test_a_folder_that_could_not_be_listed_is_not_left_out(monkeypatch: pytest.M
         fs.pipe_file(f"/bucket/{name}", b"x")
     location = UPath("memory://bucket")
     monkeypatch.setattr(type(location), "fs", fs)
-    with pytest.raises(UnreachableInputError):  # every attempt fails in the second folder
+    with pytest.raises(UnreachableInputError, match="could not be reached"):  # every attempt in the second folder
         list_files(location)
     monkeypatch.setattr(Forgetful, "ls", MemoryFileSystem.ls)
     assert list(list_files(location)) == ["a.txt", "one/b.txt"]

@@ -82,7 +82,9 @@ def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     local = tmp_path / "recordings"
     settings = write(local, sample)
     remote = UPath(f"memory://{tmp_path.name}/recordings")
-    for file in (path for path in local.rglob("*") if path.is_file()):
+    files = [path for path in local.rglob("*") if path.is_file()]
+    assert files
+    for file in files:
         (remote / file.relative_to(local).as_posix()).parent.mkdir(parents=True, exist_ok=True)
         (remote / file.relative_to(local).as_posix()).write_bytes(file.read_bytes())
 
