@@ -1,7 +1,7 @@
-"""What entries of variable length in an HDF5 file claim, before the library believes it.
+"""What entries of variable length in an HDF5 file claim, checked before the library allocates it.
 
 An entry is a length (4 bytes), the address of a heap and an index into it. The library allocates the length, up to 4 GB
-each, and walks through the heap's objects for ever where one has no size. No entry can be longer than its file, and every
+each, and walks through the heap's objects forever where one has no size. No entry can be longer than its file, and every
 object must lead on to the next. (HDF5 file format specification, "Global Heap" and "Variable-Length".)
 """
 
