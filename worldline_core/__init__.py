@@ -1,1 +1,20 @@
-"""WorldLine: from robot recordings to an action-driven visual simulator."""
+"""WorldLine: from robot recordings to an action-driven visual simulator.
+
+``WorldLine.from_pretrained(folder).predict(images, controls, cameras)`` predicts videos; importing the package alone
+imports no torch.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from worldline_core.rollout.worldline import Camera, WorldLine
+
+__all__ = ["Camera", "WorldLine"]
+
+
+def __getattr__(name: str) -> object:
+    if name in __all__:
+        from worldline_core.rollout import worldline
+
+        return getattr(worldline, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from worldline_core.data.video.decode import decode_video
 
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -27,6 +28,12 @@ def _run(project_root: Path, name: str, *arguments: str | Path) -> str:
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
+
+
+def test_predict_a_video(project_root: Path, tmp_path: Path) -> None:
+    printed = _run(project_root, "predict_video.py", "--frames", 17, "--output", tmp_path / "prediction.mp4")
+    assert "17 frames" in printed
+    assert decode_video(tmp_path / "prediction.mp4", expected_frames=17).shape == (17, 64, 2 * 96, 3)
 
 
 def test_check_calibration(project_root: Path, tmp_path: Path) -> None:

@@ -1,0 +1,152 @@
+"""The public entry: a model of a folder, first images and controls in, videos out."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core import Camera, WorldLine
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.episode_tracks import write_index, write_shard
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import CheckpointError, ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.rollout import RolloutConfig, rollout
+from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
+
+FRAMES = 17
+
+
+class Observation:
+    """The first held-out recording of a UR5e pair, as a user would have it at hand."""
+
+    def __init__(self, recordings: Path) -> None:
+        self.set = EpisodeSet.open(recordings)
+        self.position = next(
+            i for i, row in enumerate(self.set.rows) if row.embodiment == "ur5e_pair" and row.split == "test"
+        )
+        self.episode = self.set.episode(self.position)
+        self.images = {view: self.set.frames(self.position, view, [0])[0] for view in self.episode.cameras}
+        self.controls = self.episode.action[:FRAMES]
+        self.cameras = {view: Camera(camera.K) for view, camera in self.episode.cameras.items()}
+        head = self.episode.cameras["head"]
+        self.cameras["head"] = Camera(head.K, head.T_base_camera[0])
+
+
+@pytest.fixture(scope="module")
+def observed(project_root: Path) -> Observation:
+    return Observation(project_root / "artifacts" / "shipped" / "recordings")
+
+
+@pytest.fixture(scope="module")
+def models(project_root: Path) -> Path:
+    return project_root / "artifacts" / "shipped" / "models"
+
+
+@pytest.fixture(scope="module")
+def causal(models: Path) -> WorldLine:
+    return WorldLine.from_pretrained(models / "causal")
+
+
+@pytest.mark.parametrize(("kind", "sampler", "steps"), [("causal", "block_causal", None), ("stage2", "full_clip", 1)])
+def test_a_prediction_is_the_rollout_steps(
+    observed: Observation, models: Path, tmp_path: Path, kind: str, sampler: str, steps: int | None
+) -> None:
+    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_pair")))
+    write_index(tmp_path / "tracks", write_shard(tmp_path / "tracks", 0, [tracks]), sigma_px_ref=36.0)
+    config = RolloutConfig.model_validate(
+        {
+            "sampler": sampler,
+            "steps": steps,
+            "num_frames": FRAMES,
+            "embodiments": ["ur5e_pair"],
+            "max_episodes_per_embodiment": 1,
+        }
+    )
+    inputs = {"episodes": observed.set.root, "tracks": tmp_path / "tracks", "tokenizer": models / "tokenizer"}
+    rollout(config, inputs | {"checkpoint": models / kind}, tmp_path / "rollout")
+    world = WorldLine.from_pretrained(models / kind, steps=steps)
+    predicted = world.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_pair")
+    writer = RolloutSetWriter(tmp_path / "mine", "worldline", 8.0)
+    writer.add(observed.episode.episode_id, 42, predicted)
+    writer.close()
+    steps_own, mine = RolloutSet.open(tmp_path / "rollout"), RolloutSet.open(tmp_path / "mine")
+    for view in world.views:
+        assert predicted[view].shape == (FRAMES, 64, 96, 3)
+        assert predicted[view].dtype == np.uint8
+        expected = steps_own.frames(observed.episode.episode_id, view)
+        assert np.array_equal(mine.frames(observed.episode.episode_id, view), expected), view
+
+
+def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLine) -> None:
+    def predict(controls: np.ndarray, seed: int = 42) -> np.ndarray:
+        videos = causal.predict(observed.images, controls, observed.cameras, embodiment="ur5e_pair", seed=seed)
+        return videos["head"]
+
+    first = predict(observed.controls)
+    assert np.array_equal(first, predict(observed.controls))
+    assert not np.array_equal(first, predict(observed.controls, seed=43))
+    still = np.repeat(observed.controls[:1], FRAMES, axis=0)
+    assert not np.array_equal(first, predict(still))
+
+
+def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:
+    """Tools and wrist cameras of the same motion, given instead of the joints: the same maps, so the same video."""
+    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_pair")))
+    cameras = {
+        view: Camera(camera.K, tracks.T_base_camera[:FRAMES, v])
+        for v, (view, camera) in enumerate(observed.episode.cameras.items())
+        if view != "head"
+    }
+    poses = tracks.T_base_tool[:FRAMES].astype(np.float64)
+    # Stored in float32: made rigid again.
+    poses[..., :3, :3] = np.linalg.svd(poses[..., :3, :3])[0] @ np.linalg.svd(poses[..., :3, :3])[2]
+    by_tools = causal.predict(
+        observed.images,
+        None,
+        {"head": observed.cameras["head"], **cameras},
+        tool_poses=poses,
+        gripper=tracks.gripper[:FRAMES, 0],
+    )
+    by_joints = causal.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_pair")
+    for view in causal.views:
+        assert np.abs(by_tools[view].astype(int) - by_joints[view].astype(int)).mean() < 0.5, view
+
+
+def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, models: Path, tmp_path: Path) -> None:
+    def refused(match: str, error: type[Exception] = DataError, **changes: object) -> None:
+        given: dict[str, object] = {
+            "images": observed.images,
+            "controls": observed.controls,
+            "cameras": observed.cameras,
+            "embodiment": "ur5e_pair",
+        }
+        with pytest.raises(error, match=match):
+            causal.predict(**(given | changes))  # type: ignore[arg-type]
+
+    refused("driven by controls of an embodiment, or by tool poses", embodiment=None)
+    refused(r"(?s)1 \+ k \* 16 rows.*got: 16", controls=observed.controls[:16])
+    refused("images are not those of the model's views", images={"head": observed.images["head"]})
+    refused("cameras are not those of the model's views", cameras={})
+    refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
+    refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(np.eye(3))})
+    refused("camera pose has a wrong shape", cameras=observed.cameras | {"head": Camera(np.eye(3), np.eye(3))})
+    refused("Unknown embodiment", ConfigError, embodiment="ur55_pair")
+    with pytest.raises(CheckpointError, match="tokenizer is not here"):
+        WorldLine.from_pretrained(models / "causal", tokenizer=tmp_path / "none")
+    with pytest.raises(CheckpointError, match=r"(?s)wrong kind.*stage2 or causal.*base"):
+        WorldLine.from_pretrained(models / "base")
+    with pytest.raises(CheckpointError, match="Only a causal model goes block by block"):
+        WorldLine.from_pretrained(models / "stage2").simulator([42])
+
+
+def test_importing_the_package_imports_no_torch() -> None:
+    code = "import sys, worldline_core; assert 'torch' not in sys.modules; worldline_core.WorldLine"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'Simulator'"):
+        __import__("worldline_core").Simulator  # noqa: B018
