@@ -1,23 +1,14 @@
 """Auxiliary objectives of Stage III and their weights (appendix, "Score-Based Distribution Matching").
 
-Axes: b clips, v views, c latent channels, t latent frames (the observed one first), h and w rows and columns.
+Perceptual: LPIPS of decoded frames. It needs the LPIPS weights in a local folder; without them the term is off and says
+so, for a network with random weights would be no perceptual distance.
 
-The perceptual auxiliary (L_LPIPS): distance of decoded frames in a pretrained network's features.
+Robot-focused: few-step students spend their capacity on the static background. These two terms look only at the robot:
+an L2 distance on its latents and an L1 distance on their temporal differences, each divided by the area of the mask, so
+that a distant robot counts as much as a near one; the wrist views count twice. The masks come from the capsules stored
+with the action tracks; they weigh losses only, no model ever receives them.
 
-It needs the LPIPS weights in a local folder. Without them the term is off, and says so: a network with random weights
-would be no perceptual distance.
-
-Robot-focused losses: what the robot region of a predicted clip must reproduce (paper, Stage III).
-
-Few-step students tend to spend their capacity on the static background.  These two terms look only at the
-robot: an L2 distance on its latents and an L1 distance on their temporal differences, each divided by the area
-of the mask so that a distant robot counts as much as a near one, the wrist views twice.
-
-Axes: b clips, v views, c latent channels, t latent frames, h and w latent rows and columns.
-
-Robot masks of training clips at latent resolution, from the capsules stored with the action tracks.
-
-Masks weigh the robot-focused losses during distillation; no model ever receives them.
+Axes: b clips, v views, c latent channels, t latent frames (the observed one first), h and w latent rows and columns.
 """
 
 from __future__ import annotations
@@ -136,7 +127,7 @@ def robot_motion_loss(
 
 
 PerceptualDistance = Callable[[Tensor, Tensor], Tensor]
-"""Distance of two latent clips `b v c t h w` after decoding; see `perceptual.py`."""
+"""Distance of two latent clips `b v c t h w` after decoding; see :class:`PerceptualLoss`."""
 
 
 class AuxiliaryWeights(StrictModel):

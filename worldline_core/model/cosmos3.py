@@ -1,7 +1,4 @@
-"""Reading a pretrained Cosmos3 transformer from a local diffusers folder.
-
-Turn pretrained Cosmos3 weights into the base checkpoint that Stage I starts from.
-"""
+"""Pretrained Cosmos3 weights (a local diffusers folder) as the base checkpoint that Stage I starts from."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""One layer of the mixture of transformers: an understanding half (text) beside a generation half (video).
+"""Layers of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
-Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
-
-Sinusoidal time embedding, added to noisy tokens only.
-
-Action maps to token residuals (docs/method.md section 2).
+Also the sinusoidal time embedding, added to noisy tokens only, and the action encoder, which turns action maps into
+token residuals (docs/method.md). Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state
+dict loads directly.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
 The first frame is coded alone in 8 x 8 patches, then groups of four frames in 4 x 8 x 8 patches. The orthonormal basis
 of a group has two parts: *static* vectors, constant over the four frames, whose spatial patterns are also those of the
 first frame; and *motion* vectors, which sum to zero over time. A group in which nothing moves is therefore coded
-exactly as the first frame is, with zero motion channels: copying the background is the identity on latents.
-
-The convolutional decoder of the patch tokenizer: sharpens, and copies what still equals the observed frame.
+exactly as the first frame is, with zero motion channels: copying the background is the identity on latents. The
+decoder sharpens, and copies what still equals the observed frame.
 """
 
 from __future__ import annotations

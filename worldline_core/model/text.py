@@ -1,6 +1,6 @@
-"""Task text as Cosmos3 was trained to read it: Qwen2 ids of a chat with a system prompt and the clip's facts.
+"""Task text as token ids: UTF-8 bytes for the embedded models, the backbone's own chat prompt at full size.
 
-Task text as token ids. The embedded default reads UTF-8 bytes; the full size reads the backbone's own chat prompt.
+Cosmos3 was trained to read Qwen2 ids of a chat with a system prompt, the instruction, and the clip's length and size.
 """
 
 from __future__ import annotations
