@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jaxtyping
 import pytest
+
+from tools.runtime_shapes import checked
 
 if TYPE_CHECKING:
     from worldline_core.model.contracts import ActionContract, CausalSpec
     from worldline_core.model.world_model import WorldModel
 
+CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", "rollout")
+"""Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
+jaxtyping.install_import_hook(
+    [f"worldline_core.{name}" for name in CHECKED_PACKAGES], f"{checked.__module__}.{checked.__name__}"
+)
+
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def unchecked_shapes() -> Iterator[None]:
+    """For tests that hand in wrong shapes on purpose, to see what production code says of them."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

@@ -176,6 +176,7 @@ def test_copies_of_a_cache_go_on_separately(model: WorldModel) -> None:
     assert (cache.frames, other.frames) == (1, 1 + BLOCK)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_misuse_is_refused(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
     with pytest.raises(DataError, match="one sigma per block"):

@@ -108,6 +108,7 @@ def test_blocks_decode_as_they_arrive(fitted: PatchTokenizer) -> None:
     torch.testing.assert_close(block[:, :, 1:], fitted.decode(latents)[:, :, 5:], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_a_short_training_improves_on_the_linear_decode_by_using_the_reference(tmp_path: Path) -> None:
     videos = views(2)
     tokenizer = fit_patch_tokenizer([scenes()], channels=8, refinement_width=8, refinement_depth=1)

@@ -190,6 +190,7 @@ def test_a_fresh_model_starts_at_zero_velocity(build: Build) -> None:
     torch.testing.assert_close(one_step, latents[:, :, :, :1].expand_as(one_step))
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_shapes_that_do_not_fit_are_refused(build: Build) -> None:
     latents, maps, sigma = sample()
     model = build()

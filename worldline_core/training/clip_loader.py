@@ -64,7 +64,7 @@ class Batch:
     action_maps: Float[Tensor, "b v 9 t h w"] | None = None
     text_ids: Int[Tensor, "b n"] | None = None
     text_mask: Bool[Tensor, "b n"] | None = None
-    frames: UInt8[Tensor, "b v n h w 3"] | None = None
+    frames: UInt8[Tensor, "b v frames height width 3"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ class Encoder(Protocol):
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]: ...
 
 
-def encode_clip(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h w"]:
+def encode_clip(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h_l w_l"]:
     """Latents of one clip (RGB in [-1, 1]), rounded to half precision as they are stored."""
     with torch.no_grad():
         return tokenizer.encode(video[None].to(device))[0].to("cpu", torch.float16)
@@ -70,7 +70,7 @@ def encode_episode(
     videos: Float[Tensor, "v 3 n h w"],
     layout: Layout,
     config: EncodeLatentsConfig,
-) -> dict[str, Float[Tensor, "v c t h w"]]:
+) -> dict[str, Float[Tensor, "v c t h_l w_l"]]:
     """All tensors of one episode, by their names in the shard."""
     count = videos.shape[2]
     tensors: dict[str, Tensor] = {}

@@ -126,7 +126,7 @@ class SmallVideoTeacher(nn.Module):
             outputs.append(tokens)
         return outputs[-BLOCKS:]
 
-    def masked_loss(self, frames: Float[Tensor, "b 3 t h w"], hidden: Bool[Tensor, "b t n"]) -> Float[Tensor, ""]:
+    def masked_loss(self, frames: Float[Tensor, "b 3 t h w"], hidden: Bool[Tensor, "b bins n"]) -> Float[Tensor, ""]:
         """Squared error of the hidden tubelets' pixels.
 
         The target is the change against the clip's first frame, scaled by its deviation over the clip: predicting it

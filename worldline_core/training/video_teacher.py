@@ -124,7 +124,7 @@ class TeacherFeatures:
         self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Tensor] = OrderedDict()
 
     def features(
-        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n h w 3"] | None = None
+        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n height width 3"] | None = None
     ) -> Float[Tensor, "b v t h w d"]:
         """Features of every clip and view.
 
@@ -136,7 +136,7 @@ class TeacherFeatures:
         return torch.stack([self._clip(c, tuple(views), f).float() for c, f in zip(clips, given, strict=True)])
 
     def _clip(
-        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n h w 3"] | None
+        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n height width 3"] | None
     ) -> Float[Tensor, "v t h w d"]:
         key = (clip, views)
         if key in self._cache:
