@@ -13,9 +13,10 @@ from typing import Any
 
 from prefect import Task
 from prefect.cache_policies import CachePolicy
+from prefect.client.schemas.objects import RunInput, State, TaskRunResult
 from prefect.context import TaskRunContext
-from prefect.futures import PrefectFuture
-from prefect.task_runners import TaskRunner
+from prefect.futures import PrefectConcurrentFuture
+from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.command_line import log_to_stderr
 from tasks.shard_mapper import shard_mapper
@@ -75,21 +76,24 @@ class ArtifactTask:
         store_root: Path,
         name: str,
         runner: RunnerConfig,
-        pool: Callable[[], TaskRunner[Any]] | None,
-        after: Sequence[PrefectFuture[Any]] = (),
-    ) -> tuple[PrefectFuture[Any] | ArtifactReference, bool]:
+        pool: Callable[[], ProcessPoolTaskRunner] | None,
+        after: Sequence[State[Any]] = (),
+    ) -> tuple[PrefectConcurrentFuture[Any] | State[Any], bool]:
         """Start the step in a pool's process, or, where it is finished or there is no pool, do it here and now.
 
         Args:
-            after: finished tasks whose artifacts it uses, so that Prefect shows what depends on what.
+            after: how the tasks ended whose artifacts it uses, so that Prefect shows what depends on what.
 
         Returns:
-            The running task, or the artifact; and whether the artifact was there already.
+            The running task, or how it ended; and whether the artifact was there already.
         """
         task, parameters, finished = self._prepared(config, inputs, store_root, name, runner)
         if pool is None or finished:
-            return ArtifactReference.model_validate(task(**parameters, wait_for=after)), finished
-        return pool().submit(task, parameters, wait_for=after), False
+            ended: State[Any] = task(**parameters, wait_for=list(after), return_state=True)  # pyright: ignore[reportAssignmentType]
+            return ended, finished
+        ids = [state.state_details.task_run_id for state in after]
+        runs: set[RunInput] = {TaskRunResult(id=run) for run in ids if run}  # pyright: ignore[reportUnhashable] - frozen
+        return pool().submit(task, parameters, dependencies={"inputs": runs}), False
 
     def _prepared(
         self,

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
 from prefect.client.orchestration import get_client
-from prefect.futures import PrefectFuture, as_completed
+from prefect.client.schemas.objects import State
+from prefect.futures import PrefectConcurrentFuture
 from prefect.settings import PREFECT_API_URL, temporary_settings
-from prefect.task_runners import TaskRunner
+from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.artifact_task import ArtifactReference, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
 from worldline_core.scale.mapping import RunnerConfig
+
+POLL_SECONDS = 0.1
 
 
 class RunWatcher(Protocol):
@@ -56,15 +60,15 @@ class _Run:
         store_root: Path,
         runner: RunnerConfig,
         watcher: RunWatcher | None,
-        pool: Callable[[], TaskRunner[Any]] | None,
+        pool: Callable[[], ProcessPoolTaskRunner] | None,
     ) -> None:
         self.store_root = store_root
         self.runner = runner
         self.watcher = watcher
         self.pool = pool
         self.done: dict[str, ArtifactReference] = {}
-        self.running: dict[str, PrefectFuture[Any]] = {}
-        self._ended: dict[str, PrefectFuture[Any]] = {}
+        self.running: dict[str, PrefectConcurrentFuture[Any]] = {}
+        self._ended: dict[str, State[Any]] = {}
 
     def has_inputs(self, node: Node) -> bool:
         return all(source in self.done for source in node.inputs.values() if isinstance(source, str))
@@ -80,9 +84,9 @@ class _Run:
             name=node.name,
             runner=self.runner,
             pool=self.pool,
-            after=[self._ended[source] for source in sources if source in self._ended],
+            after=[self._ended[source] for source in sources],
         )
-        if isinstance(begun, ArtifactReference):
+        if isinstance(begun, State):
             self._take(node.name, begun, cached)
         else:
             self.running[node.name] = begun
@@ -91,24 +95,27 @@ class _Run:
         """Wait until one of the running nodes has ended, if any runs."""
         if not self.running:
             return
-        first = next(as_completed(list(self.running.values())))
-        name = next(name for name, future in self.running.items() if future is first)
-        self._ended[name] = self.running.pop(name)
-        self._take(name, ArtifactReference.model_validate(first.result()), cached=False)
+        while not (ended := [name for name, future in self.running.items() if future.wrapped_future.done()]):
+            time.sleep(POLL_SECONDS)
+        for name in ended:
+            future = self.running.pop(name)
+            future.wait()  # raises what ended its process
+            self._take(name, future.state, cached=False)
 
-    def _take(self, name: str, artifact: ArtifactReference, cached: bool) -> None:
-        self.done[name] = artifact
+    def _take(self, name: str, ended: State[Any], cached: bool) -> None:
+        artifact = ArtifactReference.model_validate(ended.result())
+        self.done[name], self._ended[name] = artifact, ended
         if self.watcher is not None:
             self.watcher.finished(name, artifact, cached)
 
 
-def _pool(runner: RunnerConfig, stack: ExitStack) -> Callable[[], TaskRunner[Any]] | None:
+def _pool(runner: RunnerConfig, stack: ExitStack) -> Callable[[], ProcessPoolTaskRunner] | None:
     """Makes the pool of processes when it is first asked for: a run that finds everything finished needs none."""
     if runner.nodes_at_once == 1:
         return None
-    made: list[TaskRunner[Any]] = []
+    made: list[ProcessPoolTaskRunner] = []
 
-    def pool() -> TaskRunner[Any]:
+    def pool() -> ProcessPoolTaskRunner:
         if not made:
             cores = len(os.sched_getaffinity(0))
             stack.enter_context(limited_threads(max(1, cores // runner.nodes_at_once)))

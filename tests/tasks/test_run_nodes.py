@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from prefect import flow
+from prefect.client.orchestration import get_client
 from prefect.events.worker import EventsWorker
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.testing.utilities import prefect_test_harness
@@ -102,6 +103,19 @@ def test_a_node_starts_when_its_inputs_are_finished_and_is_found_the_second_time
         "found write_first",
         "found write_next.second",
     ]
+
+
+def test_prefect_shows_what_depends_on_what(storage: Path) -> None:
+    run(storage)
+    deadline = time.monotonic() + 30
+    with get_client(sync_client=True) as client:
+        while time.monotonic() < deadline:  # task runs reach the server as events, later
+            found = client.read_task_runs(sort="EXPECTED_START_TIME_DESC", limit=2)  # type: ignore[arg-type]
+            if {run.name for run in found} == {"write_first", "write_next.second"}:
+                break
+            time.sleep(0.2)
+    runs = {run.name: run for run in found}
+    assert [source.id for source in runs["write_next.second"].task_inputs["wait_for"]] == [runs["write_first"].id]
 
 
 def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:
