@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +19,7 @@ from prefect.task_runners import ProcessPoolTaskRunner
 from tasks.artifact_task import ArtifactReference, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
-from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 
 POLL_SECONDS = 0.1
 
@@ -99,7 +100,15 @@ class _Run:
             time.sleep(POLL_SECONDS)
         for name in ended:
             future = self.running.pop(name)
-            future.wait()  # raises what ended its process
+            try:
+                future.wait()
+            except BrokenProcessPool as error:
+                raise WorkerDiedError(
+                    "A process of this run ended without an answer",
+                    where=name,
+                    got="a crash in compiled code, or killed for its memory",
+                    next_step="run the same command again: what is finished is kept; runner.nodes_at_once=1 takes less memory",
+                ) from error
             self._take(name, future.state, cached=False)
 
     def _take(self, name: str, ended: State[Any], cached: bool) -> None:
