@@ -17,13 +17,15 @@ import yaml
 from worldline_core.recorder.rendering import OPENCV_AXES, prepare_rendering, wrist_camera_pose
 from worldline_core.recorder.robots import ROBOTS
 from worldline_core.recorder.scene_model import SceneModel, build_scene_model
+from worldline_core.recorder.small_bodies import BODIES
+from worldline_core.recorder.small_things import build_small_scene
 
-# Capsule radii [m] of the kinematic robot masks (links, hand, fingers), fitted to the exact masks of recordings.
+# Capsule radii [m] of the kinematic robot masks (links, hand, fingers) per model, fitted to the exact masks of recordings.
 RADII = {
-    "aloha_viperx": (0.036, 0.045, 0.010),
-    "ur5e_pair": (0.050, 0.034, 0.026),
-    "xarm7_pair": (0.080, 0.020, 0.008),
-    "panda_pair": (0.075, 0.021, 0.013),
+    "viperx": (0.036, 0.045, 0.010),
+    "ur5e": (0.050, 0.034, 0.026),
+    "xarm7": (0.080, 0.020, 0.008),
+    "panda": (0.075, 0.021, 0.013),
     "so101": (0.027, 0.040, 0.012),
 }
 SOURCES = {
@@ -90,7 +92,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
     """YAML text of the embodiment's description."""
     model, robot = scene.model, scene.robot
     closed, opened = robot.finger_travel
-    link_radius, hand_radius, gripper_radius = RADII[robot.name]
+    link_radius, hand_radius, gripper_radius = RADII[robot.model]
     arms = []
     for number, (arm, indices) in enumerate(zip(robot.arms, scene.arms, strict=True)):
         site = indices.tool_site
@@ -117,7 +119,7 @@ def embodiment_yaml(scene: SceneModel) -> str:
                     "link": ee,
                     "T_link_camera": [[round(float(v), 9) + 0.0 for v in row] for row in T_ee_camera(scene, number)],
                 },
-                "link_radius": link_radius,
+                "link_radius": round(link_radius * robot.link_scale, 4),
                 "hand_radius": hand_radius,
                 "gripper_radius": gripper_radius,
             }
@@ -142,8 +144,10 @@ def main() -> None:
     output = parser.parse_args().output
     prepare_rendering()
     output.mkdir(parents=True, exist_ok=True)
-    for name, robot in ROBOTS.items():
-        scene = build_scene_model(robot)
+    scenes = [build_scene_model(robot) for robot in ROBOTS.values()]
+    scenes += [build_small_scene(body) for body in BODIES.values()]
+    for scene in scenes:
+        name = scene.robot.name
         (output / f"{name}.xml").write_text(kinematics_xml(scene))
         (output / f"{name}.yaml").write_text(embodiment_yaml(scene))
 

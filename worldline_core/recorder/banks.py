@@ -19,11 +19,10 @@ from tqdm import tqdm
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment
+from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment, open_recorder
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
-from worldline_core.recorder.simulate import EpisodeRecorder, Motion
-from worldline_core.recorder.task_layout import Layout
+from worldline_core.recorder.simulate import Motion, TaskLayout, WorldRecorder
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SEALED_FILE = "sealed_outcomes.parquet"
@@ -34,7 +33,7 @@ class BankSpec(StrictModel):
 
     name: str = Field(min_length=1)
     embodiment: Embodiment
-    family: str = Field(pattern="^(lift|place|state_change)$")
+    family: str = Field(pattern="^(lift|place|state_change|close|press)$")
     scene: str = Field(pattern="^scene_[0-9]{2}$")
     layout: int = Field(ge=0)
 
@@ -55,7 +54,9 @@ class RecordBanksConfig(StrictModel):
     success_range: tuple[float, float] = (0.25, 0.75)
 
 
-def draw_bank(recorder: EpisodeRecorder, spec: BankSpec, config: RecordBanksConfig) -> tuple[Layout, list[Motion]]:
+def draw_bank[L: TaskLayout](
+    recorder: WorldRecorder[L], spec: BankSpec, config: RecordBanksConfig
+) -> tuple[L, list[Motion]]:
     """Layout and executed candidates of a bank.
 
     Raises: DataError when none of 20 initial states gives a success rate in the wanted range.
@@ -93,7 +94,7 @@ def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
     total = len(config.banks) * config.candidates
     with tqdm(total=total, desc="record banks", unit="candidate", disable=None) as progress:
         for spec in config.banks:
-            recorder = EpisodeRecorder(spec.embodiment)
+            recorder = open_recorder(spec.embodiment)
             layout, motions = draw_bank(recorder, spec, config)
             for candidate, motion in enumerate(motions):
                 episode_id = f"{spec.name}-{candidate:03d}"

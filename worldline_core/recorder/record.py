@@ -7,12 +7,13 @@ bytes. Needs the optional dependency MuJoCo and an OpenGL library for off-screen
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -23,13 +24,30 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
-from worldline_core.recorder.simulate import EpisodeRecorder
+from worldline_core.recorder.simulate import EpisodeRecorder, WorldRecorder
+from worldline_core.recorder.small_bodies import BODIES
+from worldline_core.recorder.small_things import TASKS
+from worldline_core.recorder.small_world import SmallWorldRecorder
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.digest import MANIFEST_NAME, digest_folder
 from worldline_core.store.store import describe_environment
 
-Embodiment = Literal["aloha_viperx", "ur5e_pair", "xarm7_pair", "panda_pair", "so101"]
-Family = Literal["lift", "place", "state_change", "play"]
+Embodiment = Literal[
+    "aloha_viperx",
+    "ur5e_pair",
+    "xarm7_pair",
+    "panda_pair",
+    "so101",
+    # Bodies of the small world.
+    "viperx_graphite",
+    "viperx_pearl",
+    "ur5e_silver",
+    "ur5e_slate",
+    "xarm7_white",
+    "xarm7_bronze",
+    "panda_ivory",
+]
+Family = Literal["lift", "place", "state_change", "play", "close", "press"]
 Defect = Literal[
     "static_lead_in",
     "reset_segment",
@@ -41,17 +59,35 @@ Defect = Literal[
 ]
 
 # The random streams of embodiments and splits: once released, a number never changes.
-EMBODIMENT_STREAM = {"aloha_viperx": 0, "ur5e_pair": 1, "xarm7_pair": 2, "panda_pair": 3, "so101": 4}
+EMBODIMENT_STREAM = {name: number for number, name in enumerate(get_args(Embodiment))}
 SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4}
+
+# What went wrong in each failed episode of the small world; for evaluation, never read by a judge.
+FAILURES_FILE = "failures.json"
 
 
 class RecordGroup(StrictModel):
-    """``count`` episodes of one embodiment in one split; families take turns."""
+    """``count`` episodes of one embodiment in one split; families take turns.
+
+    Bodies of the small world (``small_bodies.py``) have the families lift, place, close and press; with
+    ``held_out_camera`` their head camera stands where it never stands otherwise.
+    """
 
     embodiment: Embodiment
     split: Literal["train", "validation", "test", "ood_test"] = "train"
     count: int = Field(ge=1)
     families: tuple[Family, ...] = ("lift", "place", "state_change", "play")
+    held_out_camera: bool = False
+
+    @model_validator(mode="after")
+    def _of_one_world(self) -> RecordGroup:
+        small = self.embodiment in BODIES
+        known = TASKS if small else ("lift", "place", "state_change", "play")
+        if not set(self.families) <= set(known):
+            raise ValueError(f"families of {self.embodiment} are {', '.join(known)}; got {', '.join(self.families)}")
+        if self.held_out_camera and not small:
+            raise ValueError(f"held_out_camera is for bodies of the small world, not for {self.embodiment}")
+        return self
 
 
 class RecordConfig(StrictModel):
@@ -94,6 +130,7 @@ class Job:
     family: str
     entropy: tuple[int, ...]
     defect: str | None = None
+    held_out_camera: bool = False
 
 
 def plan_jobs(config: RecordConfig) -> list[Job]:
@@ -116,6 +153,7 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
                 family=group.families[position % len(group.families)],
                 entropy=(config.seed, EMBODIMENT_STREAM[group.embodiment], SPLIT_STREAM[group.split], number),
                 defect=left.pop(0) if left else None,
+                held_out_camera=group.held_out_camera,
             )
             jobs.append((round(10 * position / group.count), job))
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
@@ -123,8 +161,18 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
     return [job for _, job in jobs]
 
 
+def open_recorder(embodiment: str, held_out_camera: bool = False) -> WorldRecorder[Any]:
+    """The recorder of an embodiment in its world.
+
+    Raises: DataError for an unknown embodiment.
+    """
+    if embodiment in BODIES:
+        return SmallWorldRecorder(embodiment, "held_out" if held_out_camera else "training")
+    return EpisodeRecorder(embodiment)
+
+
 # One recorder per process: a compiled model and its renderers are reused while the embodiment stays the same.
-_RECORDERS: dict[str, EpisodeRecorder] = {}
+_RECORDERS: dict[tuple[str, bool], WorldRecorder[Any]] = {}
 
 
 def _close_recorders() -> None:
@@ -136,16 +184,19 @@ def _close_recorders() -> None:
 def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     """Record one episode into the set's parts; runs in a worker process."""
     job, config, output = task
-    if job.embodiment not in _RECORDERS:
+    key = (job.embodiment, job.held_out_camera)
+    if key not in _RECORDERS:
         _close_recorders()
-        _RECORDERS[job.embodiment] = EpisodeRecorder(job.embodiment)
-    recording = _RECORDERS[job.embodiment].record(
+        _RECORDERS[key] = open_recorder(*key)
+    recording = _RECORDERS[key].record(
         episode_id=job.episode_id,
         split=job.split,
         family=job.family,
         entropy=job.entropy,
         num_frames=config.num_frames,
     )
+    if recording.failure:
+        write_json_atomic(output / "run" / "failures" / f"{job.episode_id}.json", recording.failure)
     if job.defect is not None:
         recording = DEFECTS[job.defect](recording, np.random.default_rng((*job.entropy, 1)))
     if config.mcap:
@@ -193,6 +244,12 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     if defects:
         write_json_atomic(output / DEFECTS_FILE, defects)
     counts = {"episodes": len(jobs), "outcomes": table}
+    failures = {
+        path.stem: json.loads(path.read_text()) for path in sorted((output / "run" / "failures").glob("*.json"))
+    }
+    if failures:
+        write_json_atomic(output / FAILURES_FILE, failures)
+        counts["failures"] = dict(sorted(Counter(failures.values()).items()))
     write_json_atomic(output / "recording.json", counts)
     return counts
 

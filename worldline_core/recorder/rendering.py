@@ -11,6 +11,7 @@ import colorsys
 import importlib
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,9 +19,9 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import UnavailableError
+from worldline_core.recorder.robots import Colour
 from worldline_core.recorder.scene_model import SceneModel
 
-Colour = tuple[float, float, float]
 FRAME_SIZE = (128, 192)
 # MuJoCo cameras look along -z with y up.
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
@@ -165,7 +166,16 @@ class SceneRenderer:
 
     def set_scene(self, look: Scene, jitter: np.random.Generator) -> None:
         """Colours, light and cameras of an episode; ``jitter`` moves the head camera a little per episode."""
-        model, robot = self.scene.model, self.scene.robot
+        robot = self.scene.robot
+        scale = robot.scale if len(robot.arms) == 1 else 1.0
+        eye = np.asarray(robot.head.eye) + scale * (np.asarray(look.camera_shift) + jitter.normal(0, 0.006, 3))
+        target = np.asarray(robot.head.target) + scale * (np.asarray(look.target_shift) + jitter.normal(0, 0.004, 3))
+        self.set_look(look)
+        self.place_cameras(eye, target)
+
+    def set_look(self, look: Scene) -> None:
+        """Colours and light."""
+        model = self.scene.model
         for name, colour in (("table", look.table), ("floor", look.floor), ("wall", look.wall)):
             model.geom_rgba[model.geom(name).id] = [*colour, 1.0]
         direction = np.asarray(look.light_direction)
@@ -176,11 +186,11 @@ class SceneRenderer:
         model.vis.headlight.ambient[:] = look.ambient
         model.vis.headlight.diffuse[:] = 0.28
         model.vis.headlight.specular[:] = 0.05
-        scale = robot.scale if len(robot.arms) == 1 else 1.0
-        eye = np.asarray(robot.head.eye) + scale * (np.asarray(look.camera_shift) + jitter.normal(0, 0.006, 3))
-        target = np.asarray(robot.head.target) + scale * (np.asarray(look.target_shift) + jitter.normal(0, 0.004, 3))
+
+    def place_cameras(self, eye: np.ndarray, target: np.ndarray) -> None:
+        """The head camera at ``eye`` (3,) looking at ``target`` (3,), the wrist cameras at their mounts."""
         self._place("head", eye, look_at(eye, target, np.array([0.0, 0.0, 1.0])))
-        for number, arm in enumerate(robot.arms):
+        for number, arm in enumerate(self.scene.robot.arms):
             self._place(f"{arm.name}/wrist", *wrist_camera_pose(self.scene, number))
 
     def _place(self, camera: str, position: np.ndarray, rotation: np.ndarray) -> None:
@@ -192,8 +202,13 @@ class SceneRenderer:
         self.scene.model.cam_pos[number] = position
         self.scene.model.cam_quat[number] = quat
 
-    def render(self, qpos: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
-        """Frames uint8 (N, 128, 192, 3), robot masks bool (N, 128, 192) and camera tracks per view for (N, nq)."""
+    def render(
+        self, qpos: np.ndarray, paint: Callable[[np.ndarray], None] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
+        """Frames uint8 (N, 128, 192, 3), robot masks bool (N, 128, 192) and camera tracks per view for (N, nq).
+
+        ``paint`` changes the model's colours before each frame, by its positions (nq,).
+        """
         import mujoco
 
         model, data = self.scene.model, self._data
@@ -203,6 +218,8 @@ class SceneRenderer:
         height, width = FRAME_SIZE
         for positions in qpos:
             data.qpos[:] = positions
+            if paint is not None:
+                paint(positions)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from worldline_core.shipped import shipped_folder
 
+Colour = tuple[float, float, float]
 ROBOTS_FOLDER = shipped_folder() / "robots"
 
 
@@ -55,6 +56,7 @@ class Robot:
         scale: size of objects and heights, 1.0 for ViperX.
         colours: pairs (mesh colour of the source model, rounded to quarters; colour drawn instead), so that every
             robot stands out from the tables.
+        link_scale: lengthens or shortens the arm from its base to the wrist; hand and fingers keep their size.
     """
 
     name: str
@@ -65,9 +67,10 @@ class Robot:
     reach_y: tuple[float, float]
     scale: float
     head: CameraMount
-    colours: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
+    colours: tuple[tuple[Colour, Colour], ...]
     wrist: CameraMount = WRIST
     jaw: bool = False
+    link_scale: float = 1.0
 
 
 def _pair(distance: float, yaw: float, home: tuple[float, ...]) -> tuple[ArmPlacement, ...]:

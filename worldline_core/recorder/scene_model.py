@@ -79,6 +79,7 @@ def arm_spec(robot: Robot) -> Any:
         mesh.file = str(folder / "meshes" / Path(mesh.file).name)
         # Cut meshes are not watertight; their inertia is not used (bodies carry their own).
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    _scale_links(spec, robot.link_scale)
     colours = {tuple(source): drawn for source, drawn in robot.colours}
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
@@ -107,18 +108,73 @@ def arm_spec(robot: Robot) -> Any:
     return spec
 
 
+def _scale_links(spec: Any, scale: float) -> None:
+    """Scale the arm from its base up to the body ``ee``, which moves but keeps its size, as the fingers do."""
+    if scale == 1.0:
+        return
+    meshes = {mesh.name: mesh for mesh in spec.meshes}
+    for body in spec.bodies:
+        if body.name in ("world", *FINGER_JOINTS):
+            continue
+        body.pos = scale * np.asarray(body.pos)
+        if body.name != "ee":
+            for geom in body.geoms:
+                geom.pos = scale * np.asarray(geom.pos)
+                if geom.meshname:
+                    meshes[geom.meshname].scale = [scale] * 3
+
+
+def scene_spec(robot: Robot) -> Any:
+    """MuJoCo specification with physics, light and head camera, still without things and arms."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 384, 256
+    # Clipping distances are relative to the extent, which parked objects would otherwise blow up.
+    spec.stat.extent = 1.0
+    spec.visual.map.znear = 0.005
+    spec.visual.map.zfar = 20.0
+    spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 3], dir=[0, 0, -1])
+    spec.worldbody.add_camera(name="head", fovy=robot.head.fovy_deg)
+    return spec
+
+
+def add_room(spec: Any) -> None:
+    """Floor, wall and table; only the table is solid."""
+    import mujoco
+
+    box, seen_only = mujoco.mjtGeom.mjGEOM_BOX, {"contype": 0, "conaffinity": 0}
+    world = spec.worldbody
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[6, 6, 1], pos=[0, 0, -0.8], **seen_only)
+    world.add_geom(name="wall", type=box, size=[0.05, 6, 4], pos=[2.6, 0, 0], **seen_only)
+    world.add_geom(
+        name="table", type=box, size=[0.75, 1.0, 0.03], pos=[0.35, 0, -0.03], friction=[0.9, 0.02, 0.001], condim=4
+    )
+
+
+def slide_joint(body: Any, name: str, axis: list[float], travel: float, **dynamics: float) -> None:
+    """A joint that slides by 0..``travel`` [m]; ``dynamics``: frictionloss, armature, damping."""
+    import mujoco
+
+    damping = dynamics.pop("damping")
+    slide = body.add_joint(
+        name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, range=[0, travel], limited=True, **dynamics
+    )
+    # Newer MuJoCo versions hold three damping coefficients (linear first), older ones a number.
+    slide.damping = [damping, 0.0, 0.0] if np.ndim(slide.damping) else damping
+
+
 def _add_objects(spec: Any, scale: float) -> None:
     import mujoco
 
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     world = spec.worldbody
-    world.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[6, 6, 1], pos=[0, 0, -0.8], contype=0, conaffinity=0
-    )
-    world.add_geom(name="wall", type=box, size=[0.05, 6, 4], pos=[2.6, 0, 0], contype=0, conaffinity=0)
-    world.add_geom(
-        name="table", type=box, size=[0.75, 1.0, 0.03], pos=[0.35, 0, -0.03], friction=[0.9, 0.02, 0.001], condim=4
-    )
     half = CUBE_HALF * scale
     for name in ("cube", "other"):
         body = world.add_body(name=name, pos=PARKED)
@@ -141,17 +197,9 @@ def _add_objects(spec: Any, scale: float) -> None:
     for name, (size, pos) in shell.items():
         cabinet.add_geom(name=f"cabinet_{name}", type=box, size=size, pos=pos, contype=0, conaffinity=0)
     drawer = cabinet.add_body(name="drawer", pos=[0, 0, 0], gravcomp=1.0)
-    slide = drawer.add_joint(
-        name="drawer",
-        type=mujoco.mjtJoint.mjJNT_SLIDE,
-        axis=[-1, 0, 0],
-        range=[0, DRAWER_TRAVEL * scale],
-        limited=True,
-        frictionloss=0.8,
-        armature=0.3,
+    slide_joint(
+        drawer, "drawer", axis=[-1, 0, 0], travel=DRAWER_TRAVEL * scale, frictionloss=0.8, armature=0.3, damping=6.0
     )
-    # Newer MuJoCo versions hold three damping coefficients (linear first), older ones a number.
-    slide.damping = [6.0, 0.0, 0.0] if np.ndim(slide.damping) else 6.0
     drawer.add_geom(name="drawer", type=box, size=[deep, wide, high], pos=[deep, 0, high + wall], mass=0.3, condim=3)
     drawer.add_geom(
         name="drawer_front", type=box, size=[wall, wide + wall, high + wall], pos=[-wall, 0, high + wall], mass=0.05
@@ -159,24 +207,15 @@ def _add_objects(spec: Any, scale: float) -> None:
 
 
 def build_scene_model(robot: Robot) -> SceneModel:
-    """Compile the embodiment's model; cameras ``head`` and ``<arm>_wrist`` are placed per episode."""
-    import mujoco
-
-    spec = mujoco.MjSpec()
-    spec.option.timestep = TIMESTEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
-    spec.visual.quality.shadowsize = 0
-    spec.visual.quality.offsamples = 0
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 384, 256
-    # Clipping distances are relative to the extent, which parked objects would otherwise blow up.
-    spec.stat.extent = 1.0
-    spec.visual.map.znear = 0.005
-    spec.visual.map.zfar = 20.0
-    spec.worldbody.add_light(name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 3], dir=[0, 0, -1])
-    spec.worldbody.add_camera(name="head", fovy=robot.head.fovy_deg)
+    """Compile the embodiment's model; cameras ``head`` and ``<arm>/wrist`` are placed per episode."""
+    spec = scene_spec(robot)
+    add_room(spec)
     _add_objects(spec, robot.scale)
+    return compile_scene(spec, robot)
+
+
+def compile_scene(spec: Any, robot: Robot) -> SceneModel:
+    """Attach the arms with their wrist cameras and compile."""
     for arm in robot.arms:
         child = arm_spec(robot)
         child.body("ee").add_camera(name="wrist", fovy=robot.wrist.fovy_deg)

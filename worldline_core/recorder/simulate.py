@@ -6,14 +6,15 @@ actions alone reproduce the motion.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
-from worldline_core.recorder.controllers import InverseKinematics, plan_actions, plan_waypoints
+from worldline_core.recorder.controllers import InverseKinematics, Waypoint, plan_actions, plan_waypoints
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
 from worldline_core.recorder.robots import ROBOTS, Robot
 from worldline_core.recorder.scene_model import FRAME_RATE, SUBSTEPS, SceneModel, build_scene_model
@@ -21,25 +22,32 @@ from worldline_core.recorder.task_layout import Layout, apply_layout, outcome, s
 
 # Largest accepted distance between a planned tool position and what the arm can reach.
 REACH_TOLERANCE_M = 0.012
+# What a recorded episode calls a task: free motion has none, and what changes a thing's state is one family.
+_TASK_FAMILIES = {"play": "unknown", "close": "state_change", "press": "state_change"}
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What happened: ``state`` and ``action`` (N, J), full positions ``qpos`` (N, nq), and the measured outcome."""
+    """What happened: ``state`` and ``action`` (N, J), full positions ``qpos`` (N, nq), and the measured outcome.
+
+    ``failure`` says what went wrong, where the world tells it.
+    """
 
     state: np.ndarray
     action: np.ndarray
     qpos: np.ndarray
     outcome: str
+    failure: str = ""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view."""
+    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view; what went wrong in it."""
 
     episode: Episode
     frames: dict[str, np.ndarray]
     robot_masks: dict[str, np.ndarray]
+    failure: str = ""
 
 
 def opening_to_fingers(robot: Robot, opening: np.ndarray) -> np.ndarray:
@@ -54,12 +62,14 @@ def fingers_to_opening(robot: Robot, fingers: np.ndarray) -> np.ndarray:
     return np.clip((np.mean(fingers, axis=-1) - closed) / (opened - closed), 0.0, 1.0)
 
 
-def execute(scene: SceneModel, data: Any, layout: Layout, action: np.ndarray) -> Motion:
-    """Drive the simulator with the recorded actions (N, J) from the layout's initial state."""
+def execute(scene: SceneModel, data: Any, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drive the simulator with the recorded actions (N, J); ``data`` holds the things at their places.
+
+    Returns: states (N, J) float32 and full positions (N, nq); ``data`` is left at the last frame.
+    """
     import mujoco
 
     model, robot = scene.model, scene.robot
-    apply_layout(scene, data, layout)
     # Actions are stored as float32; the simulator is driven by exactly what is stored.
     control = np.zeros((len(action), model.nu))
     column = 0
@@ -83,7 +93,7 @@ def execute(scene: SceneModel, data: Any, layout: Layout, action: np.ndarray) ->
             blend = (substep + 1) / SUBSTEPS
             data.ctrl[:] = (1 - blend) * control[frame] + blend * control[frame + 1]
             mujoco.mj_step(model, data)
-    return Motion(np.array(states, dtype=np.float32), action, np.array(snapshots), outcome(scene, data, layout))
+    return np.array(states, dtype=np.float32), np.array(snapshots)
 
 
 def read_state(scene: SceneModel, data: Any) -> np.ndarray:
@@ -95,42 +105,74 @@ def read_state(scene: SceneModel, data: Any) -> np.ndarray:
     return np.concatenate(parts)
 
 
-class EpisodeRecorder:
-    """Records episodes of one embodiment; holds the compiled model and its renderers."""
+class TaskLayout(Protocol):
+    """What every world's layout has."""
 
-    def __init__(self, embodiment: str) -> None:
+    @property
+    def family(self) -> str: ...
+    @property
+    def instruction(self) -> str: ...
+    @property
+    def arm(self) -> int: ...
+
+
+class WorldRecorder[L: TaskLayout](ABC):
+    """Records episodes of one embodiment in one world; holds the compiled model and its renderers."""
+
+    def __init__(self, scene: SceneModel) -> None:
         import mujoco
 
-        if embodiment not in ROBOTS:
-            raise DataError("Unknown embodiment", expected=" | ".join(sorted(ROBOTS)), got=embodiment)
-        self.scene = build_scene_model(ROBOTS[embodiment])
+        self.scene = scene
         self._solver = InverseKinematics(self.scene)
         self._data: Any = mujoco.MjData(self.scene.model)
         self._renderer: SceneRenderer | None = None
+
+    @abstractmethod
+    def layout(self, family: str, random: np.random.Generator) -> L:
+        """Draw an initial state and an instruction."""
+
+    @abstractmethod
+    def plan(self, layout: L, random: np.random.Generator, duration: float) -> list[list[Waypoint]]:
+        """Waypoints per arm for ``duration`` seconds."""
+
+    @abstractmethod
+    def apply(self, layout: L) -> None:
+        """Put every thing at its place, in its colour."""
+
+    @abstractmethod
+    def judge(self, layout: L, qpos: np.ndarray) -> tuple[str, str]:
+        """Outcome, and what went wrong, of positions (N, nq); the simulation stands at the last of them."""
+
+    @abstractmethod
+    def set_scene(self, renderer: SceneRenderer, layout: L, scene_id: str, jitter: np.random.Generator) -> None:
+        """Colours, light and cameras of an episode."""
+
+    @abstractmethod
+    def paint(self, layout: L, qpos: np.ndarray) -> None:
+        """Change colours that depend on positions (nq,)."""
 
     def close(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
-    def layout(self, family: str, random: np.random.Generator) -> Layout:
-        return sample_layout(self.scene.robot, family, random)
-
-    def move(self, layout: Layout, random: np.random.Generator, num_frames: int) -> Motion | None:
+    def move(self, layout: L, random: np.random.Generator, num_frames: int) -> Motion | None:
         """Plan and execute; None when the plan leaves what the arms can reach."""
-        plans = plan_waypoints(self.scene.robot, layout, random, (num_frames - 1) / FRAME_RATE)
+        plans = self.plan(layout, random, (num_frames - 1) / FRAME_RATE)
         action, worst = plan_actions(self.scene, self._solver, plans, num_frames)
         if worst > REACH_TOLERANCE_M:
             return None
-        return execute(self.scene, self._data, layout, action)
+        return self.replay(layout, action)
 
-    def replay(self, layout: Layout, action: np.ndarray) -> Motion:
+    def replay(self, layout: L, action: np.ndarray) -> Motion:
         """Execute recorded actions (N, J) from the layout's initial state."""
-        return execute(self.scene, self._data, layout, action)
+        self.apply(layout)
+        state, qpos = execute(self.scene, self._data, action)
+        return Motion(state, action, qpos, *self.judge(layout, qpos))
 
     def film(
         self,
-        layout: Layout,
+        layout: L,
         motion: Motion,
         *,
         episode_id: str,
@@ -144,16 +186,15 @@ class EpisodeRecorder:
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
-        self.replay(layout, motion.action[:1])
-        self._renderer.set_scene(SCENES[scene_id], jitter)
-        frames, masks, cameras = self._renderer.render(motion.qpos)
+        self.apply(layout)
+        self.set_scene(self._renderer, layout, scene_id, jitter)
+        frames, masks, cameras = self._renderer.render(motion.qpos, lambda qpos: self.paint(layout, qpos))
         episode = Episode(
             episode_id=episode_id,
             source="worldline_recorder",
             embodiment=self.scene.robot.name,
             scene=scene_id,
-            # Free motion has no task.
-            task_family="unknown" if layout.family == "play" else layout.family,
+            task_family=_TASK_FAMILIES.get(layout.family, layout.family),
             instruction=layout.instruction,
             outcome=motion.outcome,
             split=split,
@@ -167,12 +208,12 @@ class EpisodeRecorder:
             primary_view="head",
             state_names=self.scene.state_names,
         )
-        return Recording(episode, frames, masks)
+        return Recording(episode, frames, masks, motion.failure)
 
-    def record(
+    def draw(
         self, *, episode_id: str, split: str, family: str, entropy: tuple[int, ...], num_frames: int
-    ) -> Recording:
-        """Draw, execute and film one episode; the same ``entropy`` gives the same episode.
+    ) -> tuple[L, Motion, str, np.random.Generator]:
+        """Layout, executed motion and scene id of one episode, and the generator that goes on to its cameras.
 
         Raises: DataError when no reachable plan is found in 50 draws.
         """
@@ -183,5 +224,44 @@ class EpisodeRecorder:
             layout = self.layout(family, random)
             motion = self.move(layout, random, num_frames)
             if motion is not None:
-                return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
+                return layout, motion, scene_id, random
         raise DataError("No reachable plan found", where=f"episode {episode_id}", next_step="check the robot's reach")
+
+    def record(
+        self, *, episode_id: str, split: str, family: str, entropy: tuple[int, ...], num_frames: int
+    ) -> Recording:
+        """Draw, execute and film one episode; the same ``entropy`` gives the same episode.
+
+        Raises: DataError when no reachable plan is found in 50 draws.
+        """
+        layout, motion, scene_id, random = self.draw(
+            episode_id=episode_id, split=split, family=family, entropy=entropy, num_frames=num_frames
+        )
+        return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
+
+
+class EpisodeRecorder(WorldRecorder[Layout]):
+    """The table with a cube, a pad and a drawer."""
+
+    def __init__(self, embodiment: str) -> None:
+        if embodiment not in ROBOTS:
+            raise DataError("Unknown embodiment", expected=" | ".join(sorted(ROBOTS)), got=embodiment)
+        super().__init__(build_scene_model(ROBOTS[embodiment]))
+
+    def layout(self, family: str, random: np.random.Generator) -> Layout:
+        return sample_layout(self.scene.robot, family, random)
+
+    def plan(self, layout: Layout, random: np.random.Generator, duration: float) -> list[list[Waypoint]]:
+        return plan_waypoints(self.scene.robot, layout, random, duration)
+
+    def apply(self, layout: Layout) -> None:
+        apply_layout(self.scene, self._data, layout)
+
+    def judge(self, layout: Layout, qpos: np.ndarray) -> tuple[str, str]:
+        return outcome(self.scene, self._data, layout), ""
+
+    def set_scene(self, renderer: SceneRenderer, layout: Layout, scene_id: str, jitter: np.random.Generator) -> None:
+        renderer.set_scene(SCENES[scene_id], jitter)
+
+    def paint(self, layout: Layout, qpos: np.ndarray) -> None:
+        """Nothing changes its colour here."""

@@ -1,0 +1,196 @@
+"""Physics, labels and cameras of the small world; pictures only in the last test."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
+
+from worldline_core.config import CONFIG_ROOT, load_config
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError
+from worldline_core.recorder.record import FAILURES_FILE, RecordConfig, RecordGroup, record
+from worldline_core.recorder.small_bodies import BODIES
+from worldline_core.recorder.small_things import (
+    BUTTON_TRAVEL,
+    DRAWER_TRAVEL,
+    KINDS,
+    LIFTED,
+    STANDING,
+    TASKS,
+    UNLIT,
+    SmallLayout,
+)
+from worldline_core.recorder.small_world import HEAD_CAMERAS, SmallWorldRecorder
+
+
+@pytest.fixture(scope="module")
+def recorder() -> SmallWorldRecorder:
+    return SmallWorldRecorder("ur5e_slate")
+
+
+def joint_of(recorder: SmallWorldRecorder, name: str) -> int:
+    return int(recorder.scene.model.joint(name).qposadr[0])
+
+
+def still(recorder: SmallWorldRecorder, layout: SmallLayout) -> np.ndarray:
+    """(8, nq) the layout's initial positions, arms at their start."""
+    recorder.apply(layout)
+    mujoco.mj_forward(recorder.scene.model, recorder._data)
+    return np.repeat(recorder._data.qpos[None].copy(), 8, axis=0)
+
+
+def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_ways(recorder: SmallWorldRecorder) -> None:
+    found: dict[str, Counter[str]] = {task: Counter() for task in TASKS}
+    for number in range(160):
+        random = np.random.default_rng([8, number])
+        task = TASKS[number % len(TASKS)]
+        motion = recorder.move(recorder.layout(task, random), random, 33)
+        assert motion is not None
+        assert (motion.outcome == "failure") == bool(motion.failure)
+        found[task][motion.failure or motion.outcome] += 1
+    for task, counts in found.items():
+        assert 0.35 <= counts["success"] / 40 <= 0.65, (task, counts)
+    assert set().union(*found.values()) >= {"success", "missed", "slipped", "dropped", "wrong place", "incomplete"}
+
+
+@pytest.mark.parametrize("name", sorted(BODIES))
+def test_bodies_reach_their_workspace(name: str) -> None:
+    recorder = SmallWorldRecorder(name)
+    for number in range(12):
+        random = np.random.default_rng([3, number])
+        assert recorder.move(recorder.layout(TASKS[number % 4], random), random, 33) is not None
+
+
+def test_grippers_take_more_than_half_a_second(recorder: SmallWorldRecorder) -> None:
+    for number in range(8):
+        random = np.random.default_rng([4, number])
+        layout = recorder.layout("lift", random)
+        motion = recorder.move(layout, random, 33)
+        assert motion is not None
+        names = recorder.scene.state_names
+        column = names.index(f"{recorder.scene.robot.arms[layout.arm].name}/gripper")
+        opening = motion.action[8:, column]
+        if opening.min() < 0.05:
+            opened, closed = np.flatnonzero(opening > 0.9)[-1], np.flatnonzero(opening < 0.1)[0]
+            assert closed - opened >= 3 or opened > closed
+
+
+def test_a_success_shows_throughout_the_last_quarter(recorder: SmallWorldRecorder) -> None:
+    shown = 0
+    for number in range(16):
+        random = np.random.default_rng([5, number])
+        layout = recorder.layout("lift", random)
+        motion = recorder.move(layout, random, 33)
+        assert motion is not None
+        if motion.outcome == "success":
+            height = motion.qpos[:, joint_of(recorder, f"{layout.target.kind}_0") + 2] - STANDING[layout.target.kind]
+            assert height[24:].min() > LIFTED
+            shown += 1
+    assert shown > 0
+
+
+def test_outcomes_are_read_from_the_things(recorder: SmallWorldRecorder) -> None:
+    random = np.random.default_rng(0)
+    layouts = {task: recorder.layout(task, random) for task in TASKS}
+    lift, place, close, press = (layouts[task] for task in TASKS)
+
+    qpos = still(recorder, lift)
+    assert recorder.judge(lift, qpos) == ("failure", "missed")
+    qpos[4:, joint_of(recorder, f"{lift.target.kind}_0") + 2] += LIFTED + 0.01
+    assert recorder.judge(lift, qpos) == ("success", "")
+
+    qpos = still(recorder, place)
+    assert recorder.judge(place, qpos) == ("failure", "missed")
+    assert place.goal is not None
+    address = joint_of(recorder, f"{place.target.kind}_0")
+    qpos[-1, address : address + 2] = place.goal.xy
+    assert recorder.judge(place, qpos) == ("success", "")
+
+    qpos = still(recorder, close)
+    assert recorder.judge(close, qpos) == ("failure", "missed")
+    qpos[-1, joint_of(recorder, "drawer_0")] = 0.5 * DRAWER_TRAVEL
+    assert recorder.judge(close, qpos) == ("failure", "incomplete")
+    qpos[-1, joint_of(recorder, "drawer_0")] = 0.1 * DRAWER_TRAVEL
+    assert recorder.judge(close, qpos) == ("success", "")
+
+    qpos = still(recorder, press)
+    assert recorder.judge(press, qpos) == ("failure", "missed")
+    qpos[-1, joint_of(recorder, "button_1")] = BUTTON_TRAVEL
+    assert recorder.judge(press, qpos) == ("failure", "wrong place")
+    qpos[-1, joint_of(recorder, "button_0")] = BUTTON_TRAVEL
+    assert recorder.judge(press, qpos) == ("success", "")
+
+
+def test_a_pressed_button_lights_up(recorder: SmallWorldRecorder) -> None:
+    layout = recorder.layout("press", np.random.default_rng(1))
+    qpos = still(recorder, layout)[0]
+    plate = recorder.scene.model.geom("button_0_plate").id
+    recorder.paint(layout, qpos)
+    np.testing.assert_allclose(recorder.scene.model.geom_rgba[plate, :3], UNLIT, atol=1e-6)
+    qpos[joint_of(recorder, "button_0")] = BUTTON_TRAVEL
+    recorder.paint(layout, qpos)
+    np.testing.assert_allclose(
+        recorder.scene.model.geom_rgba[plate, :3],
+        recorder.scene.model.geom_rgba[recorder.scene.model.geom("button_0").id, :3],
+    )
+
+
+def test_layouts_name_what_is_there_and_keep_things_apart(recorder: SmallWorldRecorder) -> None:
+    random = np.random.default_rng(2)
+    distractors = 0
+    for number in range(60):
+        layout = recorder.layout(TASKS[number % 4], random)
+        names = [name for name, _ in layout.named()]
+        assert len(set(names)) == len(names)
+        assert max(Counter(name.split("_")[0] for name in names).values()) <= max(KINDS.values())
+        assert f"{layout.target.colour} {layout.target.kind}" in layout.instruction
+        things = [thing for _, thing in layout.named()]
+        assert len({thing.colour for thing in things}) == len(things)
+        for thing in layout.others:
+            distractors += 1
+            assert np.linalg.norm(thing.xy - layout.target.xy) > 0.1
+    assert distractors > 20
+
+
+def test_the_held_out_camera_arrangement_is_none_of_the_training_ones() -> None:
+    for training, held_out in zip(HEAD_CAMERAS["training"][:2], HEAD_CAMERAS["held_out"][:2], strict=True):
+        assert max(training) < min(held_out) or max(held_out) < min(training)
+
+
+def test_the_committed_configuration_trains_on_six_bodies_and_holds_one_and_a_camera_out() -> None:
+    config = load_config(RecordConfig, path=CONFIG_ROOT / "recording" / "small_world.yaml")
+    trained = {group.embodiment for group in config.groups if group.split in ("train", "validation")}
+    assert len(trained) == 6
+    assert not any(group.held_out_camera for group in config.groups if group.split != "ood_test")
+    unseen = {group.embodiment for group in config.groups if group.split == "ood_test"} - trained
+    assert unseen == {"panda_ivory"}
+    assert any(group.held_out_camera for group in config.groups)
+
+
+def test_families_of_another_world_are_refused() -> None:
+    with pytest.raises(ValidationError, match="families of viperx_pearl are lift, place, close, press; got play"):
+        RecordGroup(embodiment="viperx_pearl", count=1, families=("play",))
+    with pytest.raises(ValidationError, match="held_out_camera is for bodies of the small world, not for so101"):
+        RecordGroup(embodiment="so101", count=1, held_out_camera=True)
+    with pytest.raises(DataError, match="Unknown body of the small world"):
+        SmallWorldRecorder("so101")
+
+
+def test_a_recording_tells_its_failures_apart_from_its_index(tmp_path: Path) -> None:
+    group = RecordGroup(embodiment="viperx_pearl", split="ood_test", count=3, families=TASKS, held_out_camera=True)
+    try:
+        counts = record(RecordConfig(groups=(group,), seed=2, workers=1), tmp_path)
+    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
+        pytest.skip(f"off-screen OpenGL is not available here ({error})")
+    rows = EpisodeSet.open(tmp_path).rows
+    failures = json.loads((tmp_path / FAILURES_FILE).read_text())
+    assert {row.episode_id for row in rows if row.outcome == "failure"} == set(failures)
+    assert sum(counts["failures"].values()) == len(failures) > 0
+    assert {row.task_family for row in rows} == {"lift", "place", "state_change"}

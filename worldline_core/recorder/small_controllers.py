@@ -1,0 +1,203 @@
+"""Scripted controllers of the small world: waypoints of each arm, with errors as wide as a hand.
+
+Grippers close and open over more than half a second, and the last second shows how it ended. Whether a plan goes wrong
+is drawn; whether it went wrong is measured afterwards (``small_things.small_outcome``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from worldline_core.errors import DataError
+from worldline_core.recorder.controllers import Waypoint
+from worldline_core.recorder.robots import Robot
+from worldline_core.recorder.small_things import (
+    BUTTON_CAP_HALF,
+    DRAWER_TRAVEL,
+    PLATE_TOP,
+    STANDING,
+    SmallLayout,
+    free_tool,
+)
+from worldline_core.recorder.task_layout import side
+
+# A hand's width [m]: how far a plan that goes wrong passes beside its thing.
+BESIDE = (0.085, 0.12)
+GRASP_HEIGHT, DRAWER_HEIGHT = 0.088, 0.052
+PRESSED_HEIGHT, CAP_TOP = 0.045, PLATE_TOP + 2 * BUTTON_CAP_HALF
+# Openings: wide, and relaxed just so far that a thing slips out.
+WIDE, RELAXED = (0.93, 1.0), (0.80, 0.84)
+
+# What is planned, and how often; the rest succeeds, if physics agrees.
+_LIFT = {"good": 0.50, "beside": 0.17, "high": 0.07, "open": 0.06, "relax": 0.06, "release": 0.06, "low": 0.08}
+_PLACE = {"good": 0.62, "beside": 0.12, "high": 0.04, "relax": 0.05, "release": 0.07, "elsewhere": 0.12, "keep": 0.06}
+_CLOSE = {"good": 0.50, "short": 0.26, "beside": 0.14, "high": 0.10}
+_PRESS = {"good": 0.54, "short": 0.16, "beside": 0.16, "other": 0.14}
+
+
+def _draw(plans: dict[str, float], random: np.random.Generator) -> str:
+    shares = np.array(list(plans.values()))
+    return str(random.choice(list(plans), p=shares / shares.sum()))
+
+
+def _at(time: float, xy: np.ndarray, z: float, yaw: float, opening: float) -> Waypoint:
+    return Waypoint(time, (float(xy[0]), float(xy[1]), float(z)), float(yaw), float(opening))
+
+
+def _beside(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> np.ndarray:
+    """(2,) a hand's width in any direction, but not towards the other arm's half."""
+    angle, length = random.uniform(0, 2 * np.pi), random.uniform(*BESIDE)
+    offset = length * np.array([np.cos(angle), np.sin(angle)])
+    outwards = side(robot, layout.arm)
+    if abs(layout.target.y + offset[1]) > robot.reach_y[1] or outwards * (layout.target.y + offset[1]) < 0.02:
+        offset[1] = -offset[1]
+    if not robot.reach_x[0] - 0.03 < layout.target.x + offset[0] < robot.reach_x[1] + 0.03:
+        offset[0] = -offset[0]
+    return offset
+
+
+def _first(layout: SmallLayout) -> Waypoint:
+    x, y, z, yaw, opening = layout.start[layout.arm]
+    return _at(0.0, np.array([x, y]), z, yaw, opening)
+
+
+def _grasp(
+    robot: Robot, layout: SmallLayout, random: np.random.Generator, plan: str, times: np.ndarray
+) -> tuple[list[Waypoint], np.ndarray, float, float, float]:
+    """Waypoints up to the closed gripper; where it closed (2,), its height, turn and opening."""
+    target = layout.target
+    xy = target.xy + random.normal(0, 0.004, 2) + (_beside(robot, layout, random) if plan == "beside" else 0.0)
+    height = GRASP_HEIGHT if plan != "high" else 2 * STANDING[target.kind] + random.uniform(0.045, 0.07)
+    yaw, opened = target.yaw + random.normal(0, 0.06), random.uniform(*WIDE)
+    closed = random.uniform(0.9, 1.0) if plan == "open" else 0.0
+    points = [
+        _first(layout),
+        _at(times[0], xy, 0.20, yaw, opened),
+        _at(times[1], xy, height, yaw, opened),
+        _at(times[2], xy, height, yaw, closed),
+    ]
+    return points, xy, height, yaw, closed
+
+
+def _lift(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> list[Waypoint]:
+    plan, pace = _draw(_LIFT, random), random.uniform(0.96, 1.03)
+    times = pace * np.array([0.8, 1.2, 1.85, 2.75, 3.4])
+    points, xy, height, yaw, closed = _grasp(robot, layout, random, plan, times)
+    rise = random.uniform(0.02, 0.035) if plan == "low" else random.uniform(0.13, 0.18)
+    away = xy + random.normal(0, 0.015, 2)
+    if plan == "relax":
+        closed = random.uniform(*RELAXED)
+    points.append(_at(times[3], away, height + rise, yaw, closed))
+    if plan == "release":
+        points.append(_at(times[4], away, height + rise, yaw, random.uniform(*WIDE)))
+    return points
+
+
+def _place(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> list[Waypoint]:
+    if layout.goal is None:
+        raise DataError("The layout does not fit the task", where=layout.family, expected="a pad")
+    plan, pace = _draw(_PLACE, random), random.uniform(0.97, 1.02)
+    times = pace * np.array([0.7, 1.05, 1.6, 2.0, 2.65, 2.95, 3.45, 3.8])
+    points, xy, height, yaw, closed = _grasp(robot, layout, random, plan, times)
+    goal = layout.goal.xy + random.normal(0, 0.006, 2)
+    if plan == "elsewhere":
+        goal = _elsewhere(robot, layout, random)
+    turn, opened = yaw + random.uniform(-0.3, 0.3), random.uniform(*WIDE)
+    carried = height + 0.09
+    if plan == "relax":
+        closed = random.uniform(*RELAXED)
+    points.append(_at(times[3], xy + 0.25 * (goal - xy), carried, yaw, closed))
+    if plan == "release":
+        middle = xy + random.uniform(0.4, 0.6) * (goal - xy)
+        points += [_at(times[4], middle, carried, yaw, closed), _at(times[6], middle, carried, yaw, opened)]
+        return points
+    points.append(_at(times[4], goal, carried, turn, closed))
+    if plan == "keep":
+        return points
+    points += [
+        _at(times[5], goal, height + 0.003, turn, closed),
+        _at(times[6], goal, height + 0.004, turn, opened),
+        _at(times[7], goal, height + 0.11, turn, opened),
+    ]
+    return points
+
+
+def _elsewhere(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> np.ndarray:
+    """(x, y) on the arm's half, two hands' widths from the pad and from where the thing stood."""
+    goal = layout.target if layout.goal is None else layout.goal
+    spots = [free_tool(robot, layout.arm, random)[:2] for _ in range(40)]
+    distances = [min(np.linalg.norm(s - goal.xy), np.linalg.norm(s - layout.target.xy)) for s in spots]
+    far = [spot for spot, distance in zip(spots, distances, strict=True) if distance > 0.12]
+    return far[0] if far else spots[int(np.argmax(distances))]
+
+
+def _close(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> list[Waypoint]:
+    plan, pace = _draw(_CLOSE, random), random.uniform(0.96, 1.03)
+    times = pace * np.array([0.8, 1.2, 2.7, 3.1])
+    xy, yaw, opening = layout.target.xy, random.normal(0, 0.08), random.uniform(0.0, 0.1)
+    y = xy[1] + random.normal(0, 0.01)
+    if plan == "beside":
+        # Towards the arm's own side, so that the other arm is not in the way.
+        y += side(robot, layout.arm) * random.uniform(0.12, 0.14)
+    z = DRAWER_HEIGHT if plan != "high" else random.uniform(0.125, 0.15)
+    front = xy[0] - 0.022
+    left_open = random.uniform(0.45, 0.85) * DRAWER_TRAVEL if plan == "short" else -0.006
+    before, end = np.array([front - DRAWER_TRAVEL - 0.035, y]), np.array([front - left_open, y])
+    return [
+        _first(layout),
+        _at(times[0], before, z + 0.08, yaw, opening),
+        _at(times[1], before, z, yaw, opening),
+        _at(times[2], end, z, yaw, opening),
+        _at(times[3], end - [0.06, 0.0], z + 0.06, yaw, opening),
+    ]
+
+
+def _press(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> list[Waypoint]:
+    plan, pace = _draw(_PRESS, random), random.uniform(0.96, 1.03)
+    times = pace * np.array([1.1, 2.4, 2.7, 3.4])
+    goal = layout.target.xy + random.normal(0, 0.006, 2)
+    others = [thing for thing in layout.others if thing.kind == "button"]
+    if plan == "other" and others and side(robot, layout.arm) * others[0].y > 0:
+        goal = others[0].xy + random.normal(0, 0.006, 2)
+    elif plan in ("beside", "other"):
+        goal = goal + _beside(robot, layout, random)
+    z = PRESSED_HEIGHT if plan != "short" else CAP_TOP + random.uniform(0.06, 0.08)
+    yaw, opening = random.normal(0, 0.2), random.uniform(0.0, 0.1)
+    return [
+        _first(layout),
+        _at(times[0], goal, 0.19, yaw, opening),
+        _at(times[1], goal, z, yaw, opening),
+        _at(times[2], goal, z, yaw, opening),
+        _at(times[3], goal - [0.04, 0.0], 0.18, yaw, opening),
+    ]
+
+
+_TASKS = {"lift": _lift, "place": _place, "close": _close, "press": _press}
+
+
+def _idle(robot: Robot, layout: SmallLayout, arm: int, random: np.random.Generator, duration: float) -> list[Waypoint]:
+    """The arm without a task rests, or moves slowly above the things."""
+    x, y, z, yaw, opening = layout.start[arm]
+    points = [_at(0.0, np.array([x, y]), z, yaw, opening)]
+    if random.uniform() < 0.4:
+        return points
+    time = 0.0
+    while time < duration:
+        time += float(random.uniform(1.3, 2.2))
+        goal = layout.start[arm][:4] + 0.6 * (free_tool(robot, arm, random) - layout.start[arm][:4])
+        if random.uniform() < 0.4:
+            opening = random.uniform(0.7, 1.0) if opening < 0.5 else random.uniform(0.0, 0.3)
+        points.append(_at(time, goal[:2], goal[2], goal[3], opening))
+    return points
+
+
+def plan_small_waypoints(
+    robot: Robot, layout: SmallLayout, random: np.random.Generator, duration: float
+) -> list[list[Waypoint]]:
+    """Waypoints per arm for ``duration`` seconds."""
+    return [
+        _TASKS[layout.family](robot, layout, random)
+        if arm == layout.arm
+        else _idle(robot, layout, arm, random, duration)
+        for arm in range(len(robot.arms))
+    ]
