@@ -23,14 +23,17 @@ from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES
 from worldline_core.recorder.robots import ROBOTS
 from worldline_core.recorder.scene_model import CUBE_HALF, DRAWER_TRAVEL, SceneModel, build_scene_model
 from worldline_core.recorder.simulate import EpisodeRecorder
+from worldline_core.recorder.small_bodies import BODIES
+from worldline_core.recorder.small_things import build_small_scene
 from worldline_core.recorder.task_layout import apply_layout, outcome, sample_layout
 
 EMBODIMENTS = Path(__file__).resolve().parents[2] / "configs" / "embodiments"
 
 
-@pytest.fixture(scope="module", params=sorted(ROBOTS))
+@pytest.fixture(scope="module", params=sorted([*ROBOTS, *BODIES]))
 def scene(request: pytest.FixtureRequest) -> SceneModel:
-    return build_scene_model(ROBOTS[request.param])
+    name = request.param
+    return build_scene_model(ROBOTS[name]) if name in ROBOTS else build_small_scene(BODIES[name])
 
 
 def random_joints(scene: SceneModel, random: np.random.Generator) -> list[np.ndarray]:

@@ -69,17 +69,21 @@ def test_bodies_reach_their_workspace(name: str) -> None:
 
 
 def test_grippers_take_more_than_half_a_second(recorder: SmallWorldRecorder) -> None:
+    closings = 0
     for number in range(8):
         random = np.random.default_rng([4, number])
         layout = recorder.layout("lift", random)
         motion = recorder.move(layout, random, 33)
         assert motion is not None
-        names = recorder.scene.state_names
-        column = names.index(f"{recorder.scene.robot.arms[layout.arm].name}/gripper")
-        opening = motion.action[8:, column]
+        gripper = f"{recorder.scene.robot.arms[layout.arm].name}/gripper"
+        opening = motion.action[8:, recorder.scene.state_names.index(gripper)]
         if opening.min() < 0.05:
-            opened, closed = np.flatnonzero(opening > 0.9)[-1], np.flatnonzero(opening < 0.1)[0]
-            assert closed - opened >= 3 or opened > closed
+            # From its last wide open frame to its first closed one, at eight frames per second.
+            closed = int(np.flatnonzero(opening < 0.02)[0])
+            opened = int(np.flatnonzero(opening[:closed] > 0.9)[-1])
+            assert closed - opened >= 4
+            closings += 1
+    assert closings > 0
 
 
 def test_a_success_shows_throughout_the_last_quarter(recorder: SmallWorldRecorder) -> None:
@@ -184,13 +188,15 @@ def test_families_of_another_world_are_refused() -> None:
 
 
 def test_a_recording_tells_its_failures_apart_from_its_index(tmp_path: Path) -> None:
-    group = RecordGroup(embodiment="viperx_pearl", split="ood_test", count=3, families=TASKS, held_out_camera=True)
+    group = RecordGroup(
+        embodiment="viperx_pearl", split="ood_test", count=3, families=("lift", "place", "close"), held_out_camera=True
+    )
     try:
-        counts = record(RecordConfig(groups=(group,), seed=2, workers=1), tmp_path)
+        counts = record(RecordConfig(groups=(group,), seed=6, workers=1), tmp_path)
     except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
         pytest.skip(f"off-screen OpenGL is not available here ({error})")
     rows = EpisodeSet.open(tmp_path).rows
     failures = json.loads((tmp_path / FAILURES_FILE).read_text())
     assert {row.episode_id for row in rows if row.outcome == "failure"} == set(failures)
-    assert sum(counts["failures"].values()) == len(failures) > 0
+    assert counts["failures"] == {"incomplete": 1, "missed": 1}
     assert {row.task_family for row in rows} == {"lift", "place", "state_change"}

@@ -1,4 +1,8 @@
-"""Record episodes of the small world."""
+"""The small world: tasks whose outcomes a model of 64 x 96 pixels can see and foresee.
+
+Things are large and seen from near, plans that go wrong go wrong by a hand's width, grippers take more than half a
+second, and how it ended shows in the last quarter (``docs/recorded_worlds.md``).
+"""
 
 from __future__ import annotations
 
