@@ -33,9 +33,10 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.action_tracks import collate_tracks, compute_tracks
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.episode_tracks import collate_tracks
 from worldline_core.config import load_config
-from worldline_core.evaluation.policy.coloured_things import colour_share, named_things
+from worldline_core.evaluation.policy.measurements import colour_share, named_things
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.recorder import small_things
