@@ -28,7 +28,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from einops import rearrange
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -162,33 +161,33 @@ class PathNet(nn.Module):
 
 
 class MapNet(nn.Module):
-    """Rung (c): in each view the first frame's features and each frame's maps meet cell by cell; then as in (a)."""
+    """Rung (c): in each view the first frame's features and the maps of all frames, convolved together and pooled."""
 
-    def __init__(self, tasks: int, width: int = 48) -> None:
+    def __init__(self, frames: int, tasks: int, width: int = 48) -> None:
         super().__init__()
-        self.picture = nn.Sequential(
-            nn.Conv2d(5, 24, 4, 4),
-            nn.GELU(),
-            nn.Conv2d(24, width, 3, 2, 1),
-            nn.GELU(),
-            nn.Conv2d(width, width, 3, 1, 1),
-        )
-        self.maps = nn.Linear(9, width)
+        self.picture = nn.Sequential(nn.Conv2d(5, 24, 4, 4), nn.GELU(), nn.Conv2d(24, width, 3, 2, 1))
+        self.maps = nn.Conv2d(9 * frames, width, 1)
         self.words = nn.Linear(tasks + len(VIEWS), width)
-        self.meet = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU())
-        self.path = PathNet(len(VIEWS) * width, tasks)
+        self.body = nn.Sequential(
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GELU(),
+        )
+        self.head = nn.Sequential(nn.Dropout(0.2), nn.Linear(4 * width, width), nn.GELU(), nn.Linear(width, 1))
 
     def forward(self, task: Tensor, pictures: Tensor, maps: Tensor) -> Tensor:
         """Logits (n,) for tasks (n, k), pictures (n, v, 5, h, w), maps (n, v, t, 9, rows, columns)."""
-        found = []
+        pooled = []
         for view in range(len(VIEWS)):
             which = torch.zeros(len(task), len(VIEWS))
             which[:, view] = 1
-            words = self.words(torch.cat([task, which], dim=1))
-            seen = rearrange(self.picture(pictures[:, view]), "n c h w -> n 1 (h w) c")
-            acted = self.maps(rearrange(maps[:, view], "n t c h w -> n t (h w) c"))
-            found.append(self.meet(seen + acted + words[:, None, None]).amax(2))
-        return self.path(task, torch.cat(found, dim=2))
+            words = self.words(torch.cat([task, which], dim=1))[..., None, None]
+            found = self.body(self.picture(pictures[:, view]) + self.maps(maps[:, view].flatten(1, 2)) + words)
+            pooled.append(torch.cat([found.amax((2, 3)), found.mean((2, 3))], dim=1))
+        wrists = torch.stack(pooled[1:]).amax(0)
+        return self.head(torch.cat([pooled[0], wrists], dim=1))[:, 0]
 
 
 def fit_and_score(
@@ -255,7 +254,7 @@ def ladder(train: Samples, test: Samples, seeds: int, chosen: Sequence[str]) -> 
             if rung[0] in "ab":
                 scores.append(fit_and_score(PathNet(10, len(names)), seen, labels, unseen, 50, 3e-3))
             else:
-                scores.append(fit_and_score(MapNet(len(names)), seen, labels, unseen, 20, 3e-3))
+                scores.append(fit_and_score(MapNet(seen[2].shape[2], len(names)), seen, labels, unseen, 20, 3e-3))
         mean = np.mean(scores, axis=0)
         for task in names:
             of = test.tasks == task
