@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from worldline_core.data.video.decode import decode_video
 
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan, run_node
 from worldline_core.store.store import ArtifactStore

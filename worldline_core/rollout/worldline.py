@@ -210,7 +210,7 @@ class WorldLine:
 
     def encode(
         self,
-        images: Float[Tensor, "b v 3 h w"],
+        images: Float[Tensor, "b v 3 height width"],
         tracks: Sequence[EpisodeTracks],
         frames: Sequence[int],
         *,
