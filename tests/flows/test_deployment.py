@@ -91,5 +91,6 @@ def test_deployed_pipeline_runs_on_a_worker(environment: dict[str, str], project
         )  # fmt: skip
     finally:
         _stop(worker)
-    reports = list((tmp_path / "artifacts" / "report").glob("*/index.html"))
-    assert len(reports) == 1, (tmp_path / "worker.log").read_text()
+    reports = sorted(path.parent.name for path in (tmp_path / "artifacts" / "report").glob("*/index.html"))
+    assert len(reports) == 2, (tmp_path / "worker.log").read_text()
+    assert reports[1] == "latest"  # and before it, in hexadecimal, the report that it leads to
