@@ -61,6 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument(
         "--page", nargs="?", type=int, const=12, metavar="N", help="write a page to browse N episodes (12; 0: all)"
     )
+    inspect.add_argument("--json", action="store_true", help="print JSON")
     inspect.set_defaults(run=_inspect)
     card = commands.add_parser("card", help="write the dataset card of an EpisodeSet: README.md, index.html, pictures")
     card.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered")
@@ -166,7 +167,7 @@ def _task(arguments: argparse.Namespace) -> None:
     _use_local_prefect_storage(arguments.artifacts)
     from tasks.command_line import print_artifact, run_task
 
-    print_artifact(run_task(arguments.step, arguments))
+    print_artifact(run_task(arguments.step, arguments), as_json=arguments.json)
 
 
 def _record(arguments: argparse.Namespace) -> None:
@@ -195,7 +196,13 @@ def _inspect(arguments: argparse.Namespace) -> None:
         rerun=arguments.rerun,
         page=arguments.page,
     )
-    print(found)
+    if arguments.json:
+        import json
+        from dataclasses import asdict
+
+        print(json.dumps(asdict(found), default=str, indent=1))
+    else:
+        print(found)
 
 
 def _card(arguments: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from prefect import flow, task
 
+from tasks.prefect_artifacts import show_in_prefect
 from tasks.run_nodes import run_nodes
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
@@ -30,4 +31,6 @@ def nightly_evaluation(
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
     done = run_nodes(without_training(plan(settings, Path.cwd())), artifacts.resolve(), settings.runner)
     scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
-    return compare_nights(scores, artifacts.resolve() / "nightly")
+    comparison = compare_nights(scores, artifacts.resolve() / "nightly")
+    show_in_prefect(comparison, done)
+    return comparison

@@ -7,6 +7,7 @@ from pathlib import Path
 from prefect import flow
 
 from tasks.artifact_task import ArtifactReference
+from tasks.prefect_artifacts import show_in_prefect
 from tasks.run_nodes import run_nodes
 from tasks.run_page import RunPage
 from worldline_core.config import load_config
@@ -24,9 +25,12 @@ def pipeline(
     """Curate, filter, render actions, encode latents, train, distill, roll out, evaluate, report.
 
     Each node of the plan is one Prefect task; finished artifacts are found, not made again. From the first finished node
-    on ``artifacts/report/latest`` shows how far the run is; in the end it leads to the report. Returns the report.
+    on ``artifacts/report/latest`` shows how far the run is; in the end it leads to the report. Prefect's page of the
+    run links to it and has a table of the metrics. Returns the report.
     """
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
     nodes = plan(settings, Path.cwd())
     with RunPage(artifacts.resolve(), [node.name for node in nodes]) as page:
-        return run_nodes(nodes, artifacts.resolve(), settings.runner, page)["report"]
+        done = run_nodes(nodes, artifacts.resolve(), settings.runner, page)
+    show_in_prefect(page.folder, done)
+    return done["report"]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
@@ -42,6 +44,7 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--node", help="which node of the run, when a step occurs more than once (rollout.shipped_stage2)"
     )
+    parser.add_argument("--json", action="store_true", help="print the artifact and its metrics as JSON")
 
 
 def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
@@ -91,12 +94,16 @@ def run_task_command(step_name: str, argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog=f"python -m tasks.{step_name}", description=get_step(step_name).summary)
     add_task_arguments(parser)
     arguments = parser.parse_args(argv)
-    exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments)))
+    exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments), as_json=arguments.json))
 
 
-def print_artifact(artifact: Artifact) -> None:
-    """One line that a script can cut: where the artifact is, its digest, and whether it was there already."""
-    print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
+def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
+    """One line that says where the artifact is, its digest, and whether it was there already; JSON has its metrics too."""
+    if as_json:
+        metrics = read_json(artifact.path / MANIFEST)["metrics"]
+        print(json.dumps({**asdict(artifact), "metrics": metrics}, default=str, indent=1))
+    else:
+        print(f"{artifact.path}  {artifact.digest[:16]}  {'cached' if artifact.cached else 'built'}")
 
 
 def exit_with_clear_errors(action: Callable[[], object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 from prefect.testing.utilities import prefect_test_harness
 
 from tasks.artifact_task import ArtifactReference
+from tasks.prefect_artifacts import show_in_prefect
 from tasks.run_nodes import run_nodes
 from tasks.run_page import RunPage
 from worldline_core.config import StrictModel, load_config
@@ -116,6 +118,24 @@ def test_prefect_shows_what_depends_on_what(storage: Path) -> None:
             time.sleep(0.2)
     runs = {run.name: run for run in found}
     assert [source.id for source in runs["write_next.second"].task_inputs["wait_for"]] == [runs["write_first"].id]
+
+
+def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path: Path) -> None:
+    success = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 9}
+    summary = {"methods": {"causal": {"budgets": {"32": {"success": success}}}}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    scores = ArtifactReference(step="evaluate_planning", path=tmp_path, digest="0" * 64)
+
+    @flow
+    def shown() -> None:
+        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores})
+
+    shown()
+    with get_client(sync_client=True) as client:
+        found = {artifact.key: artifact.data for artifact in client.read_artifacts()}
+    assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
+    row = {"metric": "planning/N=32/causal/success", "mean": 0.75, "95 % from": 0.5, "to": 1.0, "trajectories": 9}
+    assert json.loads(str(found["metrics"])) == [row]
 
 
 def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:
