@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -106,3 +107,14 @@ def test_wrong_input_name_lists_the_right_ones(tmp_path: Path, capsys: pytest.Ca
 def test_every_step_is_a_subcommand_choice() -> None:
     arguments = build_parser().parse_args(["task", "train_stage2", "--set", "train_stage2.steps=3"])
     assert (arguments.step, arguments.overrides) == ("train_stage2", ["train_stage2.steps=3"])
+
+
+def test_task_and_inspect_answer_scripts_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["task", "curate", "--preset", "smoke", "--artifacts", str(tmp_path), "--json"])
+    artifact = json.loads(capsys.readouterr().out)
+    assert artifact["metrics"]["found"] > 0
+    assert (artifact["step"], artifact["cached"]) == ("curate", False)
+    main(["inspect", artifact["path"], "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "EpisodeSet"
+    assert all(Path(path).is_file() for path in found["written"])
