@@ -25,7 +25,6 @@ from worldline_core.scale.mapping import (
     TakeOutcome,
     WorkerDiedError,
     do_shard,
-    retry_pauses,
 )
 from worldline_core.store.remote import is_transient, process_cache
 
@@ -38,11 +37,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def shard_mapper(config: RunnerConfig) -> ShardMapper:
     """What does mapped work as configured."""
-    return _serial(config) if config.kind == "serial" else PrefectMapper(config)
-
-
-def _serial(config: RunnerConfig) -> SerialMapper:
-    return SerialMapper(config.episodes_per_shard, config.retries, config.retry_seconds)
+    return SerialMapper(config) if config.kind == "serial" else PrefectMapper(config)
 
 
 class PrefectMapper:
@@ -57,7 +52,7 @@ class PrefectMapper:
         few = config.kind == "auto" and (sum(map(len, shards)) < config.serial_below or self._workers() == 1)
         # What killed a worker must not get the chance to kill this process.
         if not shards or (few and not one_at_a_time):
-            _serial(config).map(shards, take)
+            SerialMapper(config).map(shards, take)
             return
         waiting = deque(shards)
         limit = 1 if one_at_a_time else config.in_flight or 2 * self._workers()
@@ -78,7 +73,7 @@ class PrefectMapper:
             fn=_work,
             name="shard",
             retries=self.config.retries,
-            retry_delay_seconds=retry_pauses(self.config.retries, self.config.retry_seconds),
+            retry_delay_seconds=self.config.pauses,
             retry_condition_fn=_may_pass,
             persist_result=False,
             log_prints=False,

@@ -21,7 +21,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
 from worldline_core.scale.account import read_account
-from worldline_core.scale.mapping import SerialMapper
+from worldline_core.scale.mapping import RunnerConfig, SerialMapper
 from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
@@ -51,7 +51,7 @@ def config(path: object, **changes: Any) -> CurateConfig:
 
 
 def curated_digest(configured: CurateConfig, output: Path) -> str:
-    curate(configured, {}, output, SerialMapper(2, retries=1, retry_seconds=0.01))
+    curate(configured, {}, output, SerialMapper(RunnerConfig(episodes_per_shard=2, retries=1, retry_seconds=0.01)))
     return digest_folder(output)
 
 

@@ -86,7 +86,7 @@ def runner(kind: str, **settings: Any) -> RunnerConfig:
 
 @pytest.mark.parametrize("size", [1, 5, 100])
 def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, size: int) -> None:
-    assert both_digests(recordings, tmp_path, SerialMapper(size)) == undisturbed
+    assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not EpisodeSetWriter.finished(output)
-    mapper = SerialMapper(5)
+    mapper = SerialMapper(RunnerConfig(episodes_per_shard=5))
     assert both_digests(recordings, tmp_path, mapper) == undisturbed
     rows = read_account(output)
     assert len(rows) == COUNT + 1

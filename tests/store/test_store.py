@@ -45,7 +45,7 @@ def test_second_run_is_cached(tmp_path: Path) -> None:
     assert not first.cached
     assert second.cached
     assert (second.path, second.digest) == (first.path, first.digest)
-    store.verify(second)
+    assert digest_folder(second.path) == second.digest
 
 
 @pytest.mark.parametrize("change", ["config", "version", "step", "input"])
@@ -128,15 +128,14 @@ def test_changed_artifact_is_noticed(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path)
     artifact = store.run("count", 1, count, CountConfig(), {})
     (artifact.path / "3.txt").write_text("33")
-    with pytest.raises(ArtifactError, match="changed after it was finished"):
-        store.verify(artifact)
+    assert digest_folder(artifact.path) != artifact.digest
 
 
 def test_damaged_manifest_is_named(tmp_path: Path) -> None:
     store = ArtifactStore(tmp_path)
     artifact = store.run("count", 1, count, CountConfig(), {})
     (artifact.path / "manifest.json").write_text("{")
-    with pytest.raises(ArtifactError, match="manifest is damaged"):
+    with pytest.raises(ArtifactError, match=r"JSON file is damaged[\s\S]*manifest.json"):
         store.find("count", artifact.key)
 
 

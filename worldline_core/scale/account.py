@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.errors import DataError
-from worldline_core.store.atomic import atomic_path
+from worldline_core.store.artifact_files import row_schema
+from worldline_core.store.atomic import write_table_atomic
 from worldline_core.store.digest import digest_value
 
 SHARDS_FOLDER = "run/inputs"
@@ -44,19 +45,7 @@ class InputRow:
     cpu_seconds: float | None = None
 
 
-_SCHEMA = pa.schema(
-    [
-        ("episode_id", pa.string()),
-        ("source", pa.string()),
-        ("status", pa.string()),
-        ("reason", pa.string()),
-        ("digest", pa.string()),
-        ("stored_bytes", pa.int64()),
-        ("seconds", pa.float64()),
-        ("cpu_seconds", pa.float64()),
-    ]
-)
-_COLUMNS = [field.name for field in fields(InputRow)]
+_SCHEMA = row_schema(InputRow)
 
 
 def write_shard_account(output: Path, number: int, rows: Sequence[InputRow]) -> None:
@@ -106,13 +95,11 @@ def check_account(output: Path, found: int, kept: set[str], quarantined: set[str
 
 
 def _write(path: Path, rows: Iterable[InputRow]) -> None:
-    columns = [{name: getattr(row, name) for name in _COLUMNS} for row in rows]
-    with atomic_path(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(columns, schema=_SCHEMA), temporary)
+    write_table_atomic(path, pa.Table.from_pylist([asdict(row) for row in rows], schema=_SCHEMA))
 
 
 def _read(path: Path) -> list[InputRow]:
-    return [InputRow(**row) for row in pq.read_table(path, columns=_COLUMNS).to_pylist()]
+    return [InputRow(**row) for row in pq.read_table(path, columns=_SCHEMA.names).to_pylist()]
 
 
 _ADDRESS = re.compile(r"0x[0-9a-fA-F]{4,}")

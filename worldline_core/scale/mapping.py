@@ -15,6 +15,7 @@ import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -24,13 +25,10 @@ from tqdm import tqdm
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
-from worldline_core.store.remote import UnreachableInputError, is_transient
+from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, retry_pauses, with_retries
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_EPISODES_PER_SHARD = 16
-DEFAULT_RETRIES = 2
-DEFAULT_RETRY_SECONDS = 5.0
 _MACHINE_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE, errno.ENFILE})
 
 
@@ -183,47 +181,6 @@ class ShardMapper(Protocol):
         ...
 
 
-class SerialMapper:
-    """Does the shards in this process, one after the other.
-
-    Args:
-        retries: further attempts at a shard that could not reach its input, the first after `retry_seconds`.
-    """
-
-    def __init__(
-        self,
-        episodes_per_shard: int = DEFAULT_EPISODES_PER_SHARD,
-        retries: int = DEFAULT_RETRIES,
-        retry_seconds: float = DEFAULT_RETRY_SECONDS,
-    ) -> None:
-        self.episodes_per_shard = episodes_per_shard
-        self._pauses = retry_pauses(retries, retry_seconds)
-
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
-        del one_at_a_time  # always
-        for shard in shards:
-            take(shard, self._error(shard))
-
-    def _error(self, shard: Shard[Any]) -> Exception | None:
-        waiting = iter(self._pauses)
-        while True:
-            try:
-                do_shard(shard)
-            except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
-                pause = next(waiting, None) if is_transient(error) else None
-                if pause is None:
-                    return error
-                logger.warning("%s: %s; trying again in %.1f s", shard.label, _first_line(error), pause)
-                time.sleep(pause)
-            else:
-                return None
-
-
-def retry_pauses(retries: int, first_seconds: float) -> list[float]:
-    """Seconds before each further attempt at a shard, doubling."""
-    return [first_seconds * 2**number for number in range(retries)]
-
-
 def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequence[Sequence[E]]) -> None:
     """Do all episodes, each of `pieces` as a shard; one that fails does not keep the others from being done.
 
@@ -253,7 +210,7 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
         return take
 
     def suspect(shard: Shard[E], error: Exception) -> None:
-        logger.warning("%s: %s; its episodes are done again one at a time", shard.label, _first_line(error))
+        logger.warning("%s: %s; its episodes are done again one at a time", shard.label, first_line(error))
         suspects.append(shard)
 
     def crash(shard: Shard[E], error: Exception) -> None:
@@ -263,7 +220,7 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
         raise DataError(
             "Some episodes could not be processed",
             where=shard.label,
-            got=_first_line(error),
+            got=first_line(error),
             next_step="run the step again; if it stays, look at the machine's memory",
         ) from error
 
@@ -284,14 +241,9 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
         first = next(iter(unreachable.values()))
         raise UnreachableInputError(
             f"{len(unreachable)} of {len(unfinished)} shards could not read all of their inputs; all else is done",
-            got=_first_line(first),
+            got=first_line(first),
             next_step="run the same command again when the store answers: only what is missing is read",
         ) from first
-
-
-def _first_line(error: BaseException) -> str:
-    lines = str(error).splitlines()
-    return f"{type(error).__name__}: {lines[0] if lines else ''}"
 
 
 class RunnerConfig(StrictModel):
@@ -305,15 +257,11 @@ class RunnerConfig(StrictModel):
     address: str | None = Field(
         default=None, description="scheduler of a Dask or Ray cluster; null: a cluster of its own on this machine"
     )
-    episodes_per_shard: int = Field(default=DEFAULT_EPISODES_PER_SHARD, ge=1)
+    episodes_per_shard: int = Field(default=16, ge=1)
     in_flight: int | None = Field(default=None, ge=1, description="shards handed out at a time; null: two per worker")
     serial_below: int = Field(default=256, ge=0, description="auto: fewer episodes than this are done in this process")
-    retries: int = Field(
-        default=DEFAULT_RETRIES, ge=0, description="further attempts at a shard that could not reach its input"
-    )
-    retry_seconds: float = Field(
-        default=DEFAULT_RETRY_SECONDS, ge=0, description="pause before the first of them; doubles"
-    )
+    retries: int = Field(default=2, ge=0, description="further attempts at a shard that could not reach its input")
+    retry_seconds: float = Field(default=5.0, ge=0, description="pause before the first of them; doubles")
     remote_cache_gb: float = Field(default=8.0, gt=0, description="room for copies of remote files, per worker")
     nodes_at_once: int = Field(
         default=1,
@@ -326,3 +274,26 @@ class RunnerConfig(StrictModel):
         if self.address is not None and self.kind not in ("dask", "ray"):
             raise ValueError(f"an address is that of a Dask or Ray cluster; the kind is {self.kind}")
         return self
+
+    @property
+    def pauses(self) -> list[float]:
+        """Seconds before each further attempt at a shard."""
+        return retry_pauses(self.retries, self.retry_seconds)
+
+
+class SerialMapper:
+    """Does the shards in this process, one after the other."""
+
+    def __init__(self, config: RunnerConfig | None = None) -> None:
+        self._config = config or RunnerConfig()
+        self.episodes_per_shard = self._config.episodes_per_shard
+
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+        del one_at_a_time  # always
+        for shard in shards:
+            fault: Exception | None = None
+            try:
+                with_retries(partial(do_shard, shard), shard.label, self._config.pauses)
+            except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
+                fault = error
+            take(shard, fault)

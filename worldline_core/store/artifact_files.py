@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from worldline_core.errors import ArtifactError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 JsonObject = dict[str, Any]
 
@@ -61,6 +61,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | N
     Raises:
         ArtifactError: the file cannot be read.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     if not path.is_file():
         return None
     try:
@@ -75,6 +78,18 @@ def read_rows(path: Path) -> list[JsonObject]:
     """The rows of a Parquet table as objects; no file means no rows."""
     found = read_table(path)
     return [] if found is None else found.to_pylist()
+
+
+def row_schema(row: type) -> pa.Schema:
+    """The Parquet columns of a dataclass: its fields, in order; an optional one has the type of its values."""
+    import pyarrow as pa
+
+    columns = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), tuple[str, ...]: pa.list_(pa.string())}
+    schema = []
+    for name, hint in get_type_hints(row).items():
+        known = [columns[kind] for kind in (hint, *get_args(hint)) if kind in columns]
+        schema.append((name, known[0] if known else pa.string()))
+    return pa.schema(schema)
 
 
 def kind_of(folder: Path) -> str:

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 ATTEMPTS = 5
 FIRST_PAUSE_SECONDS = 0.2
 
-_PASSING = frozenset(
+_TRANSIENT_ERRNOS = frozenset(
     getattr(errno, name)
     for name in (
         "EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ETIMEDOUT", "ENETDOWN", "ENETUNREACH", "ENETRESET",
@@ -42,7 +42,7 @@ _PASSING = frozenset(
     if hasattr(errno, name)
 )  # fmt: skip
 """What a network file system or s3fs (its translation of 5xx answers) reports when it should be asked again."""
-_PASSING_CLASSES = frozenset(
+_TRANSIENT_CLASSES = frozenset(
     {
         ("botocore.exceptions", "HTTPClientError"),  # connections refused, closed, timed out
         ("botocore.exceptions", "ResponseStreamingError"),
@@ -68,9 +68,9 @@ def is_transient(error: BaseException | None) -> bool:
         seen.add(id(error))
         if isinstance(error, ConnectionError | TimeoutError | UnreachableInputError):
             return True
-        if isinstance(error, OSError) and error.errno in _PASSING:
+        if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
             return True
-        if _busy_answer(error) or any((c.__module__, c.__name__) in _PASSING_CLASSES for c in type(error).__mro__):
+        if _busy_answer(error) or any((c.__module__, c.__name__) in _TRANSIENT_CLASSES for c in type(error).__mro__):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -85,17 +85,17 @@ def _busy_answer(error: BaseException) -> bool:
     return isinstance(status, int) and (status >= 500 or status == 429)
 
 
-def pauses(attempts: int = ATTEMPTS, first_seconds: float = FIRST_PAUSE_SECONDS) -> Iterator[float]:
-    """Seconds to wait before each further attempt, doubling."""
-    yield from (first_seconds * 2**number for number in range(attempts - 1))
+def retry_pauses(retries: int, first_seconds: float) -> list[float]:
+    """Seconds before each further attempt, doubling."""
+    return [first_seconds * 2**number for number in range(retries)]
 
 
-def with_retries[T](action: Callable[[], T], what: str) -> T:
-    """The result of `action`, tried again with growing pauses while it fails for a transient reason.
+def with_retries[T](action: Callable[[], T], what: str, pauses: Sequence[float] | None = None) -> T:
+    """The result of `action`, tried again after each of `pauses` [s] while it fails for a transient reason.
 
     Raises: UnreachableInputError after the last attempt; every other error at once.
     """
-    waiting = pauses()
+    waiting = iter(retry_pauses(ATTEMPTS - 1, FIRST_PAUSE_SECONDS) if pauses is None else pauses)
     while True:
         try:
             return action()
@@ -103,6 +103,8 @@ def with_retries[T](action: Callable[[], T], what: str) -> T:
             if not is_transient(error):
                 raise
             pause = next(waiting, None)
+            if pause is None and isinstance(error, UnreachableInputError):
+                raise
             if pause is None:
                 raise UnreachableInputError(
                     "A store could not be reached",
@@ -111,8 +113,13 @@ def with_retries[T](action: Callable[[], T], what: str) -> T:
                     got=f"{type(error).__name__}: {error}",
                     next_step="run the same command again when the store answers; finished work is kept",
                 ) from error
-            logger.warning("%s: %s: %s; trying again in %.1f s", what, type(error).__name__, error, pause)
+            logger.warning("%s: %s; trying again in %.1f s", what, first_line(error), pause)
             time.sleep(pause)
+
+
+def first_line(error: BaseException) -> str:
+    """An error's kind and the first line of its message."""
+    return f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
 
 
 if TYPE_CHECKING:
@@ -217,16 +224,8 @@ def _kind_at(fs: Any, name: str) -> str | None:
 
 
 _CHANGE_MARKS = (
-    "ETag",
-    "etag",
-    "checksum",
-    "md5Hash",
-    "content_md5",
-    "LastModified",
-    "last_modified",
-    "mtime",
-    "created",
-)
+    "ETag", "etag", "checksum", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created",
+)  # fmt: skip
 """Attributes by which stores tell that a file's content changed; the first one present is taken."""
 
 
@@ -242,11 +241,6 @@ def remote_digest(root: AnyPath) -> str:
     if not entries:
         raise ArtifactError("There is nothing at an input's location", where=str(root), next_step="check the URL")
     return digest_value(entries)
-
-
-def matching(names: list[str], pattern: str) -> list[str]:
-    """The relative names that `Path.rglob(pattern)` would find."""
-    return [name for name in names if PurePosixPath(name).match(pattern)]
 
 
 class RemoteCache:

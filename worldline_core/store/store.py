@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import fcntl
 import importlib.metadata
-import json
 import logging
 import os
 import platform
@@ -28,8 +27,9 @@ from typing import Any
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
+from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic, write_json_atomic
-from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder, digest_value
+from worldline_core.store.digest import MANIFEST_NAME, digest_folder, digest_value
 from worldline_core.store.remote import is_remote, remote_digest
 
 logger = logging.getLogger(__name__)
@@ -131,10 +131,14 @@ class ArtifactStore:
     def find(self, step: str, key: str) -> Artifact | None:
         """The finished artifact of a key, or None."""
         folder = self.root / step / key
-        manifest = folder / MANIFEST_NAME
-        if not manifest.is_file():
+        if not (folder / MANIFEST_NAME).is_file():
             return None
-        return Artifact(step, folder, _manifest_digest(manifest), cached=True)
+        manifest = read_json(folder / MANIFEST_NAME)
+        if "digest" not in manifest:
+            raise ArtifactError(
+                "A manifest has no digest", where=folder, next_step="delete the folder; the step rebuilds it"
+            )
+        return Artifact(step, folder, str(manifest["digest"]), cached=True)
 
     def input_digest(self, path: Path) -> str:
         """Digest of an input: read from the manifest of an artifact, computed for any other folder.
@@ -150,10 +154,8 @@ class ArtifactStore:
             return remote_digest(path)
         if not path.is_dir():
             raise ArtifactError("An input folder does not exist", where=path, next_step="run the step that makes it")
-        manifest = path / MANIFEST_NAME
-        if manifest.is_file() and "digest" in (content := _read_manifest(manifest)):
-            return str(content["digest"])
-        return digest_folder(path)
+        manifest = read_json(path / MANIFEST_NAME)
+        return str(manifest["digest"]) if "digest" in manifest else digest_folder(path)
 
     def run(
         self,
@@ -223,43 +225,6 @@ class ArtifactStore:
             partial.replace(folder)
         return Artifact(step, folder, digest, cached=False)
 
-    def verify(self, artifact: Artifact) -> None:
-        """Check an artifact's bytes against its manifest.
-
-        Raises:
-            ArtifactError: the content was changed after it was finished.
-        """
-        actual = digest_folder(artifact.path)
-        if actual != artifact.digest:
-            raise ArtifactError(
-                "An artifact was changed after it was finished",
-                where=artifact.path,
-                expected=artifact.digest,
-                got=actual,
-                next_step="delete the folder; the next run rebuilds it",
-            )
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ArtifactError(
-            "A manifest is damaged", where=path, got=str(error), next_step="delete the folder"
-        ) from error
-    if not isinstance(content, dict):
-        raise ArtifactError(
-            "A manifest is damaged", where=path, got=type(content).__name__, next_step="delete the folder"
-        )
-    return content
-
-
-def _manifest_digest(path: Path) -> str:
-    content = _read_manifest(path)
-    if "digest" not in content:
-        raise ArtifactError("A manifest has no digest", where=path, next_step="delete the folder; the step rebuilds it")
-    return str(content["digest"])
-
 
 def _portable(path: Path, root: Path) -> str:
     """Paths in manifests are relative to the artifacts' root, so that a checkout can be moved."""
@@ -307,10 +272,3 @@ def _git_commit() -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return result.stdout.strip() or None
-
-
-def partial_run_folder(output: Path) -> Path:
-    """``output/run``: where a step keeps resume state, logs and timings (outside the digest)."""
-    folder = output / VOLATILE_FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

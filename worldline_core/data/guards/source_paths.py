@@ -27,7 +27,7 @@ from upath import UPath
 
 from worldline_core.data.guards.rejection import RejectedInputError, too_large
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.store.remote import AnyPath, list_files, matching, parse_location, process_cache, remote_kind
+from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
 
 type FileState = tuple[int, int, int, int]
 _REMEMBERED = 100_000
@@ -258,7 +258,7 @@ def find_files[P: AnyPath](root: P, pattern: str) -> list[P]:
     Raises: UnreachableInputError when the store does not answer.
     """
     if isinstance(root, UPath) and not isinstance(root, Path):
-        return [root / name for name in matching(list(list_files(root)), pattern)]
+        return [root / name for name in list_files(root) if PurePosixPath(name).match(pattern)]
     return sorted(root.rglob(pattern))  # pyright: ignore[reportReturnType]
 
 
