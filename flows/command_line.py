@@ -288,8 +288,9 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the console command."""
+    """Entry point of the console command, which works in a child process; with `argv` it works in this one."""
     from tasks.command_line import exit_with_clear_errors
+    from tasks.supervisor import run_supervised
     from worldline_core.pipeline.steps import keep_freed_memory
 
     # Early: threads that have allocated keep the arena that they have.
@@ -297,7 +298,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     # Threads that spin at barriers take the cores from the video decoders beside them. Read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = build_parser().parse_args(argv)
-    exit_with_clear_errors(lambda: arguments.run(arguments))
+    if argv is None:
+        continues = arguments.run in (_pipeline, _nightly, _task, _record)
+        run_supervised(lambda: exit_with_clear_errors(lambda: arguments.run(arguments)), continues=continues)
+    else:
+        exit_with_clear_errors(lambda: arguments.run(arguments))
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import os
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.command_line import log_to_stderr
 from tasks.shard_mapper import shard_mapper
+from tasks.supervisor import end_with_parent
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
 from worldline_core.pipeline.steps import Step, get_step, run_step
@@ -138,15 +137,8 @@ def _run_step(
 
 @functools.cache
 def _end_with_parent() -> None:
-    """Let this process of a pool end when the one that started it has ended: killed, it cannot say so."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="end with parent", daemon=True).start()
+    """Let this process of a pool end with the one that started it."""
+    end_with_parent(lambda: os._exit(1))
 
 
 def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:

@@ -6,11 +6,12 @@ import argparse
 import json
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
+from tasks.supervisor import run_supervised
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, WorldLineError
 from worldline_core.pipeline.steps import get_step, run_step
@@ -89,12 +90,15 @@ def _parse_input(text: str) -> tuple[str, Path]:
     return name, Path(folder)
 
 
-def run_task_command(step_name: str, argv: Sequence[str] | None = None) -> None:
+def run_task_command(step_name: str) -> None:
     """Entry point of ``python -m tasks.<step>``."""
     parser = argparse.ArgumentParser(prog=f"python -m tasks.{step_name}", description=get_step(step_name).summary)
     add_task_arguments(parser)
-    arguments = parser.parse_args(argv)
-    exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments), as_json=arguments.json))
+    arguments = parser.parse_args()
+    run_supervised(
+        lambda: exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments), as_json=arguments.json)),
+        continues=True,
+    )
 
 
 def print_artifact(artifact: Artifact, *, as_json: bool) -> None:

@@ -1,0 +1,84 @@
+"""Stopping a command: it ends at once, with everything that it started, and says what to do."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+# The work starts a process of its own that ignores polite signals, as a busy pool does, and writes its id.
+WORK = """
+import signal, subprocess, sys, time
+from tasks.supervisor import run_supervised
+
+def work():
+    code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(60)"
+    helper = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    helper.stdout.readline()
+    print(helper.pid, flush=True)
+    %s
+
+run_supervised(work, continues=True)
+"""
+
+
+def start(project_root: Path, body: str) -> tuple[subprocess.Popen[str], int]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORK % body], cwd=project_root, env={**os.environ, "PYTHONPATH": str(project_root)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    return process, int(process.stdout.readline())
+
+
+def wait_until_gone(pid: int) -> None:
+    deadline = time.monotonic() + 10
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        if Path(f"/proc/{pid}/stat").read_text().rsplit(") ")[-1].startswith("Z"):
+            return  # dead; whoever adopted it has not asked yet
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_from_the_terminal_stops_everything(project_root: Path, number: int, status: int) -> None:
+    process, helper = start(project_root, "time.sleep(60)")
+    os.killpg(process.pid, number)
+    _, error = process.communicate(timeout=20)
+    assert (process.returncode, error) == (status, "stopped; the same command continues\n")
+    wait_until_gone(helper)
+
+
+def test_work_that_does_not_listen_is_killed(project_root: Path) -> None:
+    process, helper = start(project_root, "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)")
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert (process.returncode, error) == (130, "stopped; the same command continues\n")
+    wait_until_gone(helper)
+
+
+def test_the_command_ends_with_the_status_of_the_work(project_root: Path) -> None:
+    process, helper = start(project_root, "helper.kill(); raise SystemExit(7)")
+    process.communicate(timeout=20)
+    assert process.returncode == 7
+    wait_until_gone(helper)
+
+
+def test_work_that_is_killed_is_reported(project_root: Path) -> None:
+    process, helper = start(project_root, "signal.raise_signal(signal.SIGKILL)")
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == 137
+    assert "ended by SIGKILL, perhaps for its memory; the same command continues" in error
+    wait_until_gone(helper)
+
+
+def test_the_work_ends_with_a_command_that_is_killed(project_root: Path) -> None:
+    process, helper = start(project_root, "time.sleep(60)")
+    process.kill()
+    process.wait()
+    wait_until_gone(helper)
