@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from worldline_core.store import remote
+
 sys.path.insert(0, str(Path(__file__).parent))  # workers import the jobs of these tests by name
 
 
@@ -52,6 +54,12 @@ def store(store_server: object) -> Iterator[object]:
     process_cache().clear()
     yield store_server
     store_server.misbehave = lambda method, path: None  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stores are asked again at once."""
+    monkeypatch.setattr(remote, "FIRST_PAUSE_SECONDS", 0.01)
 
 
 @pytest.fixture(scope="session")

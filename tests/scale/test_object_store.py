@@ -22,13 +22,14 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
-from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
 from worldline_core.store.store import ArtifactStore
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 Make = Callable[..., tuple]
+
+pytestmark = pytest.mark.usefixtures("short_pauses")
 
 
 @pytest.fixture
@@ -37,12 +38,6 @@ def recordings(tmp_path: Path, sample: Make) -> Path:
         for number in range(5):
             writer.add(*sample(number))
     return tmp_path / "raw"
-
-
-@pytest.fixture(autouse=True)
-def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transient, "FIRST_PAUSE_SECONDS", 0.01)
-    monkeypatch.setattr(transient.pauses, "__defaults__", (transient.ATTEMPTS, 0.01))
 
 
 def config(path: object, **changes: Any) -> CurateConfig:

@@ -15,9 +15,10 @@ from worldline_core.data.guards.source_paths import parse_location
 from worldline_core.errors import ArtifactError
 from worldline_core.publishing.content import FILE_LIST
 from worldline_core.publishing.publish import pull, push
-from worldline_core.store import remote as transient
 from worldline_core.store.digest import digest_folder
 from worldline_core.store.remote import UnreachableInputError
+
+pytestmark = pytest.mark.usefixtures("short_pauses")
 
 
 @pytest.fixture
@@ -26,11 +27,6 @@ def finished(tmp_path: Path, sample: Callable[..., tuple]) -> Path:
         for number in range(2):
             writer.add(*sample(number))
     return tmp_path / "set"
-
-
-@pytest.fixture(autouse=True)
-def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transient.pauses, "__defaults__", (transient.ATTEMPTS, 0.01))
 
 
 @pytest.mark.parametrize("kind", ["store", "folder"])
