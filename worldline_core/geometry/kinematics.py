@@ -10,19 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from pytorch_kinematics.chain import Chain
-from pytorch_kinematics.frame import Frame, Joint, Link
-from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment, read_description
 from worldline_core.geometry.kinematic_tree import TreeBody, mounted, read_mjcf, read_urdf
 from worldline_core.geometry.transforms import invert
+
+if TYPE_CHECKING:  # imports a plotting library: seconds that most commands and processes need not wait
+    from pytorch_kinematics.chain import Chain
+    from pytorch_kinematics.frame import Frame, Joint
 
 
 def read_tree(embodiment: Embodiment) -> TreeBody:
@@ -257,10 +259,15 @@ def chain_from_tree(tree: TreeBody) -> Chain:
     J = Trans(p) R(axis, q) Trans(-p). A chain frame has one joint, so a body gets one frame per joint, and a last
     fixed one where a joint lies off the body's origin; the last frame bears the body's name.
     """
+    from pytorch_kinematics.chain import Chain
+
     return Chain(_frame(tree), dtype=torch.float64)
 
 
 def _frame(body: TreeBody) -> Frame:
+    from pytorch_kinematics.frame import Frame, Joint, Link
+    from pytorch_kinematics.transforms import Transform3d
+
     steps: list[tuple[np.ndarray, Joint]] = []
     offset = body.T_parent_body
     for joint in body.joints:
