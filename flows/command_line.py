@@ -145,21 +145,34 @@ def _use_local_prefect_storage(artifacts: Path) -> None:
     os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
 
 
+def _checked_preset(arguments: argparse.Namespace) -> str | None:
+    """The preset of a run whose configuration is sound: a mistake is reported before Prefect and its server start."""
+    from worldline_core.config import load_config, preset_path
+
+    preset = arguments.preset or (None if arguments.config else "demo")
+    if preset is not None:
+        preset_path(preset)  # answers before torch is imported
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
+
+    load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    return preset
+
+
 def _pipeline(arguments: argparse.Namespace) -> None:
+    preset = _checked_preset(arguments)
     _use_local_prefect_storage(arguments.artifacts)
     from flows.pipeline import pipeline
 
-    preset = arguments.preset or (None if arguments.config else "demo")
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
     report = pipeline(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
     print(f"report: {report.path / 'index.html'}")
 
 
 def _nightly(arguments: argparse.Namespace) -> None:
+    preset = _checked_preset(arguments)
     _use_local_prefect_storage(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
 
-    preset = arguments.preset or (None if arguments.config else "demo")
     print(f"nightly: {nightly_evaluation(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)}")
 
 

@@ -58,6 +58,24 @@ def test_unknown_override_ends_with_a_clear_error(capsys: pytest.CaptureFixture[
     assert "unknown key" in error
 
 
+@pytest.mark.parametrize("command", ["pipeline", "nightly"])
+@pytest.mark.parametrize(
+    ("mistake", "blocked", "message"),
+    [
+        (["--preset", "tinny"], ["prefect", "torch"], "did you mean 'tiny'"),
+        (["--set", "curate.image_sice=[64, 96]"], ["prefect"], "unknown key"),
+    ],
+)
+def test_a_mistake_in_the_configuration_is_reported_before_prefect_starts(
+    command: str, mistake: list[str], blocked: list[str], message: str, project_root: Path
+) -> None:
+    code = f"import sys; sys.modules.update(dict.fromkeys({blocked})); from flows.command_line import main; main({[command, *mistake]})"
+    result = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 def test_missing_upstream_names_the_step_to_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["task", "filter", "--preset", "tiny", "--artifacts", str(tmp_path)])
