@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
-from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
-from worldline_core.calibration.diagnosis import Diagnosis
+from worldline_core.calibration.calibration_doctor import diagnose, diagnose_set
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis
 from worldline_core.calibration.observation import small_gray
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,

@@ -19,7 +19,7 @@ from worldline_core.actions.overlays import draw_overlay
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import view_thumbnails
-from worldline_core.filters.examine import inspect
+from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import Finding

@@ -20,7 +20,6 @@ from worldline_core.calibration.diagnosis import (
     Explanation,
     Finding,
     SetDiagnosis,
-    SetFinding,
     ViewMeasures,
 )
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions
@@ -41,9 +40,8 @@ def listed(episode: Episode, images: dict[str, np.ndarray], name: str = "synthet
     )
 
 
-def explained(conventions: RecordedConventions, lines: tuple[str, ...] | None = None) -> Explanation:
-    name = "+".join(conventions.departures)
-    return Explanation(name, conventions, -1.0, {}, conventions.config_lines() if lines is None else lines)
+def explained(conventions: RecordedConventions) -> Explanation:
+    return Explanation(conventions, -1.0, {})
 
 
 # --- the line that repairs
@@ -54,7 +52,7 @@ def test_lines_name_the_source_by_its_number(episode: Episode, images: dict[str,
     assert repairing_lines(item, explained(RecordedConventions(quaternion="wxyz"))) == (
         "curate.sources[3].conventions.quaternion: wxyz",
     )
-    assert repairing_lines(item, Explanation("none", RecordedConventions(), 0.0, {}, ())) == ()
+    assert repairing_lines(item, Explanation(RecordedConventions(), 0.0, {})) == ()
 
 
 def test_what_is_declared_already_is_counted_in(episode: Episode, images: dict[str, np.ndarray]) -> None:
@@ -110,10 +108,13 @@ def test_what_one_declaration_cannot_say_is_refused(
         combined_conventions(declared, found)
 
 
-def test_lines_for_other_files_are_handed_on(episode: Episode, images: dict[str, np.ndarray]) -> None:
-    line = "configs/embodiments/x.yaml: arms[].T_link_tool.translation: +0.0500 along the tool's z"
-    explanation = explained(RecordedConventions(tool_offset_z_m=0.05), (line,))
-    assert repairing_lines(listed(episode, images), explanation) == (line,)
+def test_two_mistakes_are_named_together_and_need_a_line_each(episode: Episode, images: dict[str, np.ndarray]) -> None:
+    explanation = explained(RecordedConventions(tool_offset_z_m=0.05, gripper="inverted"))
+    assert explanation.mistake == "tool_offset_z_m+gripper"
+    assert repairing_lines(listed(episode, images), explanation) == (
+        "curate.sources[].conventions.tool_offset_z_m: 0.05",
+        "curate.sources[].conventions.gripper: inverted",
+    )
 
 
 # --- the check
@@ -165,7 +166,7 @@ def test_nothing_to_check_is_an_error(tmp_path: Path) -> None:
 
 def made_up() -> CalibrationCheck:
     """One finding of each verdict, with names that would break a page that does not escape them."""
-    none = Explanation("none", RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0}, ())
+    none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0})
     best = explained(RecordedConventions(camera_axes="opengl"))
     measures = (
         ViewMeasures("head", in_view_share=0.25, flow_agreement=-0.5),
@@ -173,13 +174,14 @@ def made_up() -> CalibrationCheck:
     )
     broken = Diagnosis("b", "explained", best, (best, none), measures, ("a note",))
     fine = Diagnosis("a", "consistent", none, (none,), (), ())
-    summed = SetDiagnosis("s", 2, "explained", best, (best, none), {"camera_axes": 1, "consistent": 1}, ("of the set",))
+    votes = {"camera_axes": 1, "consistent": 1}
+    summed = SetDiagnosis("s", 2, "explained", best, (best, none), votes, ("of the set",), ("line three",))
     findings = (
         Finding(f"a {HOSTILE}", "s", fine, picture="pictures/a.jpg"),
         Finding("b", "s", broken, config_lines=("line one", "line two")),
         Finding("c", "s", None, "unreadable", f"why {HOSTILE}"),
     )
-    return CalibrationCheck(findings, (SetFinding(summed, ("line three",)),), Path("out"))
+    return CalibrationCheck(findings, (summed,), Path("out"))
 
 
 def test_the_table_shows_the_worst_of_each_measure() -> None:

@@ -26,10 +26,8 @@ from worldline_core.errors import DataError
 
 
 def diagnosis_of(conventions: RecordedConventions, verdict: VerdictName = "explained") -> Diagnosis:
-    none = Explanation("none", RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0}, ())
-    best = Explanation(
-        "+".join(conventions.departures), conventions, -1.0, {"hand_eye right_wrist": -1.0}, conventions.config_lines()
-    )
+    none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0})
+    best = Explanation(conventions, -1.0, {"hand_eye right_wrist": -1.0})
     measures = (ViewMeasures("right_wrist", hand_eye_m=0.2, hand_eye_deg=31.4, camera_lag_frames=-2.0),)
     if not conventions.departures:
         return Diagnosis("synthetic/0", verdict, none, (none,), measures, ())

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tools.corrupted.conventions import corrupt
-from worldline_core.calibration.calibration_doctor import CalibrationDoctorConfig, diagnose, diagnose_set
-from worldline_core.calibration.diagnosis import Diagnosis
+from worldline_core.calibration.calibration_doctor import diagnose, diagnose_set
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
@@ -58,7 +58,7 @@ def test_every_mistake_is_named(benchmark: ModuleType, healthy: list, number: in
         names.append(name)
         if not name.startswith("none"):
             assert diagnosis.margin >= CONFIG.min_margin
-            assert diagnosis.best.config_lines[0].startswith("curate.sources[].conventions.")
+            assert diagnosis.best.conventions.config_lines()[0].startswith("curate.sources[].conventions.")
             assert diagnosis.ranked[0] is diagnosis.best
         if name == "tool_offset_z_m":
             assert diagnosis.best.conventions.tool_offset_z_m == pytest.approx(conventions.tool_offset_z_m, abs=1e-3)
@@ -74,7 +74,7 @@ def test_a_mistake_in_one_view_is_told_from_one_in_all(benchmark: ModuleType, he
         conventions = RecordedConventions(**mistake, views=("head",))  # type: ignore[arg-type]
         diagnosis = benchmark.examine(item, item.joints, conventions, CONFIG, True)
         assert diagnosis.best.conventions == conventions
-        assert diagnosis.best.config_lines[-1].endswith("views: [head]")
+        assert diagnosis.best.conventions.config_lines()[-1].endswith("views: [head]")
 
 
 def test_late_states_are_two_lags_at_once(benchmark: ModuleType, healthy: list) -> None:

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.calibration.gripper_evidence import finger_flow, stopped_share
-from worldline_core.calibration.hypotheses import camera_lags, intrinsics_sizes, tool_offset
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Typical
 from worldline_core.calibration.image_evidence import (
     correlation_log_likelihood,
+    finger_flow,
     still_view_agreement,
+    stopped_share,
     wrist_flow_agreement,
 )
-from worldline_core.calibration.measures import refined_peak
+from worldline_core.calibration.measures import camera_lags, intrinsics_sizes, refined_peak, tool_offset
 from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
 from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, pose_terms, rms_hand_eye
 from worldline_core.calibration.reading import read
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig, Typical
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.cameras import project_points

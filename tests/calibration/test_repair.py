@@ -50,7 +50,7 @@ def test_curate_with_the_printed_line(tmp_path: Path, shipped: EpisodeSet, mista
     spoiled = EpisodeSet.open(tmp_path / "spoiled")
     kinematics = ArmKinematics(load_embodiment("xarm7_pair"))
     frames = {view: spoiled.frames(0, view) for view in spoiled.rows[0].views}
-    lines = diagnose(spoiled.episode(0), frames, kinematics).best.config_lines
+    lines = diagnose(spoiled.episode(0), frames, kinematics).best.conventions.config_lines()
     assert lines == conventions.config_lines()
     declared = {line.split(".")[-1].split(":")[0]: yaml.safe_load(line.split(": ", 1)[1]) for line in lines}
 

@@ -21,7 +21,7 @@ from worldline_core.data.episodes.view_recording import RecordedView, VideoSetti
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk, view_thumbnails
-from worldline_core.filters.examine import examine
+from worldline_core.filters.filter import examine
 from worldline_core.filters.filter_config import FilterConfig
 
 Sample = tuple[Episode, dict[str, np.ndarray], dict[str, np.ndarray]]
@@ -122,7 +122,7 @@ def test_verdicts_do_not_depend_on_the_cached_thumbnails(tmp_path: Path, sample:
     verdicts = [examine(settings, curated, i) for i in range(len(curated))]
     shutil.rmtree(tmp_path / "out" / "run")
     assert [examine(settings, EpisodeSet.open(tmp_path / "out"), i) for i in range(len(curated))] == verdicts
-    assert all(verdict["findings"] for verdict in verdicts)
+    assert all(verdict.findings for verdict in verdicts)
     for view, thumbnails in cached.items():
         made = curated.thumbnails(1, view)
         assert np.array_equal(made.gray, thumbnails.gray)

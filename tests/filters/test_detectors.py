@@ -12,7 +12,6 @@ from worldline_core.filters.alignment import (
     detect_projection,
     lag_by_correlation,
 )
-from worldline_core.filters.base_motion import changed_area, detect_base_motion
 from worldline_core.filters.calibration import detect_camera, detect_fixed_camera, detect_hand_eye
 from worldline_core.filters.filter_config import (
     BaseMotionConfig,
@@ -26,7 +25,14 @@ from worldline_core.filters.filter_config import (
     StaticConfig,
     TimeAlignmentConfig,
 )
-from worldline_core.filters.motion import detect_joint_jump, detect_joint_speed, detect_reset, detect_static
+from worldline_core.filters.motion import (
+    changed_area,
+    detect_base_motion,
+    detect_joint_jump,
+    detect_joint_speed,
+    detect_reset,
+    detect_static,
+)
 from worldline_core.filters.pictures import detect_blur, detect_corrupted, detect_dark, detect_overexposed
 from worldline_core.filters.signals import picture_statistics, range_speed
 from worldline_core.filters.verdict import long_runs, runs

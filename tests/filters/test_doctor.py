@@ -14,7 +14,7 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.filters.calibration import detect_mistake, kinematics_of
-from worldline_core.filters.examine import inspect
+from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig, FilterDoctorConfig
 from worldline_core.filters.signals import Signals, measure
 

@@ -12,28 +12,36 @@ from itertools import combinations
 
 import numpy as np
 
-from worldline_core.calibration.diagnosis import Diagnosis, Explanation, SetDiagnosis, VerdictName
-from worldline_core.calibration.gripper_evidence import gripper_terms, inversion_gain
-from worldline_core.calibration.hypotheses import conventions_to_try, image_lags
+from worldline_core.calibration.diagnosis import (
+    CalibrationDoctorConfig,
+    Diagnosis,
+    Explanation,
+    SetDiagnosis,
+    VerdictName,
+)
 from worldline_core.calibration.image_evidence import (
     correlation_log_likelihood,
+    gripper_terms,
     image_terms,
+    inversion_gain,
     observable_views,
     turn_log_likelihood,
 )
-from worldline_core.calibration.measures import notes_on, view_measures
+from worldline_core.calibration.measures import conventions_to_try, image_lags, notes_on, view_measures
 from worldline_core.calibration.observation import Observation, observe
 from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, pose_terms
 from worldline_core.calibration.reading import Reading, read
-from worldline_core.calibration.thresholds import MIN_TRAVEL_M, PAIRED_MISTAKES, CalibrationDoctorConfig
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.geometry.kinematics import ArmKinematics
 
-__all__ = ["CalibrationDoctorConfig", "diagnose", "diagnose_set"]
-
 DEFAULT_CONFIG = CalibrationDoctorConfig()
+PAIRED_MISTAKES = 4
+"""Of the mistakes that explain most alone, each two are tried together."""
+MIN_TRAVEL_M = 0.02
+"""A tool that moves less over the episode leaves no trace of a mistake."""
+_NOTHING = Explanation(RecordedConventions(), 0.0, {})
 _CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size")
 
 
@@ -59,7 +67,8 @@ def diagnose(
     recorded = read(observation, RecordedConventions())
     if recorded is None or not episode.cameras:
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
-        return _undecided(episode, f"The recording has no {missing}: nothing can be compared")
+        note = f"The recording has no {missing}: nothing can be compared"
+        return Diagnosis(episode.episode_id, "too_little_evidence", _NOTHING, (_NOTHING,), (), (note,))
     poses = pose_terms(observation, recorded, config)
     if config.search == "when_suspicious":
         quick = _unsuspicious(observation, recorded, poses, config)
@@ -102,8 +111,7 @@ def diagnose_set(
     listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
     votes = Counter(d.best.mistake if d.verdict == "explained" else d.verdict for d in listed)
     if not listed:
-        nothing = _undecided_explanation()
-        return SetDiagnosis(source, 0, "too_little_evidence", nothing, (nothing,), {}, ("No episode can be judged",))
+        return SetDiagnosis(source, 0, "too_little_evidence", _NOTHING, (_NOTHING,), {}, ("No episode can be judged",))
     total_none = sum(d.none.score for d in listed)
     gains: dict[str, float] = defaultdict(float)
     members: dict[str, list[Explanation]] = defaultdict(list)
@@ -120,12 +128,10 @@ def diagnose_set(
     ranked.sort(key=lambda e: -e.score)
     best, none = ranked[0], next(e for e in ranked if e.mistake == "none")
     limit = config.min_margin + 0.5 * len(listed)
+    verdict: VerdictName = "explained"
     if best.mistake == "none" or best.score - none.score < limit:
-        unexplained = votes["unexplained"] > len(listed) / 2
-        verdict: VerdictName = "unexplained" if unexplained else "consistent"
+        verdict = "unexplained" if votes["unexplained"] > len(listed) / 2 else "consistent"
         best = none
-    else:
-        verdict = "explained"
     notes = tuple(dict.fromkeys(note for d in listed for note in d.notes))
     return SetDiagnosis(source, len(listed), verdict, best, tuple(ranked), dict(votes), notes)
 
@@ -143,22 +149,18 @@ def _summed(members: list[Explanation], score: float) -> Explanation:
     for member in members:
         for name, value in member.evidence.items():
             evidence[name] += value
-    by_conventions = Counter(member.conventions for member in members)
-    conventions = by_conventions.most_common(1)[0][0]
+    conventions = Counter(member.conventions for member in members).most_common(1)[0][0]
     if members[0].mistake == "tool_offset_z_m":
         median = float(np.median([member.conventions.tool_offset_z_m for member in members]))
         conventions = conventions.model_copy(update={"tool_offset_z_m": round(median, 4)})
-        return Explanation(members[0].mistake, conventions, score, dict(evidence), conventions.config_lines())
-    lines = next(member.config_lines for member in members if member.conventions == conventions)
-    return Explanation(members[0].mistake, conventions, score, dict(evidence), lines)
+    return Explanation(conventions, score, dict(evidence))
 
 
 def _explain(reading: Reading, terms: dict[str, float], config: CalibrationDoctorConfig) -> Explanation:
     """A reading with its score: the sum of its terms, less what departing from the contract costs."""
     conventions = reading.conventions
     cost = config.complexity * (len(conventions.departures) + (conventions.views is not None) / 2)
-    mistake = "+".join(conventions.departures) or "none"
-    return Explanation(mistake, conventions, float(sum(terms.values())) - cost, terms, conventions.config_lines())
+    return Explanation(conventions, float(sum(terms.values())) - cost, terms)
 
 
 def _terms(
@@ -284,12 +286,3 @@ def _decide(none: Explanation, best: Explanation, config: CalibrationDoctorConfi
     if _healthy(none, config):
         return "consistent", none
     return "unexplained", none
-
-
-def _undecided_explanation() -> Explanation:
-    return Explanation("none", RecordedConventions(), 0.0, {}, ())
-
-
-def _undecided(episode: Episode, note: str) -> Diagnosis:
-    nothing = _undecided_explanation()
-    return Diagnosis(episode.episode_id, "too_little_evidence", nothing, (nothing,), (), (note,))

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from worldline_core.calibration.calibration_doctor import diagnose, diagnose_set
 from worldline_core.calibration.check_report import as_json, page
-from worldline_core.calibration.diagnosis import CalibrationCheck, Diagnosis, Explanation, Finding, SetFinding
+from worldline_core.calibration.diagnosis import CalibrationCheck, Explanation, Finding, SetDiagnosis
 from worldline_core.calibration.pictures import diagnosis_picture
 from worldline_core.config import apply_overrides, read_yaml, validate
 from worldline_core.data.curation.checks import check_camera, check_times, check_values
@@ -33,7 +33,6 @@ from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
-CONVENTIONS_KEY = "curate.sources[].conventions"
 ADDING = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
 """Conventions that add up when they are declared and found again."""
 UNDOING = ("extrinsics", "camera_axes", "arms", "gripper")
@@ -49,7 +48,7 @@ class ListedEpisode:
     episode_id: str
     source: str
     load: Callable[[], LoadedEpisode]
-    config_prefix: str = CONVENTIONS_KEY
+    config_prefix: str = "curate.sources[].conventions"
     declared: RecordedConventions = field(default_factory=RecordedConventions)
 
 
@@ -93,19 +92,13 @@ def combined_conventions(declared: RecordedConventions, found: RecordedConventio
 def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str, ...]:
     """What the source's configuration must say if the explanation holds; nothing for the recording as written.
 
-    Lines of an explanation that are no conventions (of an embodiment's file) are handed on as they are.
-
     Raises:
         ConfigError: as `combined_conventions`.
     """
-    declared_here = [line for line in explanation.config_lines if line.startswith(f"{CONVENTIONS_KEY}.")]
-    elsewhere = tuple(line for line in explanation.config_lines if line not in declared_here)
-    if not declared_here:
-        return elsewhere
-    names = {line.removeprefix(f"{CONVENTIONS_KEY}.").split(":")[0] for line in declared_here}
-    found = RecordedConventions(**{name: getattr(explanation.conventions, name) for name in names})
-    lines = combined_conventions(item.declared, found).config_lines(item.config_prefix)
-    return (*(lines or (f"remove {item.config_prefix}",)), *elsewhere)
+    if not explanation.conventions.departures:
+        return ()
+    lines = combined_conventions(item.declared, explanation.conventions).config_lines(item.config_prefix)
+    return lines or (f"remove {item.config_prefix}",)
 
 
 def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[ListedEpisode], dict[str, str]]:
@@ -156,13 +149,12 @@ def chosen_episodes(listed: Sequence[ListedEpisode], wanted: Sequence[str]) -> l
         DataError: an id is not there.
     """
     known = {item.episode_id for item in listed}
-    for name in wanted:
-        if name not in known:
-            raise DataError(
-                "No such episode",
-                expected=f"one of {len(known)} ids, such as {', '.join(sorted(known)[:3])}",
-                got=name,
-            )
+    if unknown := set(wanted) - known:
+        raise DataError(
+            "No such episode",
+            expected=f"one of {len(known)} ids, such as {', '.join(sorted(known)[:3])}",
+            got=", ".join(sorted(unknown)),
+        )
     return [item for item in listed if not wanted or item.episode_id in wanted]
 
 
@@ -215,13 +207,14 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, 
         lines = repairing_lines(item, diagnosis.best)
     except ConfigError as error:
         notes = (*notes, f"{error.what}: {error.next_step}")
-    picture: str | None = None
-    if pictures:
+    picture = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg" if pictures else None
+    if picture:
         try:
-            picture = _write_picture(output, diagnosis, episode, frames, arms)
+            drawn = diagnosis_picture(diagnosis, episode, frames, arms)
+            write_bytes_atomic(output / picture, jpeg_bytes(drawn))
         except DataError as error:
-            notes = (*notes, f"no picture: {error.what}")
-    return Finding(item.episode_id, item.source, diagnosis, None, "", lines, picture, notes)
+            picture, notes = None, (*notes, f"no picture: {error.what}")
+    return Finding(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
 
 
 def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, str]:
@@ -255,20 +248,7 @@ def _one_line(error: DataError) -> str:
     return "; ".join([error.what, *(f"{name} {value}" for name, value in details if value is not None)])
 
 
-def _write_picture(
-    output: Path,
-    diagnosis: Diagnosis,
-    episode: Episode,
-    frames: dict[str, np.ndarray],
-    kinematics: ArmKinematics | None,
-) -> str:
-    name = f"pictures/{safe_stem(diagnosis.episode_id)}.jpg"
-    picture = diagnosis_picture(diagnosis, episode, frames, kinematics)
-    write_bytes_atomic(output / name, jpeg_bytes(picture))
-    return name
-
-
-def _sum_up(listed: Sequence[ListedEpisode], findings: Sequence[Finding]) -> Iterator[SetFinding]:
+def _sum_up(listed: Sequence[ListedEpisode], findings: Sequence[Finding]) -> Iterator[SetDiagnosis]:
     """A conclusion for each source that more than one episode could be diagnosed of."""
     for source in dict.fromkeys(item.source for item in listed):
         of_source = next(item for item in listed if item.source == source)
@@ -277,10 +257,9 @@ def _sum_up(listed: Sequence[ListedEpisode], findings: Sequence[Finding]) -> Ite
             continue
         summed = diagnose_set(source, diagnoses)
         try:
-            yield SetFinding(summed, repairing_lines(of_source, summed.best))
+            yield replace(summed, config_lines=repairing_lines(of_source, summed.best))
         except ConfigError as error:
-            notes = (*summed.notes, f"{error.what}: {error.next_step}")
-            yield SetFinding(replace(summed, notes=notes), ())
+            yield replace(summed, notes=(*summed.notes, f"{error.what}: {error.next_step}"))
 
 
 def check_command(

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from worldline_core.calibration.diagnosis import (
-    CalibrationCheck,
-    Diagnosis,
-    Explanation,
-    Finding,
-    SetDiagnosis,
-    SetFinding,
-)
+from worldline_core.calibration.diagnosis import CalibrationCheck, Diagnosis, Finding, SetDiagnosis
 from worldline_core.pages.page import Table, render, words
 
 MEANINGS = {
@@ -61,18 +54,15 @@ def measures_shown(diagnosis: Diagnosis) -> dict[str, str]:
 
 def table_text(check: CalibrationCheck) -> str:
     """The table of episodes, the conclusion over each source, and the lines that repair it."""
-    rows = [["episode", "verdict", "best explanation", "score", "as recorded", *MEASURES]]
-    refused: dict[int, str] = {}
-    for number, finding in enumerate(check.findings, 1):
-        rows.append(_table_row(finding))
-        if finding.diagnosis is None:
-            refused[number] = f"{finding.reason}: {finding.detail}"
+    header = ["episode", "verdict", "best explanation", "score", "as recorded", *MEASURES]
+    rows = [header, *(_table_row(finding) for finding in check.findings)]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = []
-    for number, row in enumerate(rows):
+    for finding, row in zip((None, *check.findings), rows, strict=True):
         cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
-        # The reason of an episode that cannot be read takes the place of all that was not measured.
-        cells[2:] = [refused[number]] if number in refused else cells[2:]
+        if finding is not None and finding.diagnosis is None:
+            # The reason of an episode that cannot be read takes the place of all that was not measured.
+            cells[2:] = [f"{finding.reason}: {finding.detail}"]
         lines.append("  ".join(cells).rstrip())
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join([*lines, "", *conclusion_lines(check)])
@@ -94,9 +84,9 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
     parts = [f"{counted[name]} {words(name)}" for name in MEANINGS if counted[name]]
     lines = [f"{len(check.findings)} episodes: {', '.join(parts)}"]
     for found in check.sets:
-        lines += ["", set_headline(found.diagnosis), f"  single episodes say: {votes_text(found.diagnosis)}"]
-        lines += [f"  {caution}" for caution in cautions(found.diagnosis)]
-        lines += [f"  note: {note}" for note in found.diagnosis.notes]
+        lines += ["", set_headline(found), f"  single episodes say: {votes_text(found)}"]
+        lines += [f"  {caution}" for caution in cautions(found)]
+        lines += [f"  note: {note}" for note in found.notes]
         if found.config_lines:
             lines += ["  what repairs it, in the configuration of this source:"]
             lines += [f"    {line}" for line in found.config_lines]
@@ -141,11 +131,26 @@ def cautions(found: SetDiagnosis) -> list[str]:
 
 def as_json(check: CalibrationCheck) -> dict[str, Any]:
     """Everything, in plain values."""
-    return {
-        "consistent": check.consistent,
-        "episodes": [_finding_json(finding) for finding in check.findings],
-        "sources": [_set_json(found) for found in check.sets],
-    }
+    return plain(
+        {
+            "consistent": check.consistent,
+            "episodes": [_finding_json(finding) for finding in check.findings],
+            "sources": [
+                {
+                    "source": found.source,
+                    "episodes": found.num_episodes,
+                    "verdict": found.verdict,
+                    "mistake": found.best.mistake,
+                    "score": found.best.score,
+                    "ranked": [{"mistake": e.mistake, "score": e.score} for e in found.ranked],
+                    "votes": found.votes,
+                    "notes": found.notes,
+                    "config_lines": found.config_lines,
+                }
+                for found in check.sets
+            ],
+        }
+    )
 
 
 def _finding_json(finding: Finding) -> dict[str, Any]:
@@ -157,49 +162,30 @@ def _finding_json(finding: Finding) -> dict[str, Any]:
         "picture": finding.picture,
         "notes": finding.notes,
     }
-    if finding.diagnosis is None:
-        return plain(content | {"reason": finding.reason, "detail": finding.detail})
     diagnosis = finding.diagnosis
-    content |= {
+    if diagnosis is None:
+        return content | {"reason": finding.reason, "detail": finding.detail}
+    return content | {
         "mistake": diagnosis.best.mistake,
         "score": diagnosis.best.score,
         "score_as_recorded": diagnosis.none.score,
-        "ranked": [_explanation_json(explanation) for explanation in diagnosis.ranked],
+        "ranked": [
+            {
+                "mistake": e.mistake,
+                "score": e.score,
+                "evidence": e.evidence,
+                "conventions": {name: getattr(e.conventions, name) for name in e.conventions.departures},
+            }
+            for e in diagnosis.ranked
+        ],
         "measures": [asdict(measures) for measures in diagnosis.measures],
         "notes": (*diagnosis.notes, *finding.notes),
     }
-    return plain(content)
-
-
-def _explanation_json(explanation: Explanation) -> dict[str, Any]:
-    return {
-        "mistake": explanation.mistake,
-        "score": explanation.score,
-        "evidence": dict(explanation.evidence),
-        "conventions": {name: getattr(explanation.conventions, name) for name in explanation.conventions.departures},
-    }
-
-
-def _set_json(found: SetFinding) -> dict[str, Any]:
-    diagnosis = found.diagnosis
-    return plain(
-        {
-            "source": diagnosis.source,
-            "episodes": diagnosis.num_episodes,
-            "verdict": diagnosis.verdict,
-            "mistake": diagnosis.best.mistake,
-            "score": diagnosis.best.score,
-            "ranked": [{"mistake": e.mistake, "score": e.score} for e in diagnosis.ranked],
-            "votes": dict(diagnosis.votes),
-            "notes": diagnosis.notes,
-            "config_lines": found.config_lines,
-        }
-    )
 
 
 def plain(value: Any) -> Any:
     """A value as JSON knows it: NumPy numbers become plain ones, what is not finite becomes null."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]

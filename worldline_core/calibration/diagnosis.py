@@ -1,4 +1,7 @@
-"""What the calibration doctor says about an episode and about all episodes of a source, and what a check found."""
+"""What the calibration doctor is told and what it says: thresholds, diagnoses of episodes and sources, a check's result.
+
+Terms of a score are log-likelihoods: 0 is as a healthy recording typically is, lower is worse.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,75 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 
 VerdictName = Literal["consistent", "explained", "unexplained", "too_little_evidence"]
+
+
+class Typical(StrictModel):
+    """A correlation that healthy recordings reach, and how many independent samples it stands for."""
+
+    value: float = Field(gt=0, lt=1)
+    samples: float = Field(gt=0)
+
+
+class Spread(StrictModel):
+    """A correlation that healthy recordings reach, and how much it scatters."""
+
+    value: float = Field(gt=0, lt=1)
+    spread: float = Field(gt=0)
+
+
+class CalibrationDoctorConfig(StrictModel):
+    """Lengths in metres, angles in degrees, scores in units of log-likelihood.
+
+    The typical values are medians over the healthy training episodes of the shipped recordings
+    (`benchmarks/calibration_doctor.py --typical` prints them); they hold for other recordings as far as these
+    resemble them, so the decisions rest on differences between readings.
+    """
+
+    search: Literal["always", "when_suspicious"] = Field(
+        default="always", description="when_suspicious: try other readings only if the recorded one looks bad"
+    )
+    min_margin: float = Field(default=2.5, gt=0, description="by which a mistake must beat the recording as written")
+    max_gain: float = Field(
+        default=20.0, gt=0, description="that one episode can lend to a reading of its whole source"
+    )
+    min_term: float = Field(
+        default=-9.0, lt=0, description="a pose term below this is bad: no healthy recording has one"
+    )
+    min_flow: float = Field(default=0.6, gt=0, lt=1, description="agreement of arm flow below which it is bad")
+    flow_turn_deg: float = Field(
+        default=8.0, gt=0, description="spread of the angle between measured and predicted flow"
+    )
+    max_flow_turn_deg: float = Field(default=25.0, gt=0, description="a larger angle is bad")
+    suspicion: float = Field(default=-4.0, lt=0, description="a term below this starts the search")
+    complexity: float = Field(default=2.0, ge=0, description="cost of a reading that departs from the contract")
+    max_lag_frames: int = Field(default=6, ge=1, le=60)
+    samples: float = Field(default=20.0, gt=0, description="independent frames that a hand-eye residual stands for")
+    hand_eye_m: float = Field(default=0.002, gt=0, description="hand-eye residual of a camera that is mounted")
+    hand_eye_deg: float = Field(default=0.7, gt=0)
+    max_hand_eye_m: float = Field(default=0.012, gt=0, description="a larger residual is bad, whatever the reading")
+    mount_m: float = Field(default=0.01, gt=0, description="spread of cameras around the stated mount")
+    mount_deg: float = Field(default=3.0, gt=0)
+    kinematics_m: float = Field(default=0.005, gt=0, description="spread of recorded poses around forward kinematics")
+    kinematics_deg: float = Field(default=2.0, gt=0)
+    principal_point: float = Field(default=0.03, gt=0, description="spread around the image centre, share of the side")
+    max_reach_m: float = Field(default=2.5, gt=0, description="of a tool from its base")
+    max_camera_m: float = Field(default=5.0, gt=0, description="of a camera from the base")
+    max_wrist_camera_m: float = Field(default=0.5, gt=0, description="of a wrist camera from its tool")
+    min_image_pairs: int = Field(default=8, ge=2, description="fewer pictures are no evidence")
+    arm_flow: Typical = Typical(value=0.92, samples=20)
+    arm_change: Typical = Typical(value=0.74, samples=20)
+    tool_flow: Typical = Typical(value=0.96, samples=14)
+    tool_change: Typical = Typical(value=0.5, samples=14)
+    wrist_flow: Typical = Typical(value=0.55, samples=12)
+    wrist_energy: Typical = Typical(value=0.8, samples=8)
+    fingers: Spread = Spread(value=0.75, spread=0.4)
+    finger_links: Spread = Spread(value=0.5, spread=0.3)
 
 
 @dataclass(frozen=True)
@@ -17,19 +86,20 @@ class Explanation:
     """One way to read the recording.
 
     Attributes:
-        mistake: "none", or the name of a field of `RecordedConventions` (two joined by "+" for a pair).
         conventions: how the source would have written its numbers; `apply_conventions` repairs the episode with it.
         score: log-likelihood of everything measured, under this reading; 0 is as a healthy recording typically is,
             lower is worse. Differences between readings of one episode mean something, and add up over episodes.
-        evidence: the terms of the score by name ("hand_eye left_wrist", ...); each at most 0.
-        config_lines: what repairs it, for example "curate.sources[].conventions.extrinsics: base_to_camera".
+        evidence: the terms of the score by name ("hand-eye left_wrist", ...); each at most 0.
     """
 
-    mistake: str
     conventions: RecordedConventions
     score: float
     evidence: Mapping[str, float]
-    config_lines: tuple[str, ...]
+
+    @property
+    def mistake(self) -> str:
+        """ "none", or the name of a field of `RecordedConventions` (two joined by "+" for a pair)."""
+        return "+".join(self.conventions.departures) or "none"
 
 
 @dataclass(frozen=True)
@@ -102,8 +172,9 @@ class SetDiagnosis:
     """All episodes of one source: the same conventions, so that the evidence adds up.
 
     Attributes:
-        votes: verdicts and mistakes of the single episodes, counted.
         ranked: readings with the scores summed over episodes.
+        votes: verdicts and mistakes of the single episodes, counted.
+        config_lines: what the source's configuration must say, in place of what it says now.
     """
 
     source: str
@@ -113,6 +184,7 @@ class SetDiagnosis:
     ranked: tuple[Explanation, ...]
     votes: Mapping[str, int]
     notes: tuple[str, ...]
+    config_lines: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -141,19 +213,11 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class SetFinding:
-    """The conclusion over all episodes of a source, and the lines that repair it."""
-
-    diagnosis: SetDiagnosis
-    config_lines: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class CalibrationCheck:
     """Everything that was found, and the folder that it was written to."""
 
     findings: tuple[Finding, ...]
-    sets: tuple[SetFinding, ...]
+    sets: tuple[SetDiagnosis, ...]
     output: Path
 
     @property
@@ -161,4 +225,4 @@ class CalibrationCheck:
         """Whether nothing is wrong: some episode is consistent, and none is anything worse than silent."""
         verdicts = {finding.verdict for finding in self.findings}
         sound = not verdicts & {"explained", "unexplained", "unreadable"}
-        return sound and "consistent" in verdicts and all(s.diagnosis.verdict != "explained" for s in self.sets)
+        return sound and "consistent" in verdicts and all(found.verdict != "explained" for found in self.sets)

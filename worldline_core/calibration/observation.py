@@ -10,7 +10,6 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from worldline_core.calibration.thresholds import STILL_CHANGE
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -18,11 +17,13 @@ from worldline_core.geometry.transforms import hand_eye_residual
 
 GRAY_WIDTH = 96
 CELL_PX = 4
+STILL_CHANGE = 4.0
+"""Grey levels: compression and sensor noise stay below."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """`T_tool_mount`: place of the wrist camera in the tool frame where the embodiment states it."""
+    """One arm; `T_tool_mount` is the place of its wrist camera in the tool frame where the embodiment states it."""
 
     name: str
     wrist_view: str
@@ -106,7 +107,7 @@ def observe(episode: Episode, frames: Mapping[str, np.ndarray], kinematics: ArmK
     Raises: DataError when images have another shape or the kinematics belong to another number of arms.
     """
     gray = {view: small_gray(images) for view, images in frames.items()}
-    return Observation(episode, gray, _arms(episode, kinematics), kinematics)
+    return Observation(episode, gray, arms_of(episode, kinematics), kinematics)
 
 
 def small_gray(images: np.ndarray) -> np.ndarray:
@@ -153,7 +154,11 @@ def _motion(gray: np.ndarray) -> Motion:
     return Motion(cell_means(flow), cell_means(np.abs(np.diff(value, axis=0))), cell_means(np.maximum(across, down)))
 
 
-def _arms(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
+def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:
+    """The arms of the embodiment; without kinematics, those of the recorded tool poses under the usual names.
+
+    Raises: DataError when the recording has another number of arms than the embodiment.
+    """
     if kinematics is None:
         count = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         names = {1: ("right",), 2: ("left", "right")}.get(count, tuple(f"arm_{i}" for i in range(count)))

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig
 from worldline_core.calibration.observation import Arm, Observation
 from worldline_core.calibration.reading import Reading
-from worldline_core.calibration.thresholds import (
-    FACING_DEG,
-    FACING_SPREAD_DEG,
-    FOLLOWS_COMMANDS_COST,
-    WORST_FACING_TERM,
-    WORST_HAND_EYE_TERM,
-    WORST_TERM,
-    CalibrationDoctorConfig,
-)
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
+
+WORST_TERM, WORST_HAND_EYE_TERM, WORST_FACING_TERM = -40.0, -60.0, -15.0
+FOLLOWS_COMMANDS_COST = 2.0
+"""Of camera poses that follow the commands rather than the states."""
+FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
+"""Between a wrist camera's axis and the direction to its tool."""
 
 
 def pose_terms(observation: Observation, reading: Reading, config: CalibrationDoctorConfig) -> dict[str, float]:
@@ -91,20 +89,23 @@ def mount_offset(mount: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
 
 
 def _intrinsics(camera: CameraTrack, config: CalibrationDoctorConfig) -> float:
-    u, v = principal_point_offset(camera)
-    fields = [
-        np.degrees(2 * np.arctan2(side, 2 * f))
-        for side, f in zip((camera.width, camera.height), (camera.K[0, 0], camera.K[1, 1]), strict=True)
-    ]
+    u, v = principal_point_offset(camera.K, camera.width, camera.height)
+    fields = fields_of_view_deg(camera.K, camera.width, camera.height)
     odd = max(0.0, (20.0 - min(fields)) / 3, (max(fields) - 140.0) / 5)
     return _quadratic(u / config.principal_point, v / config.principal_point, odd)
 
 
-def principal_point_offset(camera: CameraTrack) -> tuple[float, float]:
+def principal_point_offset(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
     """From the image centre along u and v, in shares of the image side."""
-    K = camera.K
-    u, v = (K[0, 2] - (camera.width - 1) / 2) / camera.width, (K[1, 2] - (camera.height - 1) / 2) / camera.height
-    return float(u), float(v)
+    return float((K[0, 2] - (width - 1) / 2) / width), float((K[1, 2] - (height - 1) / 2) / height)
+
+
+def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
+    """Horizontal and vertical field of view."""
+    return (
+        float(np.degrees(2 * np.arctan2(width, 2 * K[0, 0]))),
+        float(np.degrees(2 * np.arctan2(height, 2 * K[1, 1]))),
+    )
 
 
 def _place(T_base_camera: np.ndarray, config: CalibrationDoctorConfig) -> float:

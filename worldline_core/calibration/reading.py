@@ -10,7 +10,6 @@ import numpy as np
 
 from worldline_core.actions.robot_masks import robot_capsules
 from worldline_core.calibration.observation import CELL_PX, Observation
-from worldline_core.calibration.thresholds import METRES_PER_RADIAN
 from worldline_core.data.episodes.conventions import (
     RecordedConventions,
     apply_conventions,
@@ -21,6 +20,8 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import rigid_inverse
 
+METRES_PER_RADIAN = 0.15
+"""A wrist camera that turns by one radian shows about as much change as one that goes this far."""
 _CAPSULE_SAMPLES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 _TOOL_POINTS_M = np.array([0.0, 0.05, 0.1, 0.15])
 _TOOL_RADIUS_M = 0.05
@@ -84,16 +85,20 @@ class Reading:
 
     @cached_property
     def tool_speed(self) -> np.ndarray:
-        """(n - 1, a) how much each tool moves from frame to frame [m], turning counted as travel."""
-        relative = rigid_inverse(self.tools[:-1]) @ self.tools[1:]
-        travel = np.linalg.norm(relative[..., :3, 3], axis=-1)
-        return travel + METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
+        return tool_travel(self.tools)
 
     def predicted(self, view: str) -> PredictedMotion:
         """Predicted motion in a view; computed once."""
         if view not in self._predicted:
             self._predicted[view] = predict_motion(self.points, self.radii, self.cameras[view])
         return self._predicted[view]
+
+
+def tool_travel(tools: np.ndarray) -> np.ndarray:
+    """(n - 1, a) how far each tool (n, a, 4, 4) moves from frame to frame [m], turning counted as travel."""
+    relative = rigid_inverse(tools[:-1]) @ tools[1:]
+    travel = np.linalg.norm(relative[..., :3, 3], axis=-1)
+    return travel + METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
 
 
 def read(observation: Observation, conventions: RecordedConventions) -> Reading | None:

@@ -8,18 +8,17 @@ one frame). Projection: tools lie inside the image, and where one moves, the ima
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
+from worldline_core.calibration.measures import lagged, parabola_peak
+from worldline_core.calibration.pose_evidence import rms_hand_eye
+from worldline_core.calibration.reading import tool_travel
 from worldline_core.filters.filter_config import FilterConfig, ProjectionConfig, TimeAlignmentConfig
 from worldline_core.filters.signals import Signals
 from worldline_core.filters.verdict import Finding, Verdict
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
-from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import hand_eye_residual, rigid_inverse
-
-# A turn of a wrist camera by one radian changes its image about as much as a motion of this length.
-_METRES_PER_RADIAN = 0.15
 
 
 def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> tuple[float, float, float]:
@@ -31,20 +30,15 @@ def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> 
 
     Returns: (lag in frames, refined below a frame by a parabola; correlation there; correlation at lag 0).
     """
-    best, scores = 0, np.full(2 * max_lag + 1, -1.0)
+    scores = np.full(2 * max_lag + 1, -1.0)
     for index, lag in enumerate(range(-max_lag, max_lag + 1)):
-        a = motion[max(0, -lag) : len(motion) - max(0, lag)]
-        b = change[max(0, lag) : len(change) - max(0, -lag)]
-        known = _correlations(a, b)
+        known = _correlations(*lagged(motion, change, lag))
         if len(known):
             scores[index] = float(np.mean(known))
     best = int(scores.argmax())
     refined = float(best - max_lag)
     if 0 < best < len(scores) - 1:
-        left, middle, right = scores[best - 1 : best + 2]
-        curvature = left - 2 * middle + right
-        if curvature < -1e-9:
-            refined += 0.5 * (left - right) / curvature
+        refined += parabola_peak(*scores[best - 1 : best + 2])
     return refined, float(scores[best]), float(scores[max_lag])
 
 
@@ -58,6 +52,11 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (a * b).mean(axis=0)[varies] / (spread_a * spread_b)[varies]
 
 
+def _largest_lag(count: int, fps: float, config: TimeAlignmentConfig) -> int:
+    """Frames searched to either side; at most a third of the recording is given up."""
+    return max(1, min(round(config.search_s * fps), count // 3))
+
+
 def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config: TimeAlignmentConfig) -> Verdict:
     """Whether images lag or lead the states.
 
@@ -65,8 +64,7 @@ def detect_image_lag(motion: np.ndarray, change: np.ndarray, fps: float, config:
         motion: (n, s) speed of what moves view s's image, entry i for the step to frame i + 1.
         change: (n, s) mean absolute image change of view s.
     """
-    max_lag = max(1, min(round(config.search_s * fps), len(motion) // 3))
-    lag, best, at_zero = lag_by_correlation(motion, change, max_lag)
+    lag, best, at_zero = lag_by_correlation(motion, change, _largest_lag(len(motion), fps, config))
     significant = best >= config.min_correlation and best - at_zero >= config.min_gain
     return Verdict(
         "time_alignment",
@@ -87,15 +85,10 @@ def pose_lag(T_base_tool: np.ndarray, T_base_camera: np.ndarray, max_lag: int) -
 
     Returns: (lag in frames, hand-eye residual [m] there, residual at 0), residuals as root mean squares.
     """
-    residuals: dict[int, float] = {}
 
+    @cache
     def residual(lag: int) -> float:
-        if lag not in residuals:
-            tool = T_base_tool[max(0, -lag) : len(T_base_tool) - max(0, lag)]
-            camera = T_base_camera[max(0, lag) : len(T_base_camera) - max(0, -lag)]
-            _, metres, _ = hand_eye_residual(tool, camera)
-            residuals[lag] = float(np.sqrt((metres**2).mean()))
-        return residuals[lag]
+        return rms_hand_eye(*lagged(T_base_tool, T_base_camera, lag))[1]
 
     coarse = max(1, max_lag // 6)
     tried = [*range(0, max_lag + 1, coarse), *range(-coarse, -max_lag - 1, -coarse)]
@@ -109,8 +102,7 @@ def detect_pose_lag(
     T_base_tool: np.ndarray, T_base_camera: np.ndarray, fps: float, config: TimeAlignmentConfig
 ) -> Verdict:
     """Whether recorded camera poses lag or lead the states."""
-    max_lag = max(1, min(round(config.search_s * fps), len(T_base_tool) // 3))
-    lag, best, at_zero = pose_lag(T_base_tool, T_base_camera, max_lag)
+    lag, best, at_zero = pose_lag(T_base_tool, T_base_camera, _largest_lag(len(T_base_tool), fps, config))
     # Where no shift makes the pair rigid, the calibration is wrong and says nothing about clocks.
     significant = at_zero - best >= config.min_pose_gain_m and best <= config.max_rigid_residual_m
     return Verdict(
@@ -184,11 +176,9 @@ def find_lags(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> l
     if tools is None:
         return []
     fps, thresholds = signals.episode.fps, config.time_alignment
-    relative = rigid_inverse(tools[:-1]) @ tools[1:]
-    motion = np.linalg.norm(relative[..., :3, 3], axis=-1)
-    motion = motion + _METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
     findings: list[Finding] = []
     if signals.arms:
+        motion = tool_travel(tools)
         streams = [motion[:, list(signals.arms_in(view))].max(axis=1) for view in signals.pictures]
         changes = [pictures.change[1:] for pictures in signals.pictures.values()]
         verdict = detect_image_lag(np.stack(streams, axis=1), np.stack(changes, axis=1), fps, thresholds)

@@ -8,29 +8,18 @@ the source, and nothing is repaired silently.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 
 import numpy as np
 
 from worldline_core.calibration.calibration_doctor import bad_terms, diagnose
-from worldline_core.calibration.diagnosis import Diagnosis, Explanation
+from worldline_core.calibration.diagnosis import Diagnosis
+from worldline_core.calibration.pose_evidence import fields_of_view_deg, mount_offset, principal_point_offset
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.errors import UnavailableError
 from worldline_core.filters.filter_config import CalibrationConfig, FilterConfig, FilterDoctorConfig
-from worldline_core.filters.signals import Signals
+from worldline_core.filters.signals import Signals, known_kinematics
 from worldline_core.filters.verdict import Finding, Numbers, Verdict, bad_frames, runs
-from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.transforms import hand_eye_residual
-
-
-def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
-    """Horizontal and vertical field of view."""
-    return (
-        float(np.degrees(2 * np.arctan2(width, 2 * K[0, 0]))),
-        float(np.degrees(2 * np.arctan2(height, 2 * K[1, 1]))),
-    )
 
 
 def detect_camera(
@@ -43,8 +32,8 @@ def detect_camera(
         for name, angle in zip(("horizontal", "vertical"), fields_of_view_deg(K, width, height), strict=True):
             numbers[f"{name}_fov_deg"] = angle
             sane &= config.min_field_of_view_deg <= angle <= config.max_field_of_view_deg
-        offset = max(abs(K[0, 2] - (width - 1) / 2) / width, abs(K[1, 2] - (height - 1) / 2) / height)
-        numbers["principal_point_offset"] = float(offset)
+        offset = max(map(abs, principal_point_offset(K, width, height)))
+        numbers["principal_point_offset"] = offset
         sane &= offset <= config.max_principal_point_offset
     rotation = T_base_camera[:, :3, :3]
     finite = bool(np.isfinite(T_base_camera).all())
@@ -64,8 +53,7 @@ def detect_hand_eye(
         T_base_tool, T_base_camera: (n, 4, 4).
         T_tool_mount: (4, 4) the embodiment's mount relative to the tool, or None.
     """
-    mount, metres, degrees = hand_eye_residual(T_base_tool, T_base_camera)
-    metres_95, degrees_95 = float(np.percentile(metres, 95)), float(np.percentile(degrees, 95))
+    mount, metres_95, degrees_95 = _residual_95(T_base_tool, T_base_camera)
     passed = metres_95 <= config.max_hand_eye_m and degrees_95 <= config.max_hand_eye_deg
     numbers: Numbers = {
         "hand_eye_m": metres_95,
@@ -74,8 +62,7 @@ def detect_hand_eye(
         "threshold_deg": config.max_hand_eye_deg,
     }
     if T_tool_mount is not None:
-        offset_m = float(np.linalg.norm(mount[:3, 3] - T_tool_mount[:3, 3]))
-        offset_deg = float(rotation_angle_deg(mount[:3, :3].T @ T_tool_mount[:3, :3]))
+        offset_m, offset_deg = mount_offset(mount, T_tool_mount)
         numbers |= {"mount_offset_m": offset_m, "mount_offset_deg": offset_deg}
         passed &= offset_m <= config.max_mount_offset_m and offset_deg <= config.max_mount_offset_deg
     return Verdict("calibration", passed, numbers)
@@ -83,13 +70,18 @@ def detect_hand_eye(
 
 def detect_fixed_camera(T_base_camera: np.ndarray, config: CalibrationConfig) -> Verdict:
     """Whether a camera that should stand still in the base frame does."""
-    _, metres, degrees = hand_eye_residual(np.eye(4)[None].repeat(len(T_base_camera), axis=0), T_base_camera)
-    metres_95, degrees_95 = float(np.percentile(metres, 95)), float(np.percentile(degrees, 95))
+    _, metres_95, degrees_95 = _residual_95(np.eye(4)[None].repeat(len(T_base_camera), axis=0), T_base_camera)
     return Verdict(
         "calibration",
         metres_95 <= config.max_hand_eye_m and degrees_95 <= config.max_hand_eye_deg,
         {"moved_m": metres_95, "turned_deg": degrees_95},
     )
+
+
+def _residual_95(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Mean mount, and the 95th percentiles of the deviations from it [m] and [deg]."""
+    mount, metres, degrees = hand_eye_residual(T_base_tool, T_base_camera)
+    return mount, float(np.percentile(metres, 95)), float(np.percentile(degrees, 95))
 
 
 _UNEXPLAINED = "calibration_unexplained"
@@ -118,8 +110,12 @@ def detect_mistake(
         episode = episode.cut(start, stop, step)
         gray = {view: images[start:stop:step] for view, images in gray.items()}
     diagnosis = diagnose(episode, gray, kinematics_of(episode), config)
+    reason = _UNEXPLAINED
+    if diagnosis.verdict == "explained":
+        lags = all(field.endswith("lag_frames") for field in diagnosis.best.conventions.departures)
+        reason = "time_alignment" if lags else "calibration"
     return Verdict(
-        _reason(diagnosis),
+        reason,
         diagnosis.verdict in ("consistent", "too_little_evidence"),
         _numbers(diagnosis, config, step) | {"first_frame": start, "every_frame": step},
     )
@@ -135,13 +131,6 @@ def _liveliest(episode: Episode, start: int, stop: int, length: int) -> tuple[in
     return first, first + length
 
 
-def _reason(diagnosis: Diagnosis) -> str:
-    if diagnosis.verdict != "explained":
-        return _UNEXPLAINED
-    lags = all(field.endswith("lag_frames") for field in diagnosis.best.conventions.departures)
-    return "time_alignment" if lags else "calibration"
-
-
 def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Numbers:
     numbers: Numbers = {
         "verdict": diagnosis.verdict,
@@ -150,22 +139,20 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
         "threshold_margin": config.min_margin,
     }
     if diagnosis.verdict == "explained":
-        numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(_config_lines(diagnosis.best, step))}
+        # Lags were found in every step-th frame; the source counts its own.
+        found = diagnosis.best.conventions
+        lags = {field: step * getattr(found, field) for field in found.departures if "_lag_" in field}
+        lines = found.model_copy(update=lags).config_lines()
+        numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(lines)}
     if diagnosis.verdict == "unexplained":
         bad = bad_terms(diagnosis.none, config)
         numbers |= {"bad": ", ".join(sorted(bad, key=lambda name: bad[name]))}
     return numbers
 
 
-def _config_lines(best: Explanation, step: int) -> Sequence[str]:
-    """The lines that repair the source; lags counted in its own frames."""
-    lags = {field: step * getattr(best.conventions, field) for field in best.conventions.departures if "_lag_" in field}
-    return best.conventions.model_copy(update=lags).config_lines() if lags and step > 1 else best.config_lines
-
-
 def kinematics_of(episode: Episode) -> ArmKinematics | None:
     """Of the episode's embodiment; None where it or its description is not known, or the recording has another layout."""
-    kinematics = _load(episode.embodiment) if episode.embodiment in embodiment_names() else None
+    kinematics = known_kinematics(episode.embodiment)
     if kinematics is None:
         return None
     embodiment, poses = kinematics.embodiment, episode.T_base_ee
@@ -173,14 +160,6 @@ def kinematics_of(episode: Episode) -> ArmKinematics | None:
         return None
     fits = episode.state_kind != "joints" or episode.state.shape[1] == embodiment.state_size
     return kinematics if fits else None
-
-
-@lru_cache(maxsize=16)
-def _load(name: str) -> ArmKinematics | None:
-    try:
-        return ArmKinematics(load_embodiment(name))
-    except UnavailableError:  # the doctor then judges recorded tool poses without a stated mount
-        return None
 
 
 def find_calibration_faults(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:

@@ -4,6 +4,9 @@ into the curated set, row by row, with start and stop.
 Stage I (action-free, one view) drops static, reset, corrupted and base-motion frames. Stage II (three views, actions)
 needs in addition every required view, valid calibration, aligned clocks and a projection that agrees with the images.
 An episode that only Stage II cannot use stays, with stage2_ok false and the reason.
+
+A detector is a function of the episode's signals, the thresholds and what was found before it; it gives its findings.
+To add one, see docs/filters.md.
 """
 
 from __future__ import annotations
@@ -11,21 +14,29 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import batched
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pyarrow as pa
+from pydantic import Field
 
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.filters.examine import examine
+from worldline_core.filters.alignment import find_lags, find_projection
+from worldline_core.filters.calibration import find_calibration_faults, find_mistake
 from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.filters.motion import find_base_motion, find_joint_faults, find_static
+from worldline_core.filters.pictures import find_picture_faults
+from worldline_core.filters.signals import Signals, measure
+from worldline_core.filters.verdict import Finding, Verdict, runs
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
@@ -42,6 +53,131 @@ _FINDINGS = pa.schema(
         ("numbers", pa.string()),
     ]
 )
+
+type Detector = Callable[[Signals, FilterConfig, Sequence[Finding]], list[Finding]]
+
+
+def find_missing_inputs(signals: Signals, config: FilterConfig, _: Sequence[Finding]) -> list[Finding]:
+    """What Stage II needs besides clean frames: actions, required views with calibration, known tool poses."""
+    if signals.episode.state_kind == "none":
+        return [Finding("required_views", None, 2, Verdict("missing_actions", False))]
+    arms = [arm.wrist_view for arm in signals.arms] or ["right_wrist"]
+    findings: list[Finding] = []
+    for view in config.required_views or ("head", *arms):
+        reason = "missing_calibration" if view in signals.gray else "missing_view"
+        passed = view in signals.gray and view in signals.episode.cameras
+        findings.append(Finding("required_views", view, 2, Verdict(reason, passed)))
+    if signals.T_base_tool is None:
+        findings.append(Finding("required_views", None, 2, Verdict("missing_kinematics", False)))
+    return findings
+
+
+DETECTORS: tuple[Detector, ...] = (
+    find_joint_faults,  # reset, joint_jump, joint_speed
+    find_picture_faults,  # too_dark, overexposed, blur, corrupted, in each view
+    find_static,
+    find_base_motion,
+    find_missing_inputs,  # required_views
+    find_lags,  # image_lag, pose_lag: before calibration, since a lag also disturbs the hand-eye check
+    find_calibration_faults,  # camera, hand_eye, fixed_camera
+    find_projection,
+    find_mistake,  # doctor
+)
+"""In this order: Stage I first. Of several findings that drop an episode the first one is its reason."""
+
+
+def inspect(config: FilterConfig, signals: Signals) -> list[Finding]:
+    """All findings about an episode. A mistake that the calibration doctor explains comes before what it explains."""
+    findings: list[Finding] = []
+    for detect in DETECTORS:
+        findings += detect(signals, config, findings)
+    doctor = findings[-1]
+    if doctor.detector == "doctor" and doctor.verdict.numbers["verdict"] == "explained":
+        explained = (i for i, f in enumerate(findings) if f.stage == 2 and f.detector != "required_views")
+        findings.insert(next(explained), findings.pop())
+    return findings
+
+
+class EpisodeVerdict(StrictModel):
+    """What the filters say of one episode.
+
+    Attributes:
+        reason: code, with detail and evidence, of an episode that is dropped whole; None of one that is kept.
+        segments: (start, stop) of the frames that are kept.
+        stage2_reason: why a kept episode is not for Stage II.
+        findings: rows of findings.parquet.
+    """
+
+    reason: str | None = None
+    detail: str = ""
+    evidence: dict[str, Any] = Field(default_factory=dict)
+    segments: tuple[tuple[int, int], ...] = ()
+    stage1_ok: bool = True
+    stage2_reason: str | None = None
+    findings: tuple[dict[str, Any], ...] = ()
+
+
+def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> EpisodeVerdict:
+    """The verdict on row i of a set."""
+    row = episodes.rows[i]
+    try:
+        episode = episodes.episode(i)
+        thumbnails = {view: episodes.thumbnails(i, view) for view in row.views}
+    except DataError as error:
+        return EpisodeVerdict(reason="unreadable", detail=str(error).replace(str(episodes.root), ""))
+    thresholds = config.for_source(row.source)
+    shortest = thresholds.min_segment_frames
+    if row.video_frames < shortest:
+        evidence = {"video_frames": row.video_frames, "threshold_frames": shortest}
+        return EpisodeVerdict(reason="too_short", detail="Fewer images than the shortest clip", evidence=evidence)
+    findings = inspect(thresholds, measure(episode, thumbnails))
+    origin = row.source if row.source in config.sources else "default"
+    listed = tuple(_finding_row(row.episode_id, finding, origin) for finding in findings)
+    cuts = [(finding, flags) for finding in findings if (flags := _cut_frames(finding)) is not None]
+    bad = np.logical_or.reduce([flags for _, flags in cuts]) if cuts else np.zeros(row.video_frames, dtype=bool)
+    segments = tuple((a, b) for a, b in runs(~bad) if b - a >= shortest)
+    blame = next((f for f in findings if f.stage == 1 and not f.verdict.passed), None)
+    if blame is None and not segments:
+        blame = max(cuts, key=lambda cut: int(cut[1].sum()))[0]
+    if blame is not None:
+        where = f" in view {blame.view}" if blame.view else ""
+        return EpisodeVerdict(
+            reason=blame.verdict.reason,
+            detail=f"Detector {blame.detector}{where}",
+            evidence=dict(blame.verdict.numbers),
+            findings=listed,
+        )
+    return EpisodeVerdict(
+        segments=segments,
+        stage1_ok=row.primary_view in row.views,
+        stage2_reason=next((f.verdict.reason for f in findings if f.stage == 2 and not f.verdict.passed), None),
+        findings=listed,
+    )
+
+
+def _cut_frames(finding: Finding) -> np.ndarray | None:
+    """bool (n,) frames that a finding cuts out.
+
+    A view other than the primary one that is mostly bad excludes the episode from Stage II instead: nothing is cut.
+    """
+    return finding.verdict.bad_frames if finding.stage == 1 or finding.verdict.passed else None
+
+
+def _finding_row(episode_id: str, finding: Finding, thresholds: str) -> dict[str, Any]:
+    """`thresholds`: the source whose own thresholds were used, or "default"; "cut" lists (start, stop) of cut frames."""
+    verdict, cut = finding.verdict, _cut_frames(finding)
+    numbers: dict[str, Any] = {**verdict.numbers, "thresholds": thresholds}
+    if cut is not None and cut.any():
+        numbers["cut"] = runs(cut)
+    return {
+        "episode_id": episode_id,
+        "detector": finding.detector,
+        "view": finding.view,
+        "stage": finding.stage,
+        "passed": bool(verdict.passed),
+        "cut_frames": 0 if cut is None else int(cut.sum()),
+        "numbers": json.dumps(numbers, sort_keys=True),
+    }
 
 
 def filter_episodes(
@@ -74,12 +210,12 @@ def filter_episodes(
     for i, row in enumerate(episodes.rows):
         result = work.verdict(i)
         account.append(work.row(i, result))
-        findings += result["findings"]
-        if result["reason"] is not None:
-            evidence = json.dumps(result["evidence"], sort_keys=True)
-            rejected.append(QuarantineRow(row.episode_id, row.source, result["reason"], result["detail"], evidence))
+        findings += result.findings
+        if result.reason is not None:
+            evidence = json.dumps(result.evidence, sort_keys=True)
+            rejected.append(QuarantineRow(row.episode_id, row.source, result.reason, result.detail, evidence))
             continue
-        cut_frames += row.num_frames - sum(stop - start for start, stop in result["segments"])
+        cut_frames += row.num_frames - sum(stop - start for start, stop in result.segments)
         dataset = os.path.relpath(episodes.dataset_path(i), output)
         rows += _segment_rows(row, Path(dataset).as_posix(), result)
     kept = {row.episode_id for row in episodes.rows} - {row.episode_id for row in rejected}
@@ -134,25 +270,25 @@ class FilterWork(EpisodeWork[int, InputRow]):
         return self._keep(episode, examine(self.config, self.episodes, episode))
 
     def quarantine_crashed(self, episode: int, detail: str, evidence: Mapping[str, Any]) -> InputRow:
-        return self._keep(episode, {"reason": "crashed", "detail": detail, "evidence": evidence, "findings": []})
+        return self._keep(episode, EpisodeVerdict(reason="crashed", detail=detail, evidence=dict(evidence)))
 
-    def verdict(self, position: int) -> dict[str, Any]:
+    def verdict(self, position: int) -> EpisodeVerdict:
         """What `examine` said of an episode."""
-        return json.loads(self._path(position).read_text())
+        return EpisodeVerdict.model_validate(json.loads(self._path(position).read_text()))
 
-    def row(self, position: int, verdict: Mapping[str, Any]) -> InputRow:
+    def row(self, position: int, verdict: EpisodeVerdict) -> InputRow:
         """The account of an episode."""
-        row, reason = self.episodes.rows[position], verdict["reason"]
+        row = self.episodes.rows[position]
         return InputRow(
             episode_id=row.episode_id,
             source=row.source,
-            status="kept" if reason is None else "quarantined",
-            reason=reason,
+            status="kept" if verdict.reason is None else "quarantined",
+            reason=verdict.reason,
             stored_bytes=self._path(position).stat().st_size,
         )
 
-    def _keep(self, position: int, verdict: dict[str, Any]) -> InputRow:
-        write_json_atomic(self._path(position), verdict)
+    def _keep(self, position: int, verdict: EpisodeVerdict) -> InputRow:
+        write_json_atomic(self._path(position), verdict.model_dump())
         return self.row(position, verdict)
 
     def _path(self, position: int) -> Path:
@@ -160,24 +296,20 @@ class FilterWork(EpisodeWork[int, InputRow]):
         return self.output / "run" / "verdicts" / f"{part_name(self.episodes.rows[position].episode_id)}.json"
 
 
-def _segment_rows(row: EpisodeRow, dataset: str, result: dict[str, Any]) -> list[EpisodeRow]:
+def _segment_rows(row: EpisodeRow, dataset: str, verdict: EpisodeVerdict) -> list[EpisodeRow]:
     """One row per segment; a single segment keeps the episode's id."""
-    segments = result["segments"]
-    untouched = segments == [[0, row.video_frames]] and row.video_frames == row.num_frames
-    rows = []
-    for start, stop in segments:
-        rows.append(
-            replace(
-                row,
-                episode_id=row.episode_id if len(segments) == 1 else f"{row.episode_id}@{start:05d}",
-                dataset=dataset,
-                start=row.start + (0 if untouched else start),
-                stop=row.start + (row.num_frames if untouched else stop),
-                num_frames=stop - start,
-                video_frames=stop - start,
-                stage1_ok=bool(result["stage1_ok"]),
-                stage2_ok=result["stage2_reason"] is None,
-                stage2_reason=result["stage2_reason"],
-            )
+    return [
+        replace(
+            row,
+            episode_id=row.episode_id if len(verdict.segments) == 1 else f"{row.episode_id}@{start:05d}",
+            dataset=dataset,
+            start=row.start + start,
+            stop=row.start + stop,
+            num_frames=stop - start,
+            video_frames=stop - start,
+            stage1_ok=verdict.stage1_ok,
+            stage2_ok=verdict.stage2_reason is None,
+            stage2_reason=verdict.stage2_reason,
         )
-    return rows
+        for start, stop in verdict.segments
+    ]

@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, JsonValue, model_validator
 
-from worldline_core.calibration.thresholds import CalibrationDoctorConfig
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig
 from worldline_core.config import StrictModel, validate
 from worldline_core.errors import ConfigError
 

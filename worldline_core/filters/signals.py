@@ -12,9 +12,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from worldline_core.calibration.observation import Arm, arms_of
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.video.thumbnails import ViewThumbnails
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import UnavailableError
+from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 
 SPEED_WINDOW_S = 0.5
 WHITE_LEVEL = 245
@@ -148,15 +151,6 @@ def range_speed(values: np.ndarray, fps: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class ArmModel:
-    """One arm as the filters see it. `T_tool_mount` is the wrist camera's place in the tool frame where it is known."""
-
-    name: str
-    wrist_view: str
-    T_tool_mount: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
 class Signals:
     """Everything about one episode; n counts frames with images.
 
@@ -176,7 +170,7 @@ class Signals:
     gripper_speed: np.ndarray
     joints: np.ndarray | None
     T_base_tool: np.ndarray | None
-    arms: tuple[ArmModel, ...]
+    arms: tuple[Arm, ...]
 
     @property
     def primary_view(self) -> str:
@@ -239,37 +233,20 @@ def _columns(episode: Episode) -> tuple[list[int], list[int]]:
     return [i for i in range(episode.state.shape[1]) if i not in grippers], grippers
 
 
-def tool_poses(episode: Episode) -> tuple[np.ndarray | None, tuple[ArmModel, ...]]:
+def tool_poses(episode: Episode) -> tuple[np.ndarray | None, tuple[Arm, ...]]:
     """T_base_tool (N, A, 4, 4): as recorded, else from the embodiment's kinematics, else None; and the arms."""
     if episode.T_base_ee is not None:
-        count = episode.T_base_ee.shape[1]
-        names = (
-            ("left", "right") if count == 2 else ("right",) if count == 1 else tuple(f"arm_{i}" for i in range(count))
-        )
-        return episode.T_base_ee, tuple(ArmModel(name, f"{name}_wrist") for name in names)
-    from worldline_core.geometry.embodiment import embodiment_names
-
-    if episode.embodiment not in embodiment_names() or episode.state_kind != "joints":
+        return episode.T_base_ee, arms_of(episode, None)
+    kinematics = known_kinematics(episode.embodiment) if episode.state_kind == "joints" else None
+    if kinematics is None:  # the episode is left out of Stage II as missing_kinematics; the others go on
         return None, ()
+    return np.asarray(kinematics.tool_poses(episode.state.astype(np.float64))), arms_of(episode, kinematics)
+
+
+@lru_cache(maxsize=16)
+def known_kinematics(embodiment: str) -> ArmKinematics | None:
+    """Kinematics of an embodiment; None where it, or its description, is not here."""
     try:
-        kinematics, arms = _kinematics(episode.embodiment)
-    except UnavailableError:  # the episode is left out of Stage II as missing_kinematics; the others go on
-        return None, ()
-    return np.asarray(kinematics.tool_poses(episode.state.astype(np.float64))), arms
-
-
-@lru_cache(maxsize=8)
-def _kinematics(name: str):
-    from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.kinematics import ArmKinematics
-
-    embodiment = load_embodiment(name)
-    arms = []
-    for arm in embodiment.arms:
-        mount = None
-        if arm.wrist_camera is not None and arm.wrist_camera.link == arm.end_effector_link:
-            mount = np.linalg.inv(arm.T_link_tool.matrix()) @ np.asarray(arm.wrist_camera.T_link_camera, np.float64)
-        arms.append(ArmModel(arm.name, arm.camera_view, mount))
-    if not arms:
-        raise DataError("Embodiment has no arms", where=name)
-    return ArmKinematics(embodiment), tuple(arms)
+        return ArmKinematics(load_embodiment(embodiment)) if embodiment in embodiment_names() else None
+    except UnavailableError:
+        return None

@@ -118,7 +118,7 @@ class FilteredSet:
 
         Raises: DataError when the episode's images cannot be read.
         """
-        from worldline_core.filters.examine import inspect
+        from worldline_core.filters.filter import inspect
         from worldline_core.filters.signals import measure
 
         i = self.episodes.position(episode_id)
