@@ -4,6 +4,9 @@ SHELL := /bin/bash
 # A uv on the path counts only where it runs: version managers leave shims that answer "not found".
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .bootstrap/bin/uv)
 RUN := $(UV) run --frozen
+# Bytecode of packages is written when they are installed: otherwise every process of the first run compiles what it
+# imports, and where PYTHONDONTWRITEBYTECODE is set (many containers) every process of every run does.
+compile_new = $(if $(wildcard .venv/lib/*/site-packages/$(1)),,--compile-bytecode)
 
 .PHONY: demo docs wheels test test-slow lint install install-scale record clean
 
@@ -25,10 +28,11 @@ lint: install-scale
 	$(RUN) pyright
 
 install: $(filter .bootstrap/bin/uv,$(UV))
-	$(UV) sync --frozen --inexact --extra sim
+	$(UV) sync --frozen --inexact --extra sim $(call compile_new,prefect)
+	@$(RUN) python -m compileall -q flows tasks worldline_core
 
 install-scale: install
-	$(UV) sync --frozen --inexact --extra sim --group scale
+	$(UV) sync --frozen --inexact --extra sim --group scale $(call compile_new,ray)
 
 .bootstrap/bin/uv:
 	python3 -m venv .bootstrap || { echo "Install Python's venv (Debian: apt-get install python3-venv), or uv (https://docs.astral.sh/uv)"; rm -rf .bootstrap; exit 1; }

@@ -82,7 +82,7 @@ def write_side_by_side(
 def write_video(path: Path, frames: NDArray[np.uint8], fps: float, *, poster_at: float = 0.6) -> SideBySide:
     """Write `n h w 3` frames as `path` (mp4) and a poster JPEG beside it, taken at the fraction `poster_at` of the clip."""
     with atomic_path(path) as temporary:
-        encode_video(temporary, frames, fps, crf=20, preset="medium")
+        encode_video(temporary, frames, fps, crf=20, preset="veryfast")
     poster = path.with_suffix(".jpg")
     write_bytes_atomic(poster, jpeg_bytes(frames[round(poster_at * (len(frames) - 1))]))
     return SideBySide(path, poster, width=frames.shape[2], height=frames.shape[1], num_frames=len(frames))

@@ -247,7 +247,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        5,
+        6,
         "worldline_core.report.report",
         "report",
         "ReportConfig",
