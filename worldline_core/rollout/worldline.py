@@ -202,11 +202,13 @@ class WorldLine:
         """
         first, maps = self.encode(images, tracks, frames, without_actions=without_actions)
         latents = self._sample(first, maps, seeds)
-        observed = rearrange(images, "b v c h w -> (b v) c h w").to(self.device)
+        clips = []
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=self.bfloat16):
-            video = self.tokenizer.decode(rearrange(latents, "b v c t h w -> (b v) c t h w"), observed)
-        clips = rearrange(video, "(b v) c t h w -> b v c t h w", v=len(self.views))
-        return [{view: video_to_frames(clip[v]) for v, view in enumerate(self.views)} for clip in clips]
+            # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
+            for clip, observed in zip(latents, images.to(self.device), strict=True):
+                video = self.tokenizer.decode(clip, observed)
+                clips.append({view: video_to_frames(video[v]) for v, view in enumerate(self.views)})
+        return clips
 
     def encode(
         self,
