@@ -60,7 +60,7 @@ def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kin
 
 
 def test_a_shard_with_one_file_is_made_again_without_the_episode_that_kills(tmp_path: Path) -> None:
-    config = RunnerConfig.model_validate({"kind": "processes", "workers": 2, "retry_seconds": 0.1})
+    config = RunnerConfig.model_validate({"kind": "processes", "workers": 1, "retry_seconds": 0.1})
     map_episodes(shard_mapper(config), NumberFileWork(tmp_path), [[8, 9], [12, 13, 14]])
     assert (tmp_path / "shard-0.txt").read_text() == "8:kept 9:kept"
     assert (tmp_path / "shard-1.txt").read_text() == "12:kept 13:quarantined 14:kept"
