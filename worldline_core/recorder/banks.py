@@ -33,7 +33,7 @@ class BankSpec(StrictModel):
 
     name: str = Field(min_length=1)
     embodiment: Embodiment
-    family: str = Field(pattern="^(lift|place|state_change|close|press)$")
+    family: str = Field(pattern="^(lift|place|state_change|close|press|carry)$")
     scene: str = Field(pattern="^scene_[0-9]{2}$")
     layout: int = Field(ge=0)
 
@@ -111,7 +111,9 @@ def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
                         bank=spec.name,
                         candidate=candidate,
                     )
-                    writer.add(recording.episode, recording.frames, recording.robot_masks)
+                    writer.add(
+                        recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels
+                    )
                 progress.update()
             recorder.close()
             wins = sum(motion.outcome == "success" for motion in motions)

@@ -47,7 +47,7 @@ Embodiment = Literal[
     "xarm7_bronze",
     "panda_ivory",
 ]
-Family = Literal["lift", "place", "state_change", "play", "close", "press"]
+Family = Literal["lift", "place", "state_change", "play", "close", "press", "carry"]
 Defect = Literal[
     "static_lead_in",
     "reset_segment",
@@ -69,7 +69,7 @@ FAILURES_FILE = "failures.json"
 class RecordGroup(StrictModel):
     """``count`` episodes of one embodiment in one split; families take turns.
 
-    Bodies of the small world (``small_bodies.py``) have the families lift, place, close and press; with
+    Bodies of the small world (``small_bodies.py``) have the families lift, place, close, press and carry; with
     ``held_out_camera`` their head camera stands where it never stands otherwise.
     """
 
@@ -205,7 +205,7 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
         path = output / "mcap" / f"{job.episode_id}.mcap"
         write_episode_mcap(path, recording.episode, recording.frames, robot_masks=recording.robot_masks)
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
-    writer.add(recording.episode, recording.frames, recording.robot_masks)
+    writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
 
 
 def _run_jobs(jobs: list[Job], config: RecordConfig, output: Path) -> Iterator[None]:

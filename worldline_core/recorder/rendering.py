@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
@@ -203,17 +204,26 @@ class SceneRenderer:
         self.scene.model.cam_quat[number] = quat
 
     def render(
-        self, qpos: np.ndarray, paint: Callable[[np.ndarray], None] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
-        """Frames uint8 (N, 128, 192, 3), robot masks bool (N, 128, 192) and camera tracks per view for (N, nq).
+        self,
+        qpos: np.ndarray,
+        paint: Callable[[np.ndarray], None] | None = None,
+        labels: np.ndarray | None = None,
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
+        """What the cameras see of positions (N, nq), per view.
 
-        ``paint`` changes the model's colours before each frame, by its positions (nq,).
+        Args:
+            paint: changes the model's colours before each frame, by its positions (nq,).
+            labels: uint8 (number of geoms,), what thing each geom belongs to, 0 for none.
+
+        Returns: frames uint8 (N, 128, 192, 3); robot masks bool (N, 128, 192); labels uint8 (N, 128, 192), empty
+            without ``labels``; camera tracks.
         """
         import mujoco
 
         model, data = self.scene.model, self._data
         frames: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
         masks: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
+        things: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras} if labels is not None else {}
         poses: dict[str, list[np.ndarray]] = {view: [] for view in self.cameras}
         height, width = FRAME_SIZE
         for positions in qpos:
@@ -225,12 +235,14 @@ class SceneRenderer:
             mujoco.mj_camlight(model, data)
             for view, camera in self.cameras.items():
                 self._colour.update_scene(data, camera, self._option)
-                picture = self._colour.render().reshape(height, 2, width, 2, 3).astype(np.uint16)
-                frames[view].append(((picture.sum(axis=(1, 3)) + 2) // 4).astype(np.uint8))
+                frames[view].append(cv2.resize(self._colour.render(), (width, height), interpolation=cv2.INTER_AREA))
                 self._masks.update_scene(data, camera, self._option)
                 drawn = self._masks.render()
                 is_geom = (drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)) & (drawn[..., 0] >= 0)
-                masks[view].append(is_geom & self.scene.robot_geoms[np.maximum(drawn[..., 0], 0)])
+                geoms = np.maximum(drawn[..., 0], 0)
+                masks[view].append(is_geom & self.scene.robot_geoms[geoms])
+                if labels is not None:
+                    things[view].append(np.where(is_geom, labels[geoms], 0))
                 pose = np.eye(4)
                 pose[:3, :3] = data.camera(camera).xmat.reshape(3, 3) @ OPENCV_AXES
                 pose[:3, 3] = data.camera(camera).xpos
@@ -246,4 +258,5 @@ class SceneRenderer:
                 width=width,
                 height=height,
             )
-        return {v: np.array(f) for v, f in frames.items()}, {v: np.array(m) for v, m in masks.items()}, tracks
+        pictures, robot, labelled = ({v: np.array(i) for v, i in images.items()} for images in (frames, masks, things))
+        return pictures, robot, labelled, tracks

@@ -7,7 +7,7 @@ actions alone reproduce the motion.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +23,7 @@ from worldline_core.recorder.task_layout import Layout, apply_layout, outcome, s
 # Largest accepted distance between a planned tool position and what the arm can reach.
 REACH_TOLERANCE_M = 0.012
 # What a recorded episode calls a task: free motion has none, and what changes a thing's state is one family.
-_TASK_FAMILIES = {"play": "unknown", "close": "state_change", "press": "state_change"}
+_TASK_FAMILIES = {"play": "unknown", "close": "state_change", "press": "state_change", "carry": "lift"}
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,17 @@ class Motion:
 
 @dataclass(frozen=True)
 class Recording:
-    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view; what went wrong in it."""
+    """An episode with its frames ``(N, H, W, 3)`` and exact robot masks ``(N, h, w)`` by view; what went wrong in it.
+
+    ``thing_labels``: uint8 (N, h, w) by view, which thing a pixel shows: 1 what the task moves, 2 where it goes, 3..
+    others, 0 none. Empty in worlds that do not label their things.
+    """
 
     episode: Episode
     frames: dict[str, np.ndarray]
     robot_masks: dict[str, np.ndarray]
     failure: str = ""
+    thing_labels: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def opening_to_fingers(robot: Robot, opening: np.ndarray) -> np.ndarray:
@@ -151,6 +156,10 @@ class WorldRecorder[L: TaskLayout](ABC):
     def paint(self, layout: L, qpos: np.ndarray) -> None:
         """Change colours that depend on positions (nq,)."""
 
+    def labels(self, layout: L) -> np.ndarray | None:
+        """uint8 (number of geoms,): which thing each geom belongs to, as in ``Recording.thing_labels``."""
+        return None
+
     def close(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
@@ -188,7 +197,9 @@ class WorldRecorder[L: TaskLayout](ABC):
         # Another layout may have been executed since: this one decides where objects stand and what they look like.
         self.apply(layout)
         self.set_scene(self._renderer, layout, scene_id, jitter)
-        frames, masks, cameras = self._renderer.render(motion.qpos, lambda qpos: self.paint(layout, qpos))
+        frames, masks, things, cameras = self._renderer.render(
+            motion.qpos, lambda qpos: self.paint(layout, qpos), self.labels(layout)
+        )
         episode = Episode(
             episode_id=episode_id,
             source="worldline_recorder",
@@ -208,7 +219,7 @@ class WorldRecorder[L: TaskLayout](ABC):
             primary_view="head",
             state_names=self.scene.state_names,
         )
-        return Recording(episode, frames, masks, motion.failure)
+        return Recording(episode, frames, masks, motion.failure, things)
 
     def draw(
         self, *, episode_id: str, split: str, family: str, entropy: tuple[int, ...], num_frames: int

@@ -9,11 +9,11 @@ from __future__ import annotations
 from worldline_core.recorder.robots import ArmPlacement, CameraMount, Colour, Robot
 
 # Middle of the workspace, where head cameras look.
-CENTRE = (0.385, 0.0, 0.085)
+CENTRE = (0.385, 0.0, 0.115)
 REACH_X, REACH_Y = (0.31, 0.46), (0.05, 0.225)
 WRIST_STEEP = CameraMount(eye=(0.10, 0.0, -0.105), target=(0.005, 0.0, 0.02), fovy_deg=66.0)
 WRIST_FLAT = CameraMount(eye=(0.125, 0.0, -0.09), target=(0.0, 0.0, 0.03), fovy_deg=62.0)
-HEAD = CameraMount(eye=(-0.18, 0.0, 0.72), target=CENTRE, fovy_deg=29.5)
+HEAD = CameraMount(eye=(0.86, 0.0, 0.83), target=CENTRE, fovy_deg=29.5)
 
 _VIPERX_HOME = (0.0, -0.75, 0.95, 0.0, 1.2, 0.0)
 _UR5E_HOME = (-0.3, -1.9, 2.3, -1.97, -1.57, -1.87)

@@ -14,6 +14,7 @@ from worldline_core.recorder.robots import Robot
 from worldline_core.recorder.small_things import (
     BUTTON_CAP_HALF,
     DRAWER_TRAVEL,
+    HANDLE_APART,
     PLATE_TOP,
     STANDING,
     SmallLayout,
@@ -23,7 +24,7 @@ from worldline_core.recorder.task_layout import side
 
 # A hand's width [m]: how far a plan that goes wrong passes beside its thing.
 BESIDE = (0.085, 0.12)
-GRASP_HEIGHT, DRAWER_HEIGHT = 0.088, 0.052
+GRASP_HEIGHT, HANDLE_HEIGHT, DRAWER_HEIGHT = 0.088, 0.084, 0.052
 PRESSED_HEIGHT, CAP_TOP = 0.045, PLATE_TOP + 2 * BUTTON_CAP_HALF
 # Openings: wide, and relaxed just so far that a thing slips out.
 WIDE, RELAXED = (0.93, 1.0), (0.80, 0.84)
@@ -32,6 +33,7 @@ WIDE, RELAXED = (0.93, 1.0), (0.80, 0.84)
 _LIFT = {"good": 0.50, "beside": 0.17, "high": 0.07, "open": 0.06, "relax": 0.06, "release": 0.06, "low": 0.08}
 _PLACE = {"good": 0.62, "beside": 0.12, "high": 0.04, "relax": 0.05, "release": 0.07, "elsewhere": 0.12, "keep": 0.06}
 _CLOSE = {"good": 0.50, "short": 0.26, "beside": 0.14, "high": 0.10}
+_CARRY = {"good": 0.52, "beside": 0.12, "high": 0.07, "open": 0.06, "relax": 0.08, "release": 0.09, "low": 0.06}
 _PRESS = {"good": 0.54, "short": 0.16, "beside": 0.16, "other": 0.14}
 
 
@@ -56,8 +58,8 @@ def _beside(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> n
     return offset
 
 
-def _first(layout: SmallLayout) -> Waypoint:
-    x, y, z, yaw, opening = layout.start[layout.arm]
+def _first(layout: SmallLayout, arm: int | None = None) -> Waypoint:
+    x, y, z, yaw, opening = layout.start[layout.arm if arm is None else arm]
     return _at(0.0, np.array([x, y]), z, yaw, opening)
 
 
@@ -97,7 +99,7 @@ def _place(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> li
     if layout.goal is None:
         raise DataError("The layout does not fit the task", where=layout.family, expected="a pad")
     plan, pace = _draw(_PLACE, random), random.uniform(0.97, 1.02)
-    times = pace * np.array([0.7, 1.05, 1.6, 2.0, 2.65, 2.95, 3.45, 3.8])
+    times = pace * np.array([0.65, 0.95, 1.5, 1.85, 2.4, 2.65, 3.1, 3.45])
     points, xy, height, yaw, closed = _grasp(robot, layout, random, plan, times)
     goal = layout.goal.xy + random.normal(0, 0.006, 2)
     if plan == "elsewhere":
@@ -172,6 +174,38 @@ def _press(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> li
     ]
 
 
+def _carry(robot: Robot, layout: SmallLayout, random: np.random.Generator) -> list[list[Waypoint]]:
+    """Both arms take the tray by its handles and raise it; what goes wrong goes wrong with one of them, or both."""
+    plan, pace = _draw(_CARRY, random), random.uniform(0.96, 1.03)
+    times = pace * np.array([0.85, 1.25, 1.85, 2.65, 3.25])
+    # A hand that misses lets the other try alone; both relax, and both, or one of them, let go.
+    wrong = {0, 1} if plan in ("high", "relax", "low") or random.uniform() < 0.4 else {int(random.integers(2))}
+    tray, rise = layout.target, random.uniform(0.02, 0.035) if plan == "low" else random.uniform(0.12, 0.16)
+    along = np.array([-np.sin(tray.yaw), np.cos(tray.yaw)])
+    away, yaw = random.normal(0, 0.012, 2), tray.yaw + random.normal(0, 0.05)
+    plans = []
+    for arm in layout.acting():
+        spoiled = plan if arm in wrong else "good"
+        xy = tray.xy + side(robot, arm) * HANDLE_APART * along + random.normal(0, 0.004, 2)
+        if spoiled == "beside":
+            xy = xy + np.array([random.choice([-1.0, 1.0]) * random.uniform(*BESIDE), 0.0])
+        z = HANDLE_HEIGHT if spoiled != "high" else HANDLE_HEIGHT + random.uniform(0.085, 0.10)
+        opened = random.uniform(*WIDE)
+        closed = random.uniform(0.9, 1.0) if spoiled == "open" else 0.0
+        carried = random.uniform(*RELAXED) if spoiled == "relax" else closed
+        points = [
+            _first(layout, arm),
+            _at(times[0], xy, 0.21, yaw, opened),
+            _at(times[1], xy, z, yaw, opened),
+            _at(times[2], xy, z, yaw, closed),
+            _at(times[3], xy + away, z + rise, yaw, carried),
+        ]
+        if spoiled == "release":
+            points.append(_at(times[4], xy + away, z + rise, yaw, random.uniform(*WIDE)))
+        plans.append(points)
+    return plans
+
+
 _TASKS = {"lift": _lift, "place": _place, "close": _close, "press": _press}
 
 
@@ -195,6 +229,8 @@ def plan_small_waypoints(
     robot: Robot, layout: SmallLayout, random: np.random.Generator, duration: float
 ) -> list[list[Waypoint]]:
     """Waypoints per arm for ``duration`` seconds."""
+    if layout.family == "carry":
+        return _carry(robot, layout, random)
     return [
         _TASKS[layout.family](robot, layout, random)
         if arm == layout.arm

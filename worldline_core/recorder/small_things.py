@@ -23,15 +23,21 @@ PAD_RADIUS = 0.065
 DRAWER_HALF, DRAWER_TRAVEL = (0.075, 0.060, 0.032), 0.14
 BUTTON_PLATE_HALF, BUTTON_CAP_RADIUS, BUTTON_CAP_HALF, BUTTON_TRAVEL = 0.055, 0.034, 0.018, 0.026
 PLATE_TOP = 0.024
+# A tray with a handle near each end, as wide as a block: one for each arm. Its ends lie along its own y.
+TRAY_HALF, HANDLE_HALF, HANDLE_APART = (0.048, 0.150, 0.010), (0.028, 0.028, 0.050), 0.115
+HANDLES = {"left": HANDLE_APART, "right": -HANDLE_APART}
 # What counts as done.
 LIFTED = 0.07
 ON_PAD = 0.05
 DRAWER_OPEN = 0.25
 BUTTON_DOWN = 0.5
-TASKS = ("lift", "place", "close", "press")
+# An opening at which nothing is held any more.
+RELEASED = 0.88
+TASKS = ("lift", "place", "close", "press", "carry")
 # How many of each kind a scene can hold.
-KINDS = {"block": 2, "can": 2, "pad": 2, "button": 2, "drawer": 1}
-STANDING = {"block": BLOCK_HALF[2], "can": CAN_HALF}
+KINDS = {"block": 2, "can": 2, "pad": 2, "button": 2, "drawer": 1, "tray": 1}
+# Height of a free thing's origin where it stands.
+STANDING = {"block": BLOCK_HALF[2], "can": CAN_HALF, "tray": TRAY_HALF[2]}
 UNLIT = (0.17, 0.17, 0.18)
 
 
@@ -56,9 +62,9 @@ class SmallLayout:
 
     Attributes:
         family: one of TASKS.
-        arm: number of the arm that acts.
+        arm: number of the arm that acts; of a carry, in which both act, the first.
         start: per arm (x, y, z, yaw, opening) of the tool and gripper at the first frame.
-        target: what is lifted, placed, closed or pressed.
+        target: what is lifted, placed, closed, pressed or carried.
         goal: the pad of a place.
         others: distractors.
     """
@@ -70,6 +76,10 @@ class SmallLayout:
     target: Thing
     goal: Thing | None
     others: tuple[Thing, ...]
+
+    def acting(self) -> tuple[int, ...]:
+        """Numbers of the arms that act."""
+        return tuple(range(len(self.start))) if self.family == "carry" else (self.arm,)
 
     def named(self) -> list[tuple[str, Thing]]:
         """Every thing with the name of its body: ``block_0``, ``block_1``, ..; the target is the first of its kind."""
@@ -98,6 +108,14 @@ def build_small_scene(robot: Robot) -> SceneModel:
             body = spec.worldbody.add_body(name=name, pos=PARKED)
             body.add_freejoint(name=name)
             body.add_geom(name=name, type=shape, size=size, mass=0.08, **contact)
+    tray = spec.worldbody.add_body(name="tray_0", pos=PARKED)
+    tray.add_freejoint(name="tray_0")
+    # Heavy and smooth enough that one hand alone raises one end only.
+    heavy = contact | {"friction": [0.6, 0.02, 0.001], "priority": 1}
+    tray.add_geom(name="tray_0", type=box, size=TRAY_HALF, mass=1.0, **heavy)
+    for name, along in HANDLES.items():
+        place = [0, along, TRAY_HALF[2] + HANDLE_HALF[2]]
+        tray.add_geom(name=f"tray_0_{name}", type=box, size=HANDLE_HALF, pos=place, mass=0.05, **heavy)
     seen_only = {"contype": 0, "conaffinity": 0}
     for number in range(KINDS["pad"]):
         pad = spec.worldbody.add_body(name=f"pad_{number}", pos=PARKED)
@@ -120,18 +138,26 @@ def build_small_scene(robot: Robot) -> SceneModel:
         "right": ([deep, wall, high + wall], [deep + wall, -wide - 2 * wall, high + wall]),
     }
     for part, (size, pos) in shell.items():
-        cabinet.add_geom(name=f"drawer_0_{part}", type=box, size=size, pos=pos, rgba=[0.42, 0.36, 0.32, 1], **seen_only)
+        cabinet.add_geom(name=f"drawer_0_{part}", type=box, size=size, pos=pos, rgba=[*UNLIT, 1], **seen_only)
     drawer = cabinet.add_body(name="drawer_0_box", gravcomp=1.0)
     slide_joint(drawer, "drawer_0", axis=[-1, 0, 0], travel=DRAWER_TRAVEL, frictionloss=0.8, armature=0.3, damping=6.0)
     drawer.add_geom(name="drawer_0", type=box, size=[deep, wide, high], pos=[deep, 0, high + wall], mass=0.3, condim=3)
     return compile_scene(spec, robot)
 
 
-def _spot(robot: Robot, arm: int, random: np.random.Generator, taken: list[np.ndarray], apart: float) -> np.ndarray:
-    """(x, y) of the arm's half, at least ``apart`` from what is taken; the farthest of 60 draws where there is no room."""
+def _spot(
+    robot: Robot, arm: int, random: np.random.Generator, taken: list[np.ndarray], apart: float, beyond: float = 0.0
+) -> np.ndarray:
+    """(x, y) of the arm's half, at least ``apart`` from what is taken; the farthest of 60 draws where there is no room.
+
+    ``beyond`` [m]: so far before and behind what the arms reach.
+    """
     best, distance = np.zeros(2), -1.0
     for _ in range(60):
-        x, y = random.uniform(*robot.reach_x), side(robot, arm) * random.uniform(*robot.reach_y)
+        x, y = (
+            random.uniform(robot.reach_x[0] - beyond, robot.reach_x[1] + beyond),
+            side(robot, arm) * random.uniform(*robot.reach_y),
+        )
         spot = np.array([x, y])
         nearest = min((float(np.linalg.norm(spot - other)) for other in taken), default=np.inf)
         if nearest > distance:
@@ -158,6 +184,11 @@ def sample_small_layout(robot: Robot, family: str, random: np.random.Generator) 
         x, y = _spot(robot, arm, random, taken, 0.0)
         target = Thing("button", colours[0], float(x), float(y))
         instruction = f"press the {colours[0]} button"
+    elif family == "carry":
+        x, y = random.uniform(robot.reach_x[0] + 0.01, robot.reach_x[1] - 0.01), random.uniform(-0.04, 0.04)
+        target = Thing("tray", colours[0], float(x), float(y), float(random.uniform(-0.12, 0.12)))
+        taken = [target.xy + np.array([0.0, along]) for along in (-0.1, 0.0, 0.1)]
+        instruction = f"lift the {colours[0]} tray with both arms"
     else:
         x, y = _spot(robot, arm, random, taken, 0.0)
         target = Thing(kind, colours[0], float(x), float(y), float(random.uniform(-0.4, 0.4)))
@@ -172,7 +203,8 @@ def sample_small_layout(robot: Robot, family: str, random: np.random.Generator) 
         # A second button stands within reach of the same arm, so that it can be pressed by mistake.
         second = family == "press" and not others
         choices = ["button"] if second else ["block", "can", "pad"]
-        spot = _spot(robot, arm if second else int(random.integers(len(robot.arms))), random, taken, 0.15)
+        half = arm if second else int(random.integers(len(robot.arms)))
+        spot = _spot(robot, half, random, taken, 0.15, 0.09 if family == "carry" else 0.0)
         if min(float(np.linalg.norm(spot - other)) for other in taken) < 0.15:
             continue
         thing = Thing(
@@ -205,7 +237,7 @@ def apply_small_layout(scene: SceneModel, data: Any, layout: SmallLayout) -> Non
             if kind in STANDING:
                 address = int(model.joint(name).qposadr[0])
                 model.body_gravcomp[body] = 1.0 if thing is None else 0.0
-                place = PARKED + np.array([0.3 * number, 0.3 if kind == "can" else 0.0, 0.0])
+                place = PARKED + np.array([0.3 * number, 0.3 * list(STANDING).index(kind), 0.0])
                 angle = 0.0
                 if thing is not None:
                     place, angle = np.array([thing.x, thing.y, STANDING[kind] + 0.0005]), thing.yaw / 2
@@ -214,9 +246,26 @@ def apply_small_layout(scene: SceneModel, data: Any, layout: SmallLayout) -> Non
                 height = 0.0015 if kind == "pad" else 0.0
                 model.body_pos[body] = PARKED if thing is None else [thing.x, thing.y, height]
             if thing is not None:
-                model.geom_rgba[model.geom(name).id] = [*OBJECT_COLOURS[thing.colour], 1.0]
+                for part in (name, *(f"{name}_{end}" for end in HANDLES if kind == "tray")):
+                    model.geom_rgba[model.geom(part).id] = [*OBJECT_COLOURS[thing.colour], 1.0]
     opened = DRAWER_TRAVEL if "drawer_0" in used else 0.0
     data.qpos[int(model.joint("drawer_0").qposadr[0])] = opened
+
+
+def thing_labels(scene: SceneModel, layout: SmallLayout) -> np.ndarray:
+    """uint8 (number of geoms,): 1 for those of the target, 2 of the goal, 3.. of the others, 0 for the rest.
+
+    Of a drawer only what slides belongs to it; a button's plate belongs to it, because it lights up.
+    """
+    labels = np.zeros(scene.model.ngeom, np.uint8)
+    others = 3
+    for name, thing in layout.named():
+        label = 1 if thing is layout.target else 2 if thing is layout.goal else others
+        others += label > 2
+        labels[scene.model.geom(name).id] = label
+        for part in {"button": ("plate",), "tray": tuple(HANDLES)}.get(thing.kind, ()):
+            labels[scene.model.geom(f"{name}_{part}").id] = label
+    return labels
 
 
 def light_buttons(scene: SceneModel, layout: SmallLayout, qpos: np.ndarray) -> None:
@@ -235,6 +284,7 @@ def small_outcome(
 
     lift: in the last half second the thing is 7 cm above where it stood. place: it stands on the pad, its centre within
     5 cm of the pad's, and no finger touches it. close: the drawer is at most a quarter open. press: the cap is down.
+    carry: in the last half second both ends of the tray are 7 cm above the table.
 
     Args:
         data: at the last frame.
@@ -254,6 +304,8 @@ def small_outcome(
             return "success", ""
         other = qpos[-1, int(model.joint("button_1").qposadr[0])] > BUTTON_DOWN * BUTTON_TRAVEL
         return "failure", "wrong place" if other else "incomplete" if down > 0.1 else "missed"
+    if layout.family == "carry":
+        return _carried(scene, layout, qpos, address)
     position = qpos[:, address : address + 3]
     height = position[:, 2] - STANDING[layout.target.kind]
     touched = _touched(scene, data, f"{layout.target.kind}_0")
@@ -280,6 +332,23 @@ def small_outcome(
     return "failure", "dropped" if height[max(released - 1, 0)] > 0.03 else "wrong place"
 
 
+def _carried(scene: SceneModel, layout: SmallLayout, qpos: np.ndarray, address: int) -> tuple[str, str]:
+    """Outcome of a carry from the heights of the tray's ends; ``address`` is that of its positions."""
+    w, x, y, z = qpos[:, address + 3 : address + 7].T
+    middle = qpos[:, address + 2] - STANDING["tray"]
+    ends = middle[:, None] + np.outer(2 * (y * z + w * x), list(HANDLES.values()))
+    lower, higher = ends.min(axis=1), ends.max(axis=1)
+    if lower[-4:].min() > LIFTED:
+        return "success", ""
+    if higher.max() < 0.015:
+        return "failure", "missed"
+    # Still up, but not high enough; or one arm lifted its end alone.
+    if lower[-1] > 0.01 or lower.max() < 0.03:
+        return "failure", "incomplete"
+    opened = max(_opening(scene, arm, qpos)[int(np.argmax(lower)) :].max() for arm in layout.acting())
+    return "failure", "dropped" if opened > RELEASED else "slipped"
+
+
 def _touched(scene: SceneModel, data: Any, name: str) -> bool:
     geom = scene.model.geom(name).id
     pairs = data.contact.geom[: data.ncon]
@@ -290,8 +359,7 @@ def _released_at(
     scene: SceneModel, layout: SmallLayout, qpos: np.ndarray, position: np.ndarray, tool: np.ndarray
 ) -> int | None:
     """The frame at which a raised thing left the hand because the gripper opened wide; None when it left otherwise."""
-    closed, opened = scene.robot.finger_travel
-    opening = (qpos[:, scene.arms[layout.arm].finger_qpos].mean(axis=1) - closed) / (opened - closed)
+    opening = _opening(scene, layout.arm, qpos)
     raised = int(np.argmax(position[:, 2] - STANDING[layout.target.kind] > 0.015))
     away = np.linalg.norm(position - tool, axis=1)
     left = np.flatnonzero(away[raised:] > away[raised] + 0.02)
@@ -299,4 +367,10 @@ def _released_at(
         return None
     frame = raised + int(left[0])
     # A quarter of a second: an opening gripper has opened by then, a relaxed one stays where it is.
-    return frame if opening[frame : frame + 3].max() > 0.88 else None
+    return frame if opening[frame : frame + 3].max() > RELEASED else None
+
+
+def _opening(scene: SceneModel, arm: int, qpos: np.ndarray) -> np.ndarray:
+    """(N,) how far a gripper is open."""
+    closed, opened = scene.robot.finger_travel
+    return (qpos[:, scene.arms[arm].finger_qpos].mean(axis=1) - closed) / (opened - closed)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
 from worldline_core.errors import DataError
 from worldline_core.recorder.controllers import Waypoint
-from worldline_core.recorder.rendering import SCENES, SceneRenderer
+from worldline_core.recorder.rendering import SCENES, TRAIN_SCENES, SceneRenderer
 from worldline_core.recorder.simulate import WorldRecorder
 from worldline_core.recorder.small_bodies import BODIES, CENTRE
 from worldline_core.recorder.small_controllers import plan_small_waypoints
@@ -23,18 +24,24 @@ from worldline_core.recorder.small_things import (
     light_buttons,
     sample_small_layout,
     small_outcome,
+    thing_labels,
 )
 
 Cameras = Literal["training", "held_out"]
-# Where head cameras stand: azimuth from behind the robot [deg], elevation [deg], distance to the workspace [m].
+# Where head cameras stand, across the table, so that arms do not hide what they work on: how far aside from facing the
+# robot [deg], elevation [deg], distance to the workspace [m].
 HEAD_CAMERAS: dict[Cameras, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
-    "training": ((-25.0, 25.0), (56.0, 68.0), (0.80, 0.92)),
-    "held_out": ((40.0, 55.0), (40.0, 48.0), (0.80, 0.92)),
+    "training": ((-25.0, 25.0), (50.0, 64.0), (0.80, 0.92)),
+    "held_out": ((40.0, 55.0), (38.0, 45.0), (0.80, 0.92)),
 }
 
 
+# Share of the training episodes in which a body's links have drawn colours instead of its own.
+REPAINTED = 0.4
+
+
 class SmallWorldRecorder(WorldRecorder[SmallLayout]):
-    """Four tasks with large things, seen from near; ``cameras`` says where head cameras may stand."""
+    """Five tasks with large things, seen from near; ``cameras`` says where head cameras may stand."""
 
     def __init__(self, body: str, cameras: Cameras = "training") -> None:
         import mujoco
@@ -44,6 +51,7 @@ class SmallWorldRecorder(WorldRecorder[SmallLayout]):
         super().__init__(build_small_scene(BODIES[body]))
         self.cameras: Cameras = cameras
         self._kinematics: Any = mujoco.MjData(self.scene.model)
+        self._own_colours = self.scene.model.geom_rgba[self.scene.robot_geoms].copy()
 
     def layout(self, family: str, random: np.random.Generator) -> SmallLayout:
         return sample_small_layout(self.scene.robot, family, random)
@@ -72,12 +80,27 @@ class SmallWorldRecorder(WorldRecorder[SmallLayout]):
     def paint(self, layout: SmallLayout, qpos: np.ndarray) -> None:
         light_buttons(self.scene, layout, qpos)
 
+    def labels(self, layout: SmallLayout) -> np.ndarray:
+        return thing_labels(self.scene, layout)
+
     def set_scene(
         self, renderer: SceneRenderer, layout: SmallLayout, scene_id: str, jitter: np.random.Generator
     ) -> None:
         azimuth, elevation, distance = (jitter.uniform(*limits) for limits in HEAD_CAMERAS[self.cameras])
         turn, rise = np.deg2rad(azimuth * jitter.choice([-1.0, 1.0])), np.deg2rad(elevation)
         target = np.array(CENTRE) + jitter.normal(0, 0.01, 3)
-        back = np.array([-np.cos(turn) * np.cos(rise), -np.sin(turn) * np.cos(rise), np.sin(rise)])
+        back = np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
         renderer.set_look(SCENES[scene_id])
+        self._paint_body(jitter, repaint=scene_id in TRAIN_SCENES and jitter.uniform() < REPAINTED)
         renderer.place_cameras(target + distance * back, target)
+
+    def _paint_body(self, random: np.random.Generator, repaint: bool) -> None:
+        """Give each link its own colour, or, link by link of one colour, another weakly saturated one."""
+        colours = self._own_colours.copy()
+        if repaint:
+            for colour in np.unique(self._own_colours, axis=0):
+                if colour[3] > 0:
+                    hue, saturation, value = random.uniform(0, 360), random.uniform(0, 0.22), random.uniform(0.12, 0.9)
+                    drawn = cv2.cvtColor(np.float32([[[hue, saturation, value]]]), cv2.COLOR_HSV2RGB)[0, 0]
+                    colours[(self._own_colours == colour).all(axis=1), :3] = drawn
+        self.scene.model.geom_rgba[self.scene.robot_geoms] = colours

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from hashlib import sha256
@@ -40,6 +41,7 @@ def write_part(
     robot_masks: Mapping[str, np.ndarray] | None,
     video: VideoSettings,
     described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
+    thing_labels: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
 
@@ -57,15 +59,16 @@ def write_part(
         stored = {
             view: store_view(recorded, working / f"{view}.mp4", episode.fps, video) for view, recorded in views.items()
         }
-        _check_sizes(episode, stored, robot_masks)
+        _check_sizes(episode, stored, robot_masks, "Robot masks")
+        _check_sizes(episode, stored, thing_labels, "Labels of things")
         if described is not None:
             episode = described({view: kept.thumbnails for view, kept in stored.items()})
         for view in stored:
             if stored[view].copied:
                 write_thumbnails(working / f"{view}.arrow", stored[view].path, stored[view].thumbnails)
         with (working / "arrays.npz").open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **_arrays(episode, stored, robot_masks))
-        description = json.dumps(_description(episode, stored, robot_masks), sort_keys=True)
+            np.savez(stream, allow_pickle=False, **_arrays(episode, stored, robot_masks, thing_labels))
+        description = json.dumps(_description(episode, stored, robot_masks, thing_labels), sort_keys=True)
         (working / "part.json").write_text(description)
         shutil.rmtree(final, ignore_errors=True)
         working.rename(final)
@@ -74,7 +77,10 @@ def write_part(
 
 
 def _arrays(
-    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+    episode: Episode,
+    stored: Mapping[str, StoredView],
+    robot_masks: Mapping[str, np.ndarray] | None,
+    thing_labels: Mapping[str, np.ndarray] | None,
 ) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {
         name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()
@@ -84,13 +90,18 @@ def _arrays(
         arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
     for view, mask in (robot_masks or {}).items():
         arrays[f"mask.{view}"] = np.packbits(mask.astype(bool))
+    for view, labels in (thing_labels or {}).items():
+        arrays[f"things.{view}"] = np.frombuffer(zlib.compress(labels.astype(np.uint8).tobytes(), 6), np.uint8)
     for view, kept in stored.items():
         arrays[f"histogram.{view}"] = kept.histogram
     return arrays
 
 
 def _description(
-    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+    episode: Episode,
+    stored: Mapping[str, StoredView],
+    robot_masks: Mapping[str, np.ndarray] | None,
+    thing_labels: Mapping[str, np.ndarray] | None,
 ) -> dict[str, Any]:
     return {
         **episode.described(),
@@ -104,6 +115,7 @@ def _description(
         },
         "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
         "masks": {view: list(mask.shape) for view, mask in (robot_masks or {}).items()},
+        "things": {view: list(labels.shape) for view, labels in (thing_labels or {}).items()},
         "fingerprint": fingerprint(episode, {view: kept.thumbnails for view, kept in stored.items()}),
     }
 
@@ -160,6 +172,10 @@ class Part:
             for view, shape in self["masks"].items()
         }
 
+    def things(self) -> dict[str, tuple[list[int], bytes]]:
+        """By view the shape (N, H, W) of the labels, and the labels as uint8, compressed with zlib."""
+        return {view: (shape, self._arrays[f"things.{view}"].tobytes()) for view, shape in self["things"].items()}
+
     @property
     def signature(self) -> tuple[Any, ...]:
         """Episodes with equal signatures fit into one LeRobot dataset."""
@@ -199,7 +215,7 @@ def check_images(episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
 
 
 def _check_sizes(
-    episode: Episode, stored: Mapping[str, StoredView], robot_masks: Mapping[str, np.ndarray] | None
+    episode: Episode, stored: Mapping[str, StoredView], masks: Mapping[str, np.ndarray] | None, what: str
 ) -> None:
     where = f"episode {episode.episode_id}"
     for view, kept in stored.items():
@@ -214,11 +230,11 @@ def _check_sizes(
                 next_step="use CameraTrack.resized so that K follows the resize",
                 evidence={"view": view, "images": list(kept.size), "calibrated": [camera.height, camera.width]},
             )
-    for view, mask in (robot_masks or {}).items():
+    for view, mask in (masks or {}).items():
         expected = (episode.num_video_frames, *stored[view].size) if view in stored else None
         if mask.shape != expected:
             raise DataError(
-                "Robot masks do not match the images",
+                f"{what} do not match the images",
                 where=f"{where}, view {view}",
                 expected=expected or "a view with images",
                 got=mask.shape,

@@ -213,6 +213,12 @@ class EpisodeSet:
         mask = self._open(i)[1].mask(row.episode_index, view)
         return None if mask is None else mask[row.start : row.start + row.video_frames]
 
+    def thing_labels(self, i: int, view: str) -> np.ndarray | None:
+        """uint8 (N, H, W): 1 what the task moves, 2 where it goes, 3.. other things, 0 none; None where not recorded."""
+        row = self.rows[i]
+        labels = self._open(i)[1].things(row.episode_index, view)
+        return None if labels is None else labels[row.start : row.start + row.video_frames]
+
 
 def _conventions(row: EpisodeRow) -> dict[str, str | float | int]:
     found = parse_json(row.conventions, f"index, conventions of episode {row.episode_id}")

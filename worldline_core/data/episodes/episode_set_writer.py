@@ -114,6 +114,7 @@ class EpisodeSetWriter:
         frames: Mapping[str, np.ndarray | RecordedView],
         robot_masks: Mapping[str, np.ndarray] | None = None,
         described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
+        thing_labels: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Add one episode.
 
@@ -122,6 +123,7 @@ class EpisodeSetWriter:
                 picture, while it is written.
             robot_masks: by view, bool (N, H, W).
             described: gives the episode as it is stored, where its description depends on what its views show.
+            thing_labels: by view, uint8 (N, H, W): 1 what the task moves, 2 where it goes, 3.. other things, 0 none.
 
         Raises: DataError when frames, masks, cameras and states do not belong together; RejectedInputError for
             recordings that cannot be read.
@@ -144,7 +146,7 @@ class EpisodeSetWriter:
                 got=f"{episode.fps} fps",
             )
         views = {view: RecordedView.of(v) if isinstance(v, np.ndarray) else v for view, v in frames.items()}
-        write_part(self._parts, episode, views, robot_masks, self.video, described)
+        write_part(self._parts, episode, views, robot_masks, self.video, described, thing_labels)
 
     def _check_image_size(self, episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
         for view, images in frames.items():

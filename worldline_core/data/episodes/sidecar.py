@@ -32,6 +32,7 @@ _CAMERAS = pa.schema(
         ("T_base_camera", pa.list_(pa.float64())),
     ]
 )
+# Masks are packed bits, labels of things bytes; both compressed with zlib.
 _MASKS = pa.schema(
     [
         ("episode_index", pa.int64()),
@@ -55,7 +56,7 @@ _TRAJECTORIES = pa.schema(
 def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
     """Write the sidecar of a dataset whose episode i is parts[i]."""
     folder = root / FOLDER
-    cameras, masks, trajectories = [], [], []
+    cameras, masks, things, trajectories = [], [], [], []
     for index, part in enumerate(parts):
         episode = part.episode
         for view, camera in episode.cameras.items():
@@ -73,6 +74,8 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
         for view, mask in part.masks().items():
             bits = zlib.compress(np.packbits(mask).tobytes(), 9)
             masks.append({"episode_index": index, "view": view, "shape": list(mask.shape), "bits": bits})
+        for view, (shape, bits) in part.things().items():
+            things.append({"episode_index": index, "view": view, "shape": shape, "bits": bits})
         arms = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         if arms or episode.num_video_frames != episode.num_frames:
             values = {name: array.reshape(-1).tolist() for name, array in episode.arrays().items()}
@@ -80,6 +83,8 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
     write_table_atomic(folder / "cameras.parquet", pa.Table.from_pylist(cameras, schema=_CAMERAS))
     if masks:
         write_table_atomic(folder / "robot_masks.parquet", pa.Table.from_pylist(masks, schema=_MASKS))
+    if things:
+        write_table_atomic(folder / "thing_labels.parquet", pa.Table.from_pylist(things, schema=_MASKS))
     if trajectories:
         write_table_atomic(folder / "trajectories.parquet", pa.Table.from_pylist(trajectories, schema=_TRAJECTORIES))
     write_json_atomic(folder / "contract.json", contract(parts[0]))
@@ -163,19 +168,36 @@ class Sidecar:
 
         Raises: RejectedInputError (unreadable, too_large) for bits that are no mask of their shape.
         """
-        where = f"{self.root}, episode {episode_index}, view {view}, robot mask"
-        for row in self._of("robot_masks.parquet", _MASKS, episode_index, optional=True):
+        found = self._image_bits(episode_index, view, "robot_masks.parquet", 1)
+        if found is None:
+            return None
+        shape, packed = found
+        return np.unpackbits(packed, count=int(np.prod(shape))).reshape(shape).astype(bool)
+
+    def things(self, episode_index: int, view: str) -> np.ndarray | None:
+        """uint8 (N, H, W) labels of things, or None where the recording has none.
+
+        Raises: RejectedInputError (unreadable, too_large) for bytes that are no labels of their shape.
+        """
+        found = self._image_bits(episode_index, view, "thing_labels.parquet", 8)
+        return None if found is None else found[1].reshape(found[0])
+
+    def _image_bits(
+        self, episode_index: int, view: str, name: str, bits_per_pixel: int
+    ) -> tuple[tuple[int, int, int], np.ndarray] | None:
+        """Shape (N, H, W) and unpacked bytes of a view's row in a table of masks."""
+        where = f"{self.root}, episode {episode_index}, view {view}, {name}"
+        for row in self._of(name, _MASKS, episode_index, optional=True):
             if row["view"] == view:
                 with well_formed(where, "packed bits of (N, H, W), compressed with zlib"):
                     count, height, width = (int(size) for size in row["shape"])
                     check_image_size(width, height, where)
-                    bits = count * height * width
+                    bits = count * height * width * bits_per_pixel
                     if not 0 < bits <= 8 * MAX_ARRAY_BYTES:
                         raise too_large(
                             "Mask is too large", where=where, limit=8 * MAX_ARRAY_BYTES, got=bits, unit="bits"
                         )
-                    packed = np.frombuffer(_unpacked(row["bits"], -(-bits // 8)), np.uint8)
-                    return np.unpackbits(packed, count=bits).reshape(count, height, width).astype(bool)
+                    return (count, height, width), np.frombuffer(_unpacked(row["bits"], -(-bits // 8)), np.uint8)
         return None
 
     def trajectory(self, episode_index: int) -> dict[str, Any]:
