@@ -7,7 +7,7 @@ test scenes, executes them, and renders no more than their first frames. On each
 network, trained on the training scenes, predicts success; its area under the curve is measured in the test scenes,
 within each task, with a bootstrap interval over episodes:
 
-    (a)  start places of the things, and the acting tool's pose at every frame (all that decides the outcome)
+    (a)  start places of the things, and the tools' poses at every frame (all that decides the outcome)
     (b)  the same at the frames of the latents only, every fourth
     (c)  what the model is given: first frames of three views, and action maps on the latent grid at those frames
     (c4) the same with the maps of every frame
@@ -57,7 +57,8 @@ class Samples:
 
     Attributes:
         pixels: (n, 2) pixels of the thing in the head view and in the acting arm's wrist view, at model resolution.
-        paths: (n, t, 10) acting tool against the thing and its destination [dm], cos and sin of its turn, opening, time.
+        paths: (n, t, 19) acting tool, then the other, against the thing and its destination [dm], cos and sin of its
+            turn, opening; time.
         pictures: (n, v, 5, h, w) float16: first frames and where the two named colours are, 0..1.
         maps: (n, v, t, 9, rows, columns) float16 action maps of every frame.
     """
@@ -120,18 +121,13 @@ def draw_samples(recorder: WorldRecorder[Any], families: Sequence[str], split: s
                 pictures[slot, :3] = small.transpose(2, 0, 1) / 255.0
                 for place, thing in enumerate(named_things(layout.instruction)[:2]):
                     pictures[slot, 3 + place] = colour_share(small[None], thing.colour)[0]
-        tool = tracks.T_base_tool[:, layout.arm]
         places = anchors(recorder, layout)
         pixels = [(pictures[slot, 3] > 0.5).sum() for slot in (0, 1 + layout.arm)]
-        path = np.concatenate(
-            [
-                (tool[:, None, :3, 3] - places[None]).reshape(frames, 6) * 10,
-                tool[:, :2, 1],
-                tracks.gripper[:, 0, layout.arm, None],
-                np.linspace(-1, 1, frames)[:, None],
-            ],
-            axis=1,
-        )
+        path = np.linspace(-1, 1, frames)[:, None]
+        for arm in (layout.arm, 1 - layout.arm):
+            tool = tracks.T_base_tool[:, arm]
+            beside = (tool[:, None, :3, 3] - places[None]).reshape(frames, 6) * 10
+            path = np.concatenate([path, beside, tool[:, :2, 1], tracks.gripper[:, 0, arm, None]], axis=1)
         columns["pixels"].append(np.array(pixels))
         columns["tasks"].append(np.array(family))
         columns["success"].append(np.array(motion.outcome == "success"))
@@ -252,7 +248,7 @@ def ladder(train: Samples, test: Samples, seeds: int, chosen: Sequence[str]) -> 
         for seed in range(seeds):
             torch.manual_seed(seed)
             if rung[0] in "ab":
-                scores.append(fit_and_score(PathNet(10, len(names)), seen, labels, unseen, 50, 3e-3))
+                scores.append(fit_and_score(PathNet(19, len(names)), seen, labels, unseen, 50, 3e-3))
             else:
                 scores.append(fit_and_score(MapNet(seen[2].shape[2], len(names)), seen, labels, unseen, 20, 3e-3))
         mean = np.mean(scores, axis=0)

@@ -101,6 +101,6 @@ class SmallWorldRecorder(WorldRecorder[SmallLayout]):
             for colour in np.unique(self._own_colours, axis=0):
                 if colour[3] > 0:
                     hue, saturation, value = random.uniform(0, 360), random.uniform(0, 0.22), random.uniform(0.12, 0.9)
-                    drawn = cv2.cvtColor(np.float32([[[hue, saturation, value]]]), cv2.COLOR_HSV2RGB)[0, 0]
+                    drawn = cv2.cvtColor(np.array([[[hue, saturation, value]]], np.float32), cv2.COLOR_HSV2RGB)[0, 0]
                     colours[(self._own_colours == colour).all(axis=1), :3] = drawn
         self.scene.model.geom_rgba[self.scene.robot_geoms] = colours
