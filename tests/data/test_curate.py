@@ -50,6 +50,29 @@ def reasons_of(root: Path) -> dict[str, str]:
     return {row.episode_id: row.reason for row in EpisodeSet.open(root).quarantine()}
 
 
+def test_labels_of_things_are_stored_and_follow_a_resize(tmp_path: Path, sample: Make) -> None:
+    episode, frames, masks = sample(0)
+    labels = np.zeros((9, 32, 48), np.uint8)
+    labels[:, 4:8, 6:10] = 1
+    labels[:, 20:22, 30:34] = 3
+    labels[:, 0, 0] = 2
+    with EpisodeSetWriter(tmp_path / "raw") as writer:
+        writer.add(episode, frames, masks, thing_labels={"head": labels})
+    recorded = EpisodeSet.open(tmp_path / "raw")
+    stored = recorded.thing_labels(0, "head")
+    assert stored is not None
+    assert np.array_equal(stored, labels)
+    assert recorded.thing_labels(0, "left_wrist") is None
+    curate(config(tmp_path / "raw"), {}, tmp_path / "out")
+    small = EpisodeSet.open(tmp_path / "out").thing_labels(0, "head")
+    expected = np.zeros((9, 16, 24), np.uint8)
+    expected[:, 2:4, 3:5] = 1
+    expected[:, 10, 15:17] = 3
+    # A quarter of the first pixel is less than half of it.
+    assert small is not None
+    assert np.array_equal(small, expected)
+
+
 def test_kept_episodes_are_resized_and_calibration_follows(tmp_path: Path, sample: Make) -> None:
     samples = [sample(number) for number in range(2)]
     counts = curate(config(record(tmp_path / "raw", samples)), {}, tmp_path / "out")

@@ -171,6 +171,8 @@ def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) 
         writer.add(episode, {view: images[:, :16] for view, images in frames.items()})
     with pytest.raises(DataError, match="Robot masks do not match"):
         writer.add(episode, frames, {"head": masks["head"][:4]})
+    with pytest.raises(DataError, match="Labels of things do not match"):
+        writer.add(episode, frames, masks, thing_labels={"head": masks["head"][:4].astype(np.uint8)})
     camera = episode.cameras["head"].resized(96, 64)
     with pytest.raises(DataError, match="another image size"):
         writer.add(replace(episode, cameras={**episode.cameras, "head": camera}), frames)

@@ -279,6 +279,16 @@ class ImageTransform:
             return self._apply(masks, lambda mask: mask)
         return self._apply(masks, lambda mask: mask.astype(np.float32)) >= 0.5
 
+    def labels(self, labels: np.ndarray) -> np.ndarray:
+        """uint8 (N, H, W) transformed: the label that at least half of a pixel's area had, else 0.
+
+        Raises: DataError for labels of another size than the transform is for.
+        """
+        transformed = np.zeros((len(labels), *self.image_size), np.uint8)
+        for label in np.unique(labels[labels > 0]):
+            transformed[self.masks(labels == label)] = label
+        return transformed
+
     def _apply(self, images: np.ndarray, prepare: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         if tuple(images.shape[1:3]) != self.source_size:
             raise DataError(

@@ -194,7 +194,13 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
             loaded = self._source(episode.source).load(episode.listed_id)
             check_episode(own, loaded)
             prepared = prepare_episode(own, loaded)
-            self.writer.add(prepared.episode, prepared.frames, prepared.masks or None, prepared.described)
+            self.writer.add(
+                prepared.episode,
+                prepared.frames,
+                prepared.masks or None,
+                prepared.described,
+                thing_labels=prepared.things,
+            )
 
     def quarantine_crashed(self, episode: ListedEpisode, detail: str, evidence: Mapping[str, Any]) -> InputRow:
         return self._quarantine(episode, "crashed", detail, evidence)

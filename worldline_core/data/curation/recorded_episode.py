@@ -68,12 +68,14 @@ class PreparedEpisode:
     Attributes:
         frames: by view.
         masks: by view, bool (N, H, W), of the views that have them.
+        things: by view, uint8 (N, H, W) labels of things, of the views that have them.
         described: the episode as the configuration describes it, given the thumbnails of its views.
     """
 
     episode: Episode
     frames: dict[str, RecordedView]
     masks: dict[str, np.ndarray]
+    things: dict[str, np.ndarray]
     described: Callable[[Mapping[str, ViewThumbnails]], Episode]
 
 
@@ -107,10 +109,14 @@ def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpis
         for view in views
     }
     masks: dict[str, np.ndarray] = {}
+    things: dict[str, np.ndarray] = {}
     for view in views:
-        mask = loaded.robot_masks(view)
+        mask, labels = loaded.robot_masks(view), loaded.thing_labels(view)
         if mask is not None:
             masks[view] = ImageTransform.of(mask.shape[1:3]).fitted(config.image_size, config.fit).masks(mask[::step])
+        if labels is not None:
+            fitted = ImageTransform.of(labels.shape[1:3]).fitted(config.image_size, config.fit)
+            things[view] = fitted.labels(labels[::step])
     cameras = {
         view: camera.transformed(ImageTransform.of((camera.height, camera.width)).fitted(config.image_size, config.fit))
         for view in views
@@ -122,7 +128,7 @@ def prepare_episode(config: CurateConfig, loaded: LoadedEpisode) -> PreparedEpis
         timestamps=np.arange(episode.num_frames) / (config.fps or episode.fps),
         cameras=cameras,
     )
-    return PreparedEpisode(prepared, frames, masks, partial(described, config, prepared, tuple(views)))
+    return PreparedEpisode(prepared, frames, masks, things, partial(described, config, prepared, tuple(views)))
 
 
 def described(

@@ -28,7 +28,7 @@ _DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "andr
 
 
 def no_masks(view: str) -> None:
-    """Robot masks of a source that has none."""
+    """Robot masks, or labels of things, of a source that has none."""
     del view
 
 
@@ -43,6 +43,7 @@ class LoadedEpisode:
         distortions: lenses of the views whose images are not those of a pinhole; K is then that of the lens.
         clips: view -> its encoded video, of the views that are videos; curation decodes it once, and stores it without
             encoding where no picture changes.
+        thing_labels: view -> uint8 (N, H, W) as in `EpisodeSet.thing_labels`, or None where the source has none.
     """
 
     episode: Episode
@@ -51,6 +52,7 @@ class LoadedEpisode:
     robot_masks: Callable[[str], np.ndarray | None] = no_masks
     distortions: Mapping[str, Distortion] = field(default_factory=dict)
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
+    thing_labels: Callable[[str], np.ndarray | None] = no_masks
 
     def each_image(self, view: str) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB per frame.

@@ -52,5 +52,6 @@ class EpisodeSetSource:
             episode,
             views,
             robot_masks=lambda view: self._set.robot_masks(position, view),
+            thing_labels=lambda view: self._set.thing_labels(position, view),
             clips={view: self._set.clip(position, view) for view in views},
         )

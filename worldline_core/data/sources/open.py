@@ -105,8 +105,7 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
                 yield image
         check_count(count, view)
 
-    def masks(view: str) -> np.ndarray | None:
-        found = loaded.robot_masks(view)
+    def cut(found: np.ndarray | None, view: str) -> np.ndarray | None:
         if found is not None:
             check_count(len(found), view)
         return None if found is None else found[kept.start : kept.stop]
@@ -115,7 +114,14 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
     episode = replace(repaired, conventions={**repaired.conventions, **declared})
     if not lagging:
         return replace(loaded, episode=episode)
-    return replace(loaded, episode=episode, images=images, robot_masks=masks, clips=clips)
+    return replace(
+        loaded,
+        episode=episode,
+        images=images,
+        robot_masks=lambda view: cut(loaded.robot_masks(view), view),
+        thing_labels=lambda view: cut(loaded.thing_labels(view), view),
+        clips=clips,
+    )
 
 
 def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
