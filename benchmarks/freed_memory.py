@@ -23,7 +23,7 @@ def measure(way: str, clips: int, threads: int) -> dict[str, float]:
 
     import torch
 
-    from worldline_core.model.tokenizer import load_tokenizer
+    from worldline_core.model.tokenizers import load_tokenizer
     from worldline_core.pipeline.steps import keep_freed_memory
 
     if way == "kept" and not keep_freed_memory():

@@ -190,10 +190,13 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes:
         for index in range(steps):
             loader.read(index)
 
+    baselines = {process.pid for process in (*raw.processes, *whole.processes)}
+    load()
+    loading = [process.pid or 0 for process in multiprocessing.active_children() if process.pid not in baselines]
     me = os.getpid()
     runs: dict[str, tuple[Callable[[], None], list[int]]] = {
         "raw": (raw.run, [process.pid for process in raw.processes]),
-        "loader": (load, [process.pid or 0 for process, _ in loader._workers]),
+        "loader": (load, loading),
         "whole_clips": (whole.run, [process.pid for process in whole.processes]),
     }
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}

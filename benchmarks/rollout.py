@@ -20,7 +20,7 @@ from einops import rearrange
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.patch_tokenizer import PatchTokenizer
-from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizers import WanTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
-from worldline_core.model.wan_tokenizer import WanTokenizer
-from worldline_core.training.recorded_views import RecordedView, load_views
+from worldline_core.training.frame_source import RecordedView, load_views
 from worldline_core.training.train_tokenizer import (
     TokenizerConfig,
     clip_of,

@@ -110,10 +110,10 @@ def test_boundary_loss_looks_at_the_steps_between_blocks() -> None:
 def test_auxiliaries_are_weighted_as_configured() -> None:
     predicted, target = zeros() + 1.0, zeros()
     only_robot = AuxiliaryWeights(anchor=0, boundary=0, lpips=0, robot=0.5, robot_motion=0)
-    result = auxiliary_losses(predicted, target, mask=full_mask(), views=VIEWS, block_size=2, weights=only_robot)
-    assert set(result.terms) == {"robot"}
-    assert result.total.item() == pytest.approx(0.5)
-    every = auxiliary_losses(
+    total, terms = auxiliary_losses(predicted, target, mask=full_mask(), views=VIEWS, block_size=2, weights=only_robot)
+    assert set(terms) == {"robot"}
+    assert total.item() == pytest.approx(0.5)
+    total, terms = auxiliary_losses(
         predicted,
         target,
         mask=full_mask(),
@@ -122,8 +122,8 @@ def test_auxiliaries_are_weighted_as_configured() -> None:
         weights=AuxiliaryWeights(),
         perceptual=lambda a, b: (a - b).abs().mean(),
     )
-    assert set(every.terms) == {"anchor", "boundary", "lpips", "robot", "robot_motion"}
-    assert every.total.item() == pytest.approx(0.005 + 0.0 + 0.005 + 0.005)
+    assert set(terms) == {"anchor", "boundary", "lpips", "robot", "robot_motion"}
+    assert total.item() == pytest.approx(0.005 + 0.0 + 0.005 + 0.005)
 
 
 def test_paper_weights_are_the_defaults() -> None:

@@ -10,12 +10,10 @@ import torch
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
+    CachedBlock,
     KVCache,
     TeacherForcingAttention,
     block_bounds,
-    block_causal_mask,
-    teacher_forcing_mask,
-    visible_blocks,
 )
 from worldline_core.model.layers import grouped_attention
 from worldline_core.model.rope import rotate, rotation
@@ -42,16 +40,31 @@ def frames_of(values: torch.Tensor, start: int, stop: int) -> torch.Tensor:
     return values[..., start:stop, :, :]
 
 
+def teacher_forcing_mask(bounds: list[tuple[int, int]], tokens_per_frame: int) -> torch.Tensor:
+    """Dense mask (True: may attend) of the sequence ``[clean blocks 0..k-1, noisy blocks 1..k]``."""
+    sizes = [(stop - start) * tokens_per_frame for start, stop in bounds]
+    clean = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes[:-1])])
+    noisy = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes) if i > 0])
+    clean_to_clean = clean[:, None] >= clean[None, :]
+    clean_to_noisy = torch.zeros(len(clean), len(noisy), dtype=torch.bool)
+    noisy_to_clean = noisy[:, None] > clean[None, :]
+    noisy_to_noisy = noisy[:, None] == noisy[None, :]
+    return torch.cat(
+        (torch.cat((clean_to_clean, clean_to_noisy), dim=1), torch.cat((noisy_to_clean, noisy_to_noisy), dim=1))
+    )
+
+
 def test_blocks_of_a_clip() -> None:
     assert block_bounds(9, 4) == [(0, 1), (1, 5), (5, 9)]
     with pytest.raises(DataError, match="does not divide into blocks"):
         block_bounds(8, 4)
 
 
-def test_visible_blocks_with_and_without_a_window() -> None:
-    assert visible_blocks(3) == [0, 1, 2]
-    assert visible_blocks(7, sink_blocks=1, recent_blocks=3) == [0, 4, 5, 6]
-    assert visible_blocks(2, sink_blocks=1, recent_blocks=3) == [0, 1]
+def test_the_window_keeps_the_sink_and_the_recent_blocks() -> None:
+    cache = KVCache(sink_blocks=1, recent_blocks=3)
+    for number, kept in enumerate(([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [0, 2, 3, 4], [0, 3, 4, 5])):
+        cache.append(CachedBlock(10**number, {}))
+        assert cache.frames == sum(10**block for block in kept)
 
 
 def test_blockwise_attention_equals_the_dense_mask(model: WorldModel) -> None:
@@ -76,9 +89,9 @@ def test_blockwise_attention_equals_the_dense_mask(model: WorldModel) -> None:
 
 
 def test_clean_half_of_the_mask_is_block_causal() -> None:
-    bounds = block_bounds(5, 2)
-    size = (5 - 2) * 2
-    assert torch.equal(teacher_forcing_mask(bounds, 2)[:size, :size], block_causal_mask(bounds, 2)[:size, :size])
+    block_of = torch.tensor([0, 0, 1, 1, 1, 1])
+    mask = teacher_forcing_mask(block_bounds(5, 2), 2)
+    assert torch.equal(mask[:6, :6], block_of[:, None] >= block_of[None, :])
 
 
 def test_future_frames_and_actions_leave_past_blocks_unchanged(model: WorldModel) -> None:

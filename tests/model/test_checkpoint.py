@@ -147,7 +147,7 @@ def test_missing_unexpected_and_misshapen_weights_are_named(folder: Path) -> Non
 def test_damaged_files_are_refused(folder: Path) -> None:
     path = folder / "model.safetensors"
     path.write_bytes(path.read_bytes()[:-2])
-    with pytest.raises(CheckpointError, match="not those the checkpoint describes"):
+    with pytest.raises(CheckpointError, match="not those that are described"):
         load_checkpoint(folder)
     path.unlink()
     with pytest.raises(CheckpointError, match="has no weights"):

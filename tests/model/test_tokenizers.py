@@ -11,12 +11,10 @@ import pytest
 import torch
 
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.patch_tokenizer import PatchTokenizer
-from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_tokenizer
+from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
-from worldline_core.model.wan_tokenizer import WAN22_MEAN, WAN22_STD, WanTokenizer
-from worldline_core.training.fit_tokenizer import fit_patch_tokenizer
-from worldline_core.training.recorded_views import RecordedView
+from worldline_core.training.frame_source import RecordedView
 from worldline_core.training.train_tokenizer import TokenizerConfig, decoder_batch, disturb, train_decoder
 
 
@@ -189,7 +187,7 @@ def test_tokenizer_files_round_trip_and_are_read_strictly(fitted: PatchTokenizer
     assert loaded.encoder_digest != fitted.encoder_digest
     weights = tmp_path / "b" / "tokenizer.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="not those the tokenizer describes"):
+    with pytest.raises(CheckpointError, match="not those that are described"):
         load_tokenizer(tmp_path / "b")
     description = json.loads((tmp_path / "a" / "tokenizer.json").read_text())
     (tmp_path / "a" / "tokenizer.json").write_text(json.dumps(description | {"kind": "other"}))

@@ -82,7 +82,8 @@ def test_zero_initialised_action_branch_leaves_the_function_unchanged_bit_for_bi
 ) -> None:
     latents, maps, sigma = sample()
     model = build()
-    model.action_encoder.reset_output()
+    torch.nn.init.zeros_(model.action_encoder.proj.weight)
+    torch.nn.init.zeros_(model.action_encoder.proj.bias)
     with torch.no_grad():
         assert torch.equal(model(latents, sigma, action_maps=maps).velocity, model(latents, sigma).velocity)
     model(latents, sigma, action_maps=maps).velocity.square().mean().backward()

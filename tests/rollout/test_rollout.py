@@ -20,12 +20,12 @@ from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, D
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
+from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import RolloutConfig, rollout, shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.digest import digest_folder
-from worldline_core.training.fit_tokenizer import fit_patch_tokenizer
 
 SIZE = (32, 48)
 SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)

@@ -7,7 +7,8 @@ import torch
 
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
-from worldline_core.model.world_model import WorldModel, WorldModelConfig, preconditioned_velocity
+from worldline_core.model.layers import preconditioned_velocity
+from worldline_core.model.world_model import WorldModel, WorldModelConfig
 
 STD = 0.75
 

@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.digest import digest_folder
-from worldline_core.training.training_state import read_metrics
 
 
 def free_port() -> int:
@@ -113,14 +113,16 @@ def test_two_processes_train_one_model(
     start = dict(load_file(inputs["stage1"] / "model.safetensors"))
     moved = max(float((alone[name] - start[name].float()).abs().max()) for name in alone if name in start)
     assert moved > 5e-3
-    losses = [[row["loss"] for row in read_metrics(run / "metrics.jsonl") if "loss" in row] for run in (shared, twice)]
+    losses = [
+        [row["loss"] for row in read_json_lines(run / "metrics.jsonl") if "loss" in row] for run in (shared, twice)
+    ]
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
 
     for run in (shared, tmp_path / "drawn", tmp_path / "text"):
         first, second = weights(run, 0), weights(run, 1)
         assert all(torch.equal(first[name], second[name]) for name in first)
         # One writer: every line of the log once.
-        steps = [row["step"] for row in read_metrics(run / "metrics.jsonl") if "loss" in row]
+        steps = [row["step"] for row in read_json_lines(run / "metrics.jsonl") if "loss" in row]
         assert steps == [2, 4, 6]
 
 

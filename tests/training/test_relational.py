@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from worldline_core.training.relational import (
-    PoolingShape,
     RelationalConfig,
     RelationalScales,
+    common_shape,
     pool_features,
     relational_losses,
 )
@@ -55,11 +55,11 @@ def test_one_view_has_no_cross_term() -> None:
 
 
 def test_both_sides_are_pooled_to_the_coarser_grid_and_at_most_eight_bins() -> None:
-    shape = PoolingShape.common(RelationalConfig(), (9, 4, 6), (17, 24, 24))
-    assert shape == PoolingShape(8, 4, 6)
-    assert PoolingShape.common(RelationalConfig(), (5, 15, 20), (17, 24, 24)) == PoolingShape(5, 8, 8)
+    shape = common_shape(RelationalConfig(), (9, 4, 6), (17, 24, 24))
+    assert shape == (8, 4, 6)
+    assert common_shape(RelationalConfig(), (5, 15, 20), (17, 24, 24)) == (5, 8, 8)
     student = torch.arange(2 * 9 * 4 * 6, dtype=torch.float32).reshape(1, 2, 9, 4, 6, 1)
-    pooled = pool_features(student, PoolingShape(3, 2, 3))
+    pooled = pool_features(student, (3, 2, 3))
     assert pooled.shape == (1, 2, 3, 6, 1)
     assert pooled[0, 1, 0, 0, 0].item() == pytest.approx(student[0, 1, :3, :2, :2].mean().item())
 
@@ -74,5 +74,5 @@ def test_scales_hold_the_weighted_terms_at_their_share_within_caps_and_ramp() ->
     assert cross * 0.25 == pytest.approx(0.005)
     assert RelationalScales(RelationalConfig(ramp_steps=0)).update(1.0, 1e-3, 1e-3, 0) == (0.20, 0.10)
     resumed = RelationalScales(scales.config)
-    resumed.load_state(scales.state())
+    resumed.ratios = dict(scales.ratios)
     assert resumed.update(2.0, 0.5, 0.25, 300) == scales.update(2.0, 0.5, 0.25, 300)

@@ -16,12 +16,12 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
-from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, train_stage1
 from worldline_core.training.stage2 import Stage2Config, train_stage2
-from worldline_core.training.training_state import read_metrics
+from worldline_core.training.train_teacher import TeacherConfig, train_teacher
 
 TRAINER = {
     "steps": 4,
@@ -59,7 +59,7 @@ def first_stage(
 
 
 def losses(folder: Path) -> list[float]:
-    return [row["loss"] for row in read_metrics(folder / "metrics.jsonl") if "loss" in row]
+    return [row["loss"] for row in read_json_lines(folder / "metrics.jsonl") if "loss" in row]
 
 
 def test_stage1_learns_the_same_from_frames_as_from_their_cached_latents(
@@ -141,7 +141,7 @@ def test_the_teacher_is_shown_the_frames_that_were_read(
         ("online", {"input": FRAMES}, {"tokenizer": tokenizer}),
     ):
         train_stage2(stage2(relational={"ramp_steps": 2}, **values), given | source, tmp_path / name)
-        rows = [row for row in read_metrics(tmp_path / name / "metrics.jsonl") if "loss" in row]
+        rows = [row for row in read_json_lines(tmp_path / name / "metrics.jsonl") if "loss" in row]
         found.append([(row["relational_intra"], row["relational_cross"]) for row in rows])
     for cached, online in zip(*found, strict=True):
         assert online == pytest.approx(cached, rel=5e-3)

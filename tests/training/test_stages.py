@@ -15,14 +15,14 @@ from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, D
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.contracts import ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import stage as stage_module
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_source import training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.small_teacher import TeacherConfig, train_teacher
 from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
 from worldline_core.training.stage2 import Stage2Config, stage2_groups, train_stage2
-from worldline_core.training.training_state import read_metrics
+from worldline_core.training.train_teacher import TeacherConfig, train_teacher
 
 MakeConfig = Callable[..., WorldModelConfig]
 
@@ -113,7 +113,7 @@ def test_a_killed_run_ends_with_the_same_bytes(
     torch.rand(5)
     train_stage2(config, inputs, tmp_path / "parts")
     assert digested(tmp_path / "parts") == digested(tmp_path / "whole")
-    rows = [row for row in read_metrics(tmp_path / "parts" / "metrics.jsonl") if "loss" in row]
+    rows = [row for row in read_json_lines(tmp_path / "parts" / "metrics.jsonl") if "loss" in row]
     assert [row["step"] for row in rows] == [3, 6, 9, 12, 14]
     assert all(row["relational_intra"] > 0 for row in rows)
 
@@ -145,7 +145,7 @@ def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeC
         160, trainer=trainer_values(160, batch_size=8, ema_decay=0.95), weighting={"kind": "sample"}, action_dropout=0.0
     )
     result = train_stage2(config, {**world.inputs, "stage1": tmp_path / "base"}, tmp_path / "run")
-    losses = [row["loss"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl") if "loss" in row]
+    losses = [row["loss"] for row in read_json_lines(tmp_path / "run" / "metrics.jsonl") if "loss" in row]
     assert losses[-1] < 0.4 * losses[0]
     assert result["validation/sample_error"] < 0.8 * result["validation/sample_error_shuffled_actions"]
     _, info = load_checkpoint(tmp_path / "run", expect_kind="stage2")
@@ -259,7 +259,8 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
     from worldline_core.training.clip_source import Clip
-    from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
+    from worldline_core.training.relational import TeacherFeatures
+    from worldline_core.training.video_teacher import load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())
     assert description["metrics"]["validation/loss"] > 0

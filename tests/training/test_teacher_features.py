@@ -7,7 +7,7 @@ from collections import OrderedDict
 import torch
 
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.video_teacher import TeacherFeatures
+from worldline_core.training.relational import TeacherFeatures
 
 
 def test_cached_features_are_handed_on_in_single_precision_under_autocast() -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -166,14 +165,6 @@ def enabled_terms(weights: AuxiliaryWeights, *, perceptual: bool) -> tuple[str, 
     return tuple(name for name in names if getattr(weights, name) and (perceptual or name != "lpips"))
 
 
-@dataclass(frozen=True)
-class AuxiliaryLosses:
-    """Weighted sum of the auxiliaries and the plain value of each, for the metrics."""
-
-    total: Tensor
-    terms: dict[str, Tensor]
-
-
 def auxiliary_losses(
     predicted: Float[Tensor, "b v c t h w"],
     target: Float[Tensor, "b v c t h w"],
@@ -183,10 +174,10 @@ def auxiliary_losses(
     block_size: int,
     weights: AuxiliaryWeights,
     perceptual: PerceptualDistance | None = None,
-) -> AuxiliaryLosses:
-    """All auxiliaries of `predicted` against `target`, observed frame included in both.
+) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    """Weighted sum of all auxiliaries of `predicted` against `target`, and the plain value of each for the metrics.
 
-    `mask` may be None only where no robot term is wanted (both robot weights 0); `perceptual` None leaves LPIPS
+    Both clips hold the observed frame. `mask` may be None only where no robot term is wanted (both robot weights 0); `perceptual` None leaves LPIPS
     out, which the caller reports.
     """
     terms: dict[str, tuple[float, Tensor]] = {}
@@ -201,14 +192,11 @@ def auxiliary_losses(
         if weights.robot:
             terms["robot"] = (weights.robot, robot_reconstruction_loss(predicted, target, mask, per_view))
         if weights.robot_motion:
-            terms["robot_motion"] = (
-                weights.robot_motion,
-                robot_motion_loss(predicted, target, mask, per_view),
-            )
+            terms["robot_motion"] = (weights.robot_motion, robot_motion_loss(predicted, target, mask, per_view))
     total = (predicted * 0.0).sum()
     for weight, value in terms.values():
         total = total + weight * value
-    return AuxiliaryLosses(total, {name: value.detach() for name, (_, value) in terms.items()})
+    return total, {name: value.detach() for name, (_, value) in terms.items()}
 
 
 def clip_robot_masks(

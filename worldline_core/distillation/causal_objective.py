@@ -5,9 +5,9 @@ Axes: b clips, v views, c latent channels, t latent frames, h and w rows and col
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from einops import repeat
@@ -22,6 +22,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import integrate
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import SigmaSampling, sample_sigmas
+from worldline_core.training.trainer import Objective
 
 
 def frame_sigmas(sigma: Float[Tensor, "b blocks"], block_size: int) -> Float[Tensor, "b t"]:
@@ -102,24 +103,19 @@ def self_forced_rollout(
     return torch.cat(blocks, dim=3)
 
 
-class CausalObjective:
-    """A block-causal model under training, and the error of its own rollouts on held-out clips."""
+class CausalObjective[BatchT: Batch](Objective[BatchT], ABC):
+    """A block-causal model under training, and the error of its own rollouts on held-out clips.
+
+    Each step of Stage III has a loss of its own; nothing but the weights changes from step to step.
+    """
 
     def __init__(self, model: WorldModel, config: DistillConfig) -> None:
         self.model = model
         self.config = config
         self.spec = config.spec
 
-    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Loss of one micro-batch and its parts; each step has its own."""
-        raise NotImplementedError
-
-    def state(self) -> dict[str, Any]:
-        """Nothing but the weights changes from step to step."""
-        return {}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Nothing to continue from."""
+    @abstractmethod
+    def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]: ...
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]:
         """Squared latent error of complete rollouts: with the true controls, with another clip's, and copying.

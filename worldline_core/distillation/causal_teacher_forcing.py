@@ -20,7 +20,7 @@ from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling, add_noise, flow_matching_loss
 
 
-class TeacherForcingObjective(CausalObjective):
+class TeacherForcingObjective(CausalObjective[Batch]):
     """Flow matching of every block given the clean blocks before it."""
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:

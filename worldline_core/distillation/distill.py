@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +23,22 @@ from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import TrajectoryMaker
+from worldline_core.distillation.teacher_trajectories import trajectory_shard
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.distillation.trajectory_store import (
     INDEX,
+    TrajectoryBatch,
     TrajectoryLoader,
     TrajectoryStore,
     write_trajectories,
 )
-from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.tokenizer import load_tokenizer
+from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION, ClipRow, named_rows, training_rows
+from worldline_core.training.clip_source import ClipRow, named_rows, training_rows
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage import validation_function
 from worldline_core.training.trainer import ParameterGroup, TrainerConfig, join_processes, train, wait_for_all
@@ -55,12 +56,10 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
 
     Raises:
         CheckpointError: the checkpoint is not of Stage II, or its action maps and latents are not those given here.
-        ConfigError: the clips are not whole blocks of all views.
         DataError: no clip fits the blocks.
         TrainingError: a loss or gradient is not finite.
     """
     torch.manual_seed(config.teacher_forcing.trainer.seed)
-    _check_clips(config)
     run = DistillationRun.open(config, inputs, output)
     metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
     return {
@@ -139,7 +138,7 @@ class DistillationRun:
         settings = self.config.teacher_forcing
         model, info = load_checkpoint(self.stage2, expect_kind="stage2", towers="generation")
         views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
-        clips = self.config.clips.model_copy(update=views)
+        clips = ClipSampling.model_validate(self.config.clips.model_dump() | views)
         sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, distributed=True)
         objective = TeacherForcingObjective(model.to(settings.trainer.device).train(), self.config)
         return self._train(
@@ -152,7 +151,7 @@ class DistillationRun:
         student, info = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
         self._make_trajectories(info)
         objective = TrajectoryObjective(student.to(settings.trainer.device).train(), self.config, self.perceptual)
-        return self._train(STEPS[1], settings.trainer, objective, self._trajectories(settings.trainer).load, info)
+        return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(settings.trainer), info)
 
     def distribution_matching(self) -> dict[str, float]:
         """Step 3, from step 2's model; the real and the fake score start from the same weights."""
@@ -164,7 +163,7 @@ class DistillationRun:
             student.to(settings.trainer.device).train(), real, fake.train(), self.config, self.perceptual
         )
         other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate)
-        load = self._trajectories(settings.trainer).load
+        load = self._load_trajectories(settings.trainer)
         return self._train(STEPS[2], settings.trainer, objective, load, info, other)
 
     def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, *, distributed: bool) -> ClipSampler:
@@ -191,9 +190,10 @@ class DistillationRun:
         folder = self._trajectory_folder
         if self.rank == 0 and not (folder / INDEX).is_file():
             teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
+            teacher.to(trainer.device).eval().requires_grad_(False)
             per_shard = min(settings.clips, settings.clips_per_shard)
             sampler = self._sampler(per_shard, settings.seed, self.config.clips, distributed=False)
-            maker = TrajectoryMaker(self.config, trainer, teacher.to(trainer.device), self.loader, sampler)
+            make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, sampler=sampler)
             facts = {
                 "teacher": teacher_info.weights_sha256,
                 "causal": self.config.spec.model_dump(mode="json"),
@@ -201,13 +201,13 @@ class DistillationRun:
                 "clips": self.config.clips.model_dump(mode="json"),
                 **settings.model_dump(mode="json"),
             }
-            write_trajectories(folder, -(-settings.clips // per_shard), maker, facts)
+            write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if self.rank == 0:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
         wait_for_all()
 
-    def _trajectories(self, trainer: TrainerConfig) -> TrajectoryLoader:
-        return TrajectoryLoader(
+    def _load_trajectories(self, trainer: TrainerConfig) -> Callable[[int], TrajectoryBatch]:
+        loader = TrajectoryLoader(
             TrajectoryStore.open(self._trajectory_folder),
             self.loader,
             batch_size=trainer.batch_size,
@@ -216,20 +216,21 @@ class DistillationRun:
             rank=self.rank,
             world_size=self.world_size,
         )
+        return loader.load
 
-    def _train(
+    def _train[BatchT: Batch](
         self,
         step: str,
         trainer: TrainerConfig,
-        objective: CausalObjective,
-        load: Callable[[int], Batch],
+        objective: CausalObjective[BatchT],
+        load: Callable[[int], BatchT],
         parent: CheckpointInfo,
         *other_groups: ParameterGroup,
     ) -> dict[str, float]:
         """Train one step with the shared loop, then write its checkpoint and metrics; a finished step is only read."""
         folder, log = self.folder(step), self.output / step / "metrics.jsonl"
         if (folder / "checkpoint.json").is_file() and log.is_file():
-            return _prefixed(step, read_checkpoint_info(folder).metadata["metrics"])
+            return {f"{step}/{name}": value for name, value in read_checkpoint_info(folder).metadata["metrics"].items()}
         work, model = self.output / "run" / step, objective.model
         result = train(
             trainer,
@@ -252,7 +253,7 @@ class DistillationRun:
             world_size=self.world_size,
         )
         if self.rank == 0:
-            names = _named_parameters(model).keys()
+            trained = {name: result.average[name] for name, _ in model.named_parameters()}
             write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
             save_checkpoint(
                 folder,
@@ -269,31 +270,10 @@ class DistillationRun:
                     "lpips": self.lpips,
                     "metrics": result.metrics,
                 },
-                state_dict=model.state_dict()
-                | {name: result.average[name] for name in names if name in result.average},
+                state_dict=model.state_dict() | trained,
             )
         wait_for_all()
-        return _prefixed(step, result.metrics)
-
-
-def _check_clips(config: DistillConfig) -> None:
-    span = TEMPORAL_COMPRESSION * config.block_size
-    if config.clips.view_weights is not None:
-        raise ConfigError(
-            "Distillation clips hold all views",
-            where="distill.clips.view_weights",
-            expected="null",
-            got=config.clips.view_weights,
-            next_step="set distill.teacher_forcing.view_weights for the first step alone",
-        )
-    odd = [length for length in config.clips.lengths if length <= span or (length - 1) % span]
-    if odd:
-        raise ConfigError(
-            "Clips for distillation are one observed frame and whole blocks",
-            where="distill.clips.lengths",
-            expected=f"1 + k * {span} frames",
-            got=odd,
-        )
+        return {f"{step}/{name}": value for name, value in result.metrics.items()}
 
 
 def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> PerceptualDistance | None:
@@ -302,15 +282,8 @@ def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> Perceptu
         if wanted:
             logger.warning("The perceptual auxiliary is %s; it is left out of the loss.", LPIPS_OFF)
         return None
-    codec = load_tokenizer(tokenizer)
-    if isinstance(codec, torch.nn.Module):
-        codec.to(device).eval().requires_grad_(False)
-    return PerceptualLoss(codec, config.lpips_weights, device=device)
+    return PerceptualLoss(load_tokenizer(tokenizer, device), config.lpips_weights, device=device)
 
 
 def _named_parameters(model: WorldModel, prefix: str = "") -> dict[str, torch.nn.Parameter]:
     return {prefix + name: parameter for name, parameter in model.named_parameters()}
-
-
-def _prefixed(step: str, metrics: Mapping[str, float]) -> dict[str, float]:
-    return {f"{step}/{name}": value for name, value in metrics.items()}

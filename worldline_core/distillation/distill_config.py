@@ -7,11 +7,11 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.training.clip_sampler import ClipSampling
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
 from worldline_core.training.trainer import OptimizerConfig, TrainerConfig
 
@@ -122,7 +122,18 @@ class DistillConfig(StrictModel):
     lpips_weights: Path | None = Field(default=None, description="folder of the LPIPS weights; None: that term is off")
 
     @model_validator(mode="after")
-    def _one_interval_per_step(self) -> Self:
+    def _consistent(self) -> Self:
+        if self.clips.view_weights is not None:
+            raise ValueError(
+                "clips.view_weights: distillation clips hold all views; set teacher_forcing.view_weights for the first "
+                "step alone"
+            )
+        span = TEMPORAL_FACTOR * self.block_size
+        odd = [length for length in self.clips.lengths if length <= span or (length - 1) % span]
+        if odd:
+            raise ValueError(
+                f"clips.lengths {odd}: clips are one observed frame and whole blocks, 1 + k * {span} frames"
+            )
         steps, substeps = self.spec.steps, self.trajectory_regression.trajectories.substeps
         if len(substeps) != steps:
             raise ValueError(f"trajectories.substeps {substeps}: one number per interval of sigmas is needed, {steps}")
@@ -134,7 +145,7 @@ class DistillConfig(StrictModel):
 
         Of recent blocks it keeps no more than the longest clip has: what lies further back, it has never seen.
         """
-        blocks = (max(self.clips.lengths) - 1) // (TEMPORAL_COMPRESSION * self.block_size)
+        blocks = (max(self.clips.lengths) - 1) // (TEMPORAL_FACTOR * self.block_size)
         return CausalSpec(
             block_size=self.block_size,
             sink_blocks=self.window.sink_blocks,

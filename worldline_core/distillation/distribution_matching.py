@@ -25,10 +25,11 @@ from worldline_core.distillation.causal_objective import (
     CausalObjective,
     block_sigmas,
     frame_sigmas,
+    maps_of,
     with_observed_frame,
 )
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
-from worldline_core.distillation.trajectory_store import parts_of
+from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
@@ -38,7 +39,7 @@ Score = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Velocity at (noisy clip, the clip's own clean latents, sigma of every block "b blocks")."""
 
 
-class DistributionMatchingObjective(CausalObjective):
+class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
     """Step 3: five updates of the fake score, then one of the student, in one training loop.
 
     An iteration gives gradients to one of the two models only; the optimiser leaves the other as it is. Every iteration
@@ -60,28 +61,23 @@ class DistributionMatchingObjective(CausalObjective):
         self.fake = fake
         self.perceptual = perceptual
 
-    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, batch: TrajectoryBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """The student's loss in one iteration of six, the fake score's in the others."""
-        trajectories, maps = parts_of(batch)
+        maps = maps_of(batch)
         student_turn = is_student_iteration(step)
         enabled = enabled_terms(self.settings.auxiliary, perceptual=self.perceptual is not None)
         names = ("distribution_matching", *enabled)
         noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
         if self.settings.target == "teacher":
             # The teacher's trajectory started from this noise: its clean end is what this rollout should become.
-            noise = with_observed_frame(noise[..., :1, :, :], trajectories.nodes[:, 0])
+            noise = with_observed_frame(noise[..., :1, :, :], batch.nodes[:, 0])
         generated = self.rollout(batch, maps, noise, self.exit_step(step), with_gradient=student_turn)
         sigma = self.sigmas(batch, generator)
         fresh = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
         fake = self.score(self.fake, batch, maps)
         if not student_turn:
             loss = fake_score_loss(
-                fake,
-                generated,
-                fresh,
-                sigma,
-                block_size=self.spec.block_size,
-                weighting=self.settings.weighting,
+                fake, generated, fresh, sigma, block_size=self.spec.block_size, weighting=self.settings.weighting
             )
             return loss, {**dict.fromkeys(names, 0.0), "fake_score": loss.item() * CYCLE / (CYCLE - 1)}
         gradient = distribution_gradient(
@@ -90,19 +86,18 @@ class DistributionMatchingObjective(CausalObjective):
         matching = distribution_matching_loss(generated, gradient)
         target = batch.latents
         if self.settings.target == "teacher":
-            target = with_observed_frame(target[..., :1, :, :], trajectories.nodes[:, -1])
-        extra = auxiliary_losses(
+            target = with_observed_frame(target[..., :1, :, :], batch.nodes[:, -1])
+        auxiliary, values = auxiliary_losses(
             generated,
             target,
-            mask=trajectories.mask,
+            mask=batch.mask,
             views=batch.views,
             block_size=self.spec.block_size,
             weights=self.settings.auxiliary,
             perceptual=self.perceptual,
         )
-        terms = {"distribution_matching": matching.detach(), **extra.terms}
-        values = {name: terms[name].item() * CYCLE for name in names}
-        return matching + extra.total, {**values, "fake_score": 0.0}
+        values = {"distribution_matching": matching, **values}
+        return matching + auxiliary, {name: values[name].item() * CYCLE for name in names} | {"fake_score": 0.0}
 
     def exit_step(self, step: int) -> int:
         """Exit step of this iteration: random, and the same on every process (it does not depend on the rank)."""

@@ -15,7 +15,6 @@ import itertools
 from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,7 +30,7 @@ from worldline_core.rollout.samplers import VelocityField, integrate
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.trainer import TrainerConfig, autocast, step_generator
+from worldline_core.training.trainer import autocast, step_generator
 
 
 def substep_sigmas(start: float, stop: float, substeps: int) -> list[float]:
@@ -123,46 +122,27 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
     """
     if loader.tracks is None:
         raise ConfigError("Robot masks come from action tracks", next_step="give the tracks to the clip loader")
-    cut = []
-    for clip in clips:
-        frames = np.arange(clip.num_frames) * clip.stride + clip.start
-        cut.append(loader.tracks.tracks(clip.episode_id).clip(frames))
-    _, rows, columns = loader.store.latent_shape
-    return clip_robot_masks(cut, views, (rows, columns))
+    cut = [loader.tracks.tracks(clip.episode_id).clip(list(clip.frames)) for clip in clips]
+    return clip_robot_masks(cut, views, loader.store.latent_shape[1:])
 
 
-class TrajectoryMaker:
-    """Makes the shards of the trajectory store: clips by sampler, noise by seed, nodes by the frozen teacher."""
-
-    def __init__(
-        self,
-        config: DistillConfig,
-        trainer: TrainerConfig,
-        teacher: WorldModel,
-        loader: ClipLoader,
-        sampler: ClipSampler,
-    ) -> None:
-        self.config = config
-        self.trainer = trainer
-        self.teacher = teacher.eval().requires_grad_(False)
-        self.loader = loader
-        self.sampler = sampler
-
-    def __call__(self, number: int) -> tuple[Sequence[Clip], Tensor, Tensor]:
-        """Clips, nodes and masks of shard `number`."""
-        settings = self.config.trajectory_regression.trajectories
-        batch = self.loader.load(self.sampler.clips(number))
-        generator = step_generator(settings.seed, number, self.trainer.device)
-        noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
-        with autocast(self.trainer):
-            nodes = teacher_trajectories(
-                self.teacher,
-                batch.latents,
-                maps_of(batch),
-                noise,
-                views=batch.views,
-                spec=self.config.spec,
-                substeps=settings.substeps,
-                generated_history=settings.history == "generated",
-            )
-        return batch.clips, nodes, robot_masks(self.loader, batch.clips, batch.views)
+def trajectory_shard(
+    number: int, config: DistillConfig, teacher: WorldModel, loader: ClipLoader, sampler: ClipSampler
+) -> tuple[Sequence[Clip], Float[Tensor, "b k v c u h w"], Float[Tensor, "b v t h w"]]:
+    """Clips, nodes and robot masks of one shard of the store: a function of the seed and the shard's number."""
+    settings, trainer = config.trajectory_regression.trajectories, config.trajectory_regression.trainer
+    batch = loader.load(sampler.clips(number))
+    generator = step_generator(settings.seed, number, trainer.device)
+    noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
+    with autocast(trainer):
+        nodes = teacher_trajectories(
+            teacher,
+            batch.latents,
+            maps_of(batch),
+            noise,
+            views=batch.views,
+            spec=config.spec,
+            substeps=settings.substeps,
+            generated_history=settings.history == "generated",
+        )
+    return batch.clips, nodes, robot_masks(loader, batch.clips, batch.views)

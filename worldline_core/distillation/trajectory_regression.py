@@ -10,58 +10,44 @@ nodes is taken in expectation (times K); all blocks are trained in one teacher-f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from einops import rearrange
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights, PerceptualDistance, auxiliary_losses
-from worldline_core.distillation.causal_objective import CausalObjective, frame_sigmas, with_observed_frame
-from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.trajectory_store import parts_of
+from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses
+from worldline_core.distillation.causal_objective import CausalObjective, frame_sigmas, maps_of, with_observed_frame
+from worldline_core.distillation.distill_config import DistillConfig, TrajectoryRegressionConfig
+from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import broadcast_sigma
 
 
-@dataclass(frozen=True)
-class TrajectoryLoss:
-    """The weighted total and its parts."""
-
-    total: Tensor
-    terms: dict[str, Tensor]
-
-
-class TrajectoryObjective(CausalObjective):
+class TrajectoryObjective(CausalObjective[TrajectoryBatch]):
     """Regression of the teacher's trajectories."""
 
     def __init__(self, model: WorldModel, config: DistillConfig, perceptual: PerceptualDistance | None) -> None:
         super().__init__(model, config)
         self.perceptual = perceptual
 
-    def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+    def loss(self, batch: TrajectoryBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Trajectory loss of one batch, and its parts."""
-        settings = self.config.trajectory_regression
-        trajectories, maps = parts_of(batch)
         blocks = (batch.latents.shape[3] - 1) // self.spec.block_size
-        loss = trajectory_regression_loss(
+        total, terms = trajectory_regression_loss(
             self.model,
-            trajectories.nodes,
-            trajectories.clean,
-            maps,
+            batch.nodes,
+            batch.history,
+            maps_of(batch),
             draw_nodes(len(batch.latents), blocks, self.spec.steps, generator),
-            mask=trajectories.mask,
+            mask=batch.mask,
             views=batch.views,
             spec=self.spec,
-            next_weight=settings.next_weight,
-            terminal_weight=settings.terminal_weight,
-            auxiliary=settings.auxiliary,
+            config=self.config.trajectory_regression,
             perceptual=self.perceptual,
         )
-        return loss.total, {name: value.item() for name, value in loss.terms.items()}
+        return total, {name: value.item() for name, value in terms.items()}
 
 
 def draw_nodes(clips: int, blocks: int, steps: int, generator: torch.Generator) -> Int[Tensor, "b blocks"]:
@@ -89,12 +75,13 @@ def trajectory_regression_loss(
     mask: Float[Tensor, "b v t h w"] | None,
     views: Sequence[str],
     spec: CausalSpec,
-    next_weight: float,
-    terminal_weight: float,
-    auxiliary: AuxiliaryWeights,
+    config: TrajectoryRegressionConfig,
     perceptual: PerceptualDistance | None = None,
-) -> TrajectoryLoss:
+) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """Regression of the next node and of the clean end, plus the auxiliaries against the teacher's clean end.
+
+    Returns:
+        The weighted total, and its parts.
 
     Args:
         nodes: the teacher's states, observed frame left out.
@@ -118,14 +105,14 @@ def trajectory_regression_loss(
     # Frame 0 is the observation in both: it adds nothing and is left out of the means.
     next_loss = spec.steps * ((stepped - following)[..., 1:, :, :] ** 2).mean()
     terminal_loss = ((predicted - end)[..., 1:, :, :] ** 2).mean()
-    extra = auxiliary_losses(
+    auxiliary, terms = auxiliary_losses(
         predicted,
         end,
         mask=mask,
         views=views,
         block_size=spec.block_size,
-        weights=auxiliary,
+        weights=config.auxiliary,
         perceptual=perceptual,
     )
-    total = next_weight * next_loss + terminal_weight * terminal_loss + extra.total
-    return TrajectoryLoss(total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **extra.terms})
+    total = config.next_weight * next_loss + config.terminal_weight * terminal_loss + auxiliary
+    return total, {"next": next_loss.detach(), "terminal": terminal_loss.detach(), **terms}

@@ -24,8 +24,9 @@ from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
-from worldline_core.distillation.causal_objective import maps_of, with_observed_frame
-from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.distillation.causal_objective import with_observed_frame
+from worldline_core.errors import ArtifactError
+from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.digest import digest_file
 from worldline_core.training.clip_loader import Batch, ClipLoader
@@ -51,18 +52,16 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
     Raises:
         ArtifactError: the folder holds trajectories made with other settings.
     """
-    recorded = folder / "settings.json"
-    if recorded.is_file():
-        found = json.loads(recorded.read_text(encoding="utf-8"))
-        if found != settings:
-            raise ArtifactError(
-                "The folder holds trajectories made with other settings",
-                where=folder,
-                expected=settings,
-                got=found,
-                next_step="remove the folder, or use another one",
-            )
-    write_json_atomic(recorded, settings)
+    found = read_json(folder / "settings.json") or settings
+    if found != settings:
+        raise ArtifactError(
+            "The folder holds trajectories made with other settings",
+            where=folder,
+            expected=settings,
+            got=found,
+            next_step="remove the folder, or use another one",
+        )
+    write_json_atomic(folder / "settings.json", settings)
     for number in tqdm(range(shards), desc="teacher trajectories", unit="shard", disable=None):
         path = shard_path(folder, number)
         if path.is_file():
@@ -71,11 +70,8 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
         header = {"clips": json.dumps([asdict(clip) for clip in clips])}
         tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
         write_bytes_atomic(path, save({name: value.contiguous() for name, value in tensors.items()}, metadata=header))
-    index = {
-        "settings": settings,
-        "shards": [digest_file(shard_path(folder, number)) for number in range(shards)],
-    }
-    write_json_atomic(folder / INDEX, index)
+    digests = [digest_file(shard_path(folder, number)) for number in range(shards)]
+    write_json_atomic(folder / INDEX, {"settings": settings, "shards": digests})
 
 
 class TrajectoryStore:
@@ -132,32 +128,18 @@ class TrajectoryStore:
         return torch.cat(rows).float()
 
 
-@dataclass(frozen=True)
-class Trajectories:
-    """What distillation adds to a batch; `clean` is the history the teacher saw, observed frame included."""
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryBatch(Batch):
+    """A batch with the teacher's trajectories of its clips.
+
+    Attributes:
+        history: what the teacher saw before each block, observed frame included.
+        mask: where the robot is.
+    """
 
     nodes: Float[Tensor, "b k v c u h w"]
-    clean: Float[Tensor, "b v c t h w"]
+    history: Float[Tensor, "b v c t h w"]
     mask: Float[Tensor, "b v t h w"]
-
-
-@dataclass(frozen=True)
-class TrajectoryBatch(Batch):
-    """A batch with the teacher's trajectories of its clips."""
-
-    trajectories: Trajectories | None = None
-
-
-def parts_of(batch: Batch) -> tuple[Trajectories, Float[Tensor, "b v a t h w"]]:
-    """Trajectories and action maps of a batch.
-
-    Raises:
-        ConfigError: the batch lacks one of them.
-    """
-    trajectories = batch.trajectories if isinstance(batch, TrajectoryBatch) else None
-    if trajectories is None:
-        raise ConfigError("A batch without teacher trajectories", expected="a batch of TrajectoryLoader")
-    return trajectories, maps_of(batch)
 
 
 class TrajectoryLoader:
@@ -200,8 +182,8 @@ class TrajectoryLoader:
         rows = [group[int(draw)] for draw in draws[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]]
         batch = self.loader.load(ClipBatch(self.store.clips(rows), None))
         nodes = self.store.nodes(rows).to(self.loader.device)
-        clean = batch.latents
+        history = batch.latents
         if self.generated_history:
-            clean = with_observed_frame(clean[..., :1, :, :], nodes[:, -1])
-        trajectories = Trajectories(nodes, clean, self.store.masks(rows).to(self.loader.device))
-        return TrajectoryBatch(batch.clips, batch.views, batch.latents, batch.action_maps, trajectories=trajectories)
+            history = with_observed_frame(history[..., :1, :, :], nodes[:, -1])
+        mask = self.store.masks(rows).to(self.loader.device)
+        return TrajectoryBatch(**vars(batch), nodes=nodes, history=history, mask=mask)

@@ -6,11 +6,9 @@ A block of latent frames sees itself and the clean blocks before it. Block 0 is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
@@ -32,35 +30,6 @@ def block_bounds(latent_frames: int, block_size: int) -> list[tuple[int, int]]:
             next_step="cut the clip, or change the block size",
         )
     return [(0, 1), *((start, start + block_size) for start in range(1, latent_frames, block_size))]
-
-
-def visible_blocks(block: int, sink_blocks: int | None = None, recent_blocks: int | None = None) -> list[int]:
-    """Earlier blocks that ``block`` attends to: all of them, or the first ``sink_blocks`` and last ``recent_blocks``."""
-    if sink_blocks is None or recent_blocks is None:
-        return list(range(block))
-    return [earlier for earlier in range(block) if earlier < sink_blocks or earlier >= block - recent_blocks]
-
-
-def block_causal_mask(bounds: Sequence[tuple[int, int]], tokens_per_frame: int) -> Bool[Tensor, "n n"]:
-    """Dense mask (True: may attend) of one clean sequence, for reference and for tests."""
-    block_of = torch.cat(
-        [torch.full(((stop - start) * tokens_per_frame,), i) for i, (start, stop) in enumerate(bounds)]
-    )
-    return block_of[:, None] >= block_of[None, :]
-
-
-def teacher_forcing_mask(bounds: Sequence[tuple[int, int]], tokens_per_frame: int) -> Bool[Tensor, "n n"]:
-    """Dense mask of the sequence ``[clean blocks 0..k-1, noisy blocks 1..k]``: the reference of the pattern below."""
-    sizes = [(stop - start) * tokens_per_frame for start, stop in bounds]
-    clean = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes[:-1])])
-    noisy = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes) if i > 0])
-    clean_to_clean = clean[:, None] >= clean[None, :]
-    clean_to_noisy = torch.zeros(len(clean), len(noisy), dtype=torch.bool)
-    noisy_to_clean = noisy[:, None] > clean[None, :]
-    noisy_to_noisy = noisy[:, None] == noisy[None, :]
-    return torch.cat(
-        (torch.cat((clean_to_clean, clean_to_noisy), dim=1), torch.cat((noisy_to_clean, noisy_to_noisy), dim=1))
-    )
 
 
 @dataclass
@@ -87,8 +56,9 @@ class FullAttention:
 
 @dataclass
 class TeacherForcingAttention:
-    """One pass over ``[clean blocks 0..k-1, noisy blocks 1..k]`` with the mask of :func:`teacher_forcing_mask`.
+    """One pass over ``[clean blocks 0..k-1, noisy blocks 1..k]``.
 
+    A clean block sees itself and the clean blocks before it; a noisy block sees itself and the clean blocks before it.
     Each block is one unmasked call on its own keys: nothing is computed only to be masked away, and no mask of
     sequence length squared exists (at full size it would hold 10^9 entries).
     """

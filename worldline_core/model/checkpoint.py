@@ -17,7 +17,8 @@ from torch import Tensor
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 from worldline_core.model.contracts import ActionContract, CausalSpec
-from worldline_core.model.world_model import WorldModel, is_text_parameter
+from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
@@ -128,17 +129,7 @@ def read_checkpoint_info(folder: Path) -> CheckpointInfo:
         CheckpointError: the file is missing, damaged, of another format, or lacks a field; the message names it.
     """
     path = folder / DESCRIPTION
-    if not path.is_file():
-        raise CheckpointError("No checkpoint here", where=folder, expected=f"a folder with {DESCRIPTION} and {WEIGHTS}")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError("The checkpoint description is not JSON", where=path, got=str(error)) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
-        got = {key: content.get(key) for key in ("format", "version")} if isinstance(content, dict) else type(content)
-        raise CheckpointError(
-            "Not a checkpoint of this version", where=path, expected={"format": FORMAT, "version": VERSION}, got=got
-        )
+    content = read_description(path, FORMAT, "checkpoint", version=VERSION)
     return _checked({key: value for key, value in content.items() if key not in ("format", "version")}, where=path)
 
 
@@ -185,23 +176,56 @@ def load_checkpoint(
     if towers == "generation":
         config = config.model_copy(update={"towers": "generation"})
     path = folder / WEIGHTS
-    if not path.is_file():
-        raise CheckpointError("The checkpoint has no weights", where=path)
-    content = path.read_bytes()
-    digest = hashlib.sha256(content).hexdigest()
-    if digest != info.weights_sha256:
-        raise CheckpointError(
-            "The weights are not those the checkpoint describes", where=path, expected=info.weights_sha256, got=digest
-        )
-    try:
-        tensors = load(content)
-    except SafetensorError as error:
-        raise CheckpointError("The weights file is damaged", where=path, got=str(error)) from error
+    tensors = read_weights(path, info.weights_sha256)
     if config.towers == "generation":
         tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     model = WorldModel(config)
     fill(model, tensors, where=path, dtype=dtype)
     return model, info
+
+
+def read_description(path: Path, form: str, noun: str, *, version: int | None = None) -> dict[str, Any]:
+    """The JSON object that describes some weights.
+
+    Args:
+        form: what its ``format`` must say.
+        noun: what it describes, for messages.
+        version: what its ``version`` must be, where it has one.
+
+    Raises:
+        CheckpointError: it is missing, damaged, or of another format or version.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"No {noun} here", where=path.parent, expected=f"a folder with {path.name}")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"The {noun} description is not JSON", where=path, got=str(error)) from error
+    found = (content.get("format"), content.get("version")) if isinstance(content, dict) else type(content)
+    if not isinstance(content, dict) or found != (form, version):
+        raise CheckpointError(f"Not a {noun} of this version", where=path, expected=(form, version), got=found)
+    return content
+
+
+def read_weights(path: Path, sha256: str | None) -> dict[str, Tensor]:
+    """The tensors of a safetensors file.
+
+    Args:
+        sha256: digest that the description gives; None where it gives none.
+
+    Raises:
+        CheckpointError: the file is missing or damaged, or holds other weights.
+    """
+    if not path.is_file():
+        raise CheckpointError("The checkpoint has no weights", where=path)
+    content = path.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    if sha256 not in (None, digest):
+        raise CheckpointError("The weights are not those that are described", where=path, expected=sha256, got=digest)
+    try:
+        return load(content)
+    except SafetensorError as error:
+        raise CheckpointError("The weights file is damaged", where=path, got=str(error)) from error
 
 
 def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object, dtype: torch.dtype) -> None:

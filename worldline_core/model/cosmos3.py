@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,17 @@ from typing import Any, Literal
 
 import torch
 from pydantic import Field, ValidationError
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, save_checkpoint
-from worldline_core.model.world_model import WorldModel, is_text_parameter
+from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.store.artifact_files import read_json
 
 CLASS_NAME = "Cosmos3OmniTransformer"
 SINGLE, INDEX = "diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.safetensors.index.json"
@@ -108,7 +110,7 @@ def load_cosmos3(
 
     Raises:
         UnavailableError: there is no such folder.
-        CheckpointError: the folder is incomplete, damaged, or holds another architecture.
+        ArtifactError: the folder is incomplete, damaged, or holds another architecture.
     """
     root = folder / "transformer" if (folder / "transformer").is_dir() else folder
     if not (root / "config.json").is_file():
@@ -118,45 +120,32 @@ def load_cosmos3(
             expected="a diffusers folder with config.json and *.safetensors",
             next_step="download nvidia/Cosmos3-Nano in diffusers format and give its folder",
         )
-    raw = _read_json(root / "config.json")
+    raw = read_json(root / "config.json")
     config = config_from_diffusers(raw, where=root / "config.json", fps=fps)
     config = WorldModelConfig.model_validate(config.model_dump() | {"towers": towers} | dict(changes or {}))
     tensors = _read_tensors(root)
-    ignored = sorted(name for name in tensors if name.startswith(UNUSED_PARAMETERS))
-    if towers == "generation":
-        ignored = sorted({*ignored, *(name for name in tensors if is_text_parameter(name))})
-    kept = {name: tensor for name, tensor in tensors.items() if name not in set(ignored)}
+    without_text = towers == "generation"
+    ignored = {
+        name for name in tensors if name.startswith(UNUSED_PARAMETERS) or (without_text and is_text_parameter(name))
+    }
+    kept = {name: tensor for name, tensor in tensors.items() if name not in ignored}
     model = WorldModel(config)
     own = model.state_dict()
     new = sorted(name for name in own if name.startswith("action_encoder.") or name == "view_embedding")
     fill(model, kept | {name: own[name] for name in new}, where=root, dtype=dtype)
-    return model, Cosmos3Report(tuple(ignored), tuple(new))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError("Not valid JSON", where=path, got=str(error)) from error
-    if not isinstance(content, dict):
-        raise CheckpointError("Not a JSON object", where=path, got=type(content).__name__)
-    return content
+    return model, Cosmos3Report(tuple(sorted(ignored)), tuple(new))
 
 
 def _read_tensors(root: Path) -> dict[str, Tensor]:
+    names = [SINGLE]
     if (root / INDEX).is_file():
-        names = sorted(set(_read_json(root / INDEX).get("weight_map", {}).values()))
-    else:
-        names = [SINGLE]
+        names = sorted(set(read_json(root / INDEX).get("weight_map", {}).values()))
     tensors: dict[str, Tensor] = {}
-    for name in names:
-        path = root / Path(name).name
+    for path in (root / Path(name).name for name in names):
         if not path.is_file():
             raise CheckpointError("A weight file is missing", where=path, next_step="download the folder again")
         try:
-            with safe_open(path, framework="pt") as shard:
-                for key in shard.keys():  # noqa: SIM118 - safe_open is not iterable
-                    tensors[key] = shard.get_tensor(key)
+            tensors |= load_file(path)
         except SafetensorError as error:
             raise CheckpointError("A weight file is damaged", where=path, got=str(error)) from error
     return tensors
@@ -177,7 +166,7 @@ def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], ou
 
     Raises:
         UnavailableError: there are no weights in the folder.
-        CheckpointError: the folder is damaged, or holds another architecture.
+        ArtifactError: the folder is damaged, or holds another architecture.
     """
     dtype = {"bfloat16": torch.bfloat16, "float16": torch.float16}[config.dtype]
     model, report = load_cosmos3(inputs["diffusers"], fps=config.fps, changes=config.changes, dtype=dtype)

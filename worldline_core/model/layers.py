@@ -1,8 +1,8 @@
 """Layers of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
-Also the sinusoidal time embedding, added to noisy tokens only, and the action encoder, which turns action maps into
-token residuals (docs/method.md). Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state
-dict loads directly.
+Also what stands at both ends: the sinusoidal time embedding, added to noisy tokens only; the action encoder, which
+turns action maps into token residuals (docs/method.md); and the velocity that follows from what the head emits. Module
+names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.rope import Rotation, rotate
 from worldline_core.model.world_model_config import WorldModelConfig
 
@@ -147,34 +147,48 @@ class MixtureLayer(nn.Module):
 
     def forward(
         self,
-        generation: Tensor | None,
-        attend: GenerationAttention | None,
+        tokens: Float[Tensor, "b n d"],
+        attend: GenerationAttention,
         layer: int,
-        *,
-        understanding: Tensor | None = None,
-        text_rotation: Rotation | None = None,
         text: tuple[Tensor, Tensor] | None = None,
-    ) -> tuple[Tensor | None, Tensor | None, tuple[Tensor, Tensor] | None]:
-        """Advance either half or both.
+    ) -> Float[Tensor, "b n d"]:
+        """Advance the video tokens.
 
         Args:
-            generation: video tokens ``(b n d)``, or None to read text only.
-            attend: attention pattern of the video tokens.
-            understanding: text tokens ``(b m d)``; their keys and values then serve the video of this layer.
-            text: keys and values of the text, when they were computed before.
-
-        Returns:
-            video tokens, text tokens, and the text keys and values of this layer.
+            attend: how they look at each other.
+            text: keys and values of the text in this layer, from `understand`.
         """
-        if understanding is not None and text_rotation is not None:
-            mixed, text = self.self_attn.understand(self.input_layernorm(understanding), text_rotation)
-            understanding = understanding + mixed
-            understanding = understanding + self.mlp(self.post_attention_layernorm(understanding))
-        if generation is not None and attend is not None:
-            normalised = self.input_layernorm_moe_gen(generation)
-            generation = generation + self.self_attn.generate(normalised, attend, layer, text)
-            generation = generation + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(generation))
-        return generation, understanding, text
+        tokens = tokens + self.self_attn.generate(self.input_layernorm_moe_gen(tokens), attend, layer, text)
+        return tokens + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(tokens))
+
+    def understand(
+        self, tokens: Float[Tensor, "b m d"], by: Rotation
+    ) -> tuple[Float[Tensor, "b m d"], tuple[Tensor, Tensor]]:
+        """Advance the text tokens; also returns their keys and values, which the video tokens of this layer read."""
+        mixed, read = self.self_attn.understand(self.input_layernorm(tokens), by)
+        tokens = tokens + mixed
+        return tokens + self.mlp(self.post_attention_layernorm(tokens)), read
+
+
+TEXT_PARAMETERS = (
+    "embed_tokens.",
+    "norm.",
+    ".to_q.",
+    ".to_k.",
+    ".to_v.",
+    ".to_out.",
+    ".norm_q.",
+    ".norm_k.",
+    ".mlp.",
+    ".input_layernorm.",
+    ".post_attention_layernorm.",
+)
+"""Name parts of the understanding tower's parameters; everything else belongs to the generation tower."""
+
+
+def is_text_parameter(name: str) -> bool:
+    """Whether a parameter belongs to the understanding (text) tower."""
+    return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
 
 
 CHANNELS = 256
@@ -214,10 +228,6 @@ class ActionEncoder(nn.Module):
         self.patch_size = patch_size
         self.conv = nn.Conv3d(channels, channels, kernel_size=(1, 3, 3), padding=(0, 1, 1))
         self.proj = nn.Linear(channels * patch_size**2, hidden_size)
-        self.reset_output()
-
-    def reset_output(self) -> None:
-        """Set the last layer to zero."""
         nn.init.zeros_(self.proj.weight)
         nn.init.zeros_(self.proj.bias)
 
@@ -241,3 +251,40 @@ class ActionEncoder(nn.Module):
             q=self.patch_size,
         )
         return self.proj(patches)
+
+
+def velocity_of(
+    config: WorldModelConfig, emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor | None
+) -> Tensor:
+    """Velocity under the config's ``prediction``; in float32 where clean latents are emitted.
+
+    Args:
+        emitted: output of the head, ``(b v c t h w)``.
+        sigma: noise level, broadcastable to ``emitted``.
+        reference: clean latents of the first frame, ``(b v c 1 h w)``.
+
+    Raises:
+        ConfigError: residuals to the first frame are predicted, but there is none.
+    """
+    if config.prediction == "velocity":
+        return emitted
+    emitted, noisy = emitted.float(), noisy.float()
+    if config.prediction == "first_frame_residual":
+        if reference is None:
+            raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
+        if config.first_frame_std is not None:
+            return preconditioned_velocity(emitted, noisy, sigma, reference.float(), config.first_frame_std)
+        emitted = emitted + reference.float()
+    return (noisy - emitted) / sigma.clamp_min(config.minimum_sigma)
+
+
+def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor, std: float) -> Tensor:
+    """Velocity of the posterior mean under z ~ N(reference, std^2), corrected by ``emitted`` posterior deviations.
+
+    With D = (1 - sigma)^2 std^2 + sigma^2 the posterior of z given the noisy latents has the mean
+    ``reference + (1 - sigma) std^2 / D (noisy - (1 - sigma) reference)`` and the deviation ``sigma std / sqrt(D)``.
+    ``(noisy - z) / sigma`` then has no division by sigma left.
+    """
+    spread = (1 - sigma) ** 2 * std**2 + sigma**2
+    mean = ((sigma - (1 - sigma) * std**2) * noisy - sigma * reference) / spread
+    return mean - std * emitted * spread.rsqrt()

@@ -10,7 +10,7 @@ decoder sharpens, and copies what still equals the observed frame.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +19,17 @@ import torch.nn.functional as F
 from einops import rearrange, repeat
 from jaxtyping import Float
 from pydantic import Field, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.model.checkpoint import fill
-from worldline_core.model.video_tokenizer import (
-    DESCRIPTION,
-    FORMAT,
-    WEIGHTS,
-    check_latents,
-    check_video,
-    read_description,
-)
+from worldline_core.model.checkpoint import fill, read_description, read_weights
+from worldline_core.model.video_tokenizer import check_latents, check_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+
+DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"
+FORMAT, VERSION = "worldline.tokenizer", 1
 
 
 class _Residual(nn.Module):
@@ -130,6 +125,7 @@ class PatchTokenizer(nn.Module):
             self.temporal_compression, self.config.refinement_width, self.config.refinement_depth
         )
         self.metadata: dict[str, Any] = {}
+        self.weights_sha256 = ""
 
     @property
     def encoder_digest(self) -> str:
@@ -205,11 +201,7 @@ class PatchTokenizer(nn.Module):
         groups = rearrange(coarse[:, :, 1:], "b c (n g) h w -> b n g c h w", g=time)
         groups = torch.cat((first[:, None], groups), dim=1)
         count = groups.shape[1]
-        known = (
-            torch.ones(batch, device=coarse.device)
-            if reference is not None
-            else torch.zeros(batch, device=coarse.device)
-        )
+        known = torch.full((batch,), float(reference is not None), device=coarse.device)
         reference = coarse[:, :, 0] if reference is None else reference.to(coarse.dtype)
         refined = self.refinement(
             rearrange(groups, "b n g c h w -> (b n) g c h w"),
@@ -233,7 +225,7 @@ class PatchTokenizer(nn.Module):
             folder / DESCRIPTION,
             {
                 "format": FORMAT,
-                "version": 1,
+                "version": VERSION,
                 "kind": self.KIND,
                 "config": self.config.model_dump(mode="json"),
                 "metadata": dict(self.metadata if metadata is None else metadata),
@@ -248,29 +240,96 @@ class PatchTokenizer(nn.Module):
         Raises:
             CheckpointError: the folder is incomplete, damaged, or of another kind.
         """
-        content = read_description(folder)
+        path = folder / DESCRIPTION
+        content = read_description(path, FORMAT, "tokenizer", version=VERSION)
         if content.get("kind") != cls.KIND:
-            raise CheckpointError("Not a patch tokenizer", where=folder, expected=cls.KIND, got=content.get("kind"))
+            raise CheckpointError("Unknown kind of tokenizer", where=path, expected=cls.KIND, got=content.get("kind"))
         try:
             tokenizer = cls(PatchTokenizerConfig.model_validate(content.get("config")))
         except ValidationError as error:
-            raise CheckpointError("The tokenizer's config is not valid", where=folder, got=str(error)) from error
-        path = folder / WEIGHTS
-        if not path.is_file():
-            raise CheckpointError("The tokenizer has no weights", where=path)
-        raw = path.read_bytes()
-        digest = hashlib.sha256(raw).hexdigest()
-        if digest != content.get("weights_sha256"):
-            raise CheckpointError(
-                "The weights are not those the tokenizer describes",
-                where=path,
-                expected=content.get("weights_sha256"),
-                got=digest,
-            )
-        try:
-            tensors = load(raw)
-        except SafetensorError as error:
-            raise CheckpointError("The weights file is damaged", where=path, got=str(error)) from error
-        fill(tokenizer, tensors, where=path, dtype=torch.float32)
+            raise CheckpointError("The tokenizer's config is not valid", where=path, got=str(error)) from error
+        weights = folder / WEIGHTS
+        fill(tokenizer, read_weights(weights, content["weights_sha256"]), where=weights, dtype=torch.float32)
         tokenizer.metadata = dict(content.get("metadata", {}))
+        tokenizer.weights_sha256 = content["weights_sha256"]
         return tokenizer.eval().requires_grad_(False)
+
+
+def fit_patch_tokenizer(
+    clips: Iterable[Float[Tensor, "b 3 t h w"]],
+    *,
+    channels: int = 32,
+    spatial: int = 8,
+    temporal: int = 4,
+    motion_weight: float = 4.0,
+    whitening: float = 0.5,
+    refinement_width: int = 48,
+    refinement_depth: int = 2,
+) -> PatchTokenizer:
+    """Fit the linear part to clips of ``1 + k * temporal`` frames in [-1, 1]: principal components of patches.
+
+    Static and motion components lie in orthogonal subspaces, so the best ``channels`` of the two spectra together are
+    the best basis of this form; how many are static follows from the data.
+
+    Args:
+        motion_weight: extra weight of patches that differ from the clip's first frame (arms and what they move).
+        whitening: 0 divides all channels by one number, 1 each by its standard deviation, in between by that power of
+            it. Always followed by one number, so that latents have unit variance over all channels of a group.
+
+    Raises:
+        DataError: there are no clips.
+    """
+    pixels = 3 * spatial**2
+    static = torch.zeros(pixels, pixels, dtype=torch.float64)
+    motion = torch.zeros(temporal * pixels, temporal * pixels, dtype=torch.float64)
+    total, total_weight = torch.zeros(pixels, dtype=torch.float64), 0.0
+    for video in clips:
+        patches = rearrange(video.float(), "b c t (h p) (w q) -> b t (h w) (c p q)", p=spatial, q=spatial)
+        groups = rearrange(patches[:, 1:], "b (n g) s d -> b n s g d", g=temporal)
+        means = groups.mean(dim=3)
+        change = (groups - rearrange(patches[:, 0], "b s d -> b 1 s 1 d")).abs().mean(dim=(3, 4))
+        weight = rearrange(1.0 + motion_weight * (change > 0.05).float(), "b n s -> (b n s) 1")
+        flat = rearrange(means, "b n s d -> (b n s) d")
+        moving = rearrange(groups - rearrange(means, "b n s d -> b n s 1 d"), "b n s g d -> (b n s) (g d)")
+        static += ((flat * weight).T @ flat).double()
+        motion += ((moving * weight).T @ moving).double()
+        total += (flat * weight).sum(dim=0).double()
+        total_weight += float(weight.double().sum())
+    if total_weight == 0:
+        raise DataError("No clips to fit the tokenizer to", next_step="check the selection of episodes")
+    mean = total / total_weight
+    # Eigenvalues and eigenvectors in falling order.
+    static_values, static_vectors = (
+        part.flip(-1) for part in torch.linalg.eigh(static / total_weight - torch.outer(mean, mean))
+    )
+    motion_values, motion_vectors = (part.flip(-1) for part in torch.linalg.eigh(motion / total_weight))
+    # A static vector stands for `temporal` equal frames: its energy in pixels is that many times its variance.
+    energies = torch.cat((static_values * temporal, motion_values[: channels - 1]))
+    static_count = int((torch.argsort(energies, descending=True)[:channels] < pixels).sum())
+    motion_count = channels - static_count
+    tokenizer = PatchTokenizer(
+        PatchTokenizerConfig(
+            static_channels=static_count,
+            motion_channels=motion_count,
+            spatial_compression=spatial,
+            temporal_compression=temporal,
+            refinement_width=refinement_width,
+            refinement_depth=refinement_depth,
+        )
+    )
+    kept = torch.cat((static_values[:static_count] * temporal, motion_values[:motion_count]))
+    deviation = kept.clamp_min(1e-12).sqrt()
+    scale = deviation**whitening
+    scale = scale * ((deviation / scale) ** 2).mean().sqrt()
+    scale[:static_count] /= temporal**0.5
+    tokenizer.mean.copy_(mean)
+    tokenizer.static_basis.copy_(_signed(static_vectors[:, :static_count].T))
+    tokenizer.motion_basis.copy_(_signed(motion_vectors[:, :motion_count].T))
+    tokenizer.scale.copy_(scale)
+    return tokenizer
+
+
+def _signed(basis: Float[Tensor, "k d"]) -> Float[Tensor, "k d"]:
+    """Eigenvectors have no sign of their own; make the largest entry positive, so that equal data give equal bases."""
+    largest = basis.gather(1, basis.abs().argmax(dim=1, keepdim=True))
+    return basis * torch.where(largest < 0, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Interleaved three-axis rotary positions (time, height, width), with one height slot a view.
+"""Interleaved three-axis rotary positions (time, height, width), with one height slot per view.
 
 Axis order of a video sequence everywhere in this package: ``(t v h w)``.
 """

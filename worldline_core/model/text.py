@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Int
 from pydantic import Field
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
@@ -25,7 +26,7 @@ VISION_START = "<|vision_start|>"
 
 @dataclass(frozen=True)
 class ClipFacts:
-    """What a prompt says of its clip: frames, frames a second as they are shown, (height, width) in pixels."""
+    """What a prompt says of its clip: frames, frames per second as they are shown, (height, width) in pixels."""
 
     num_frames: int
     fps: float
@@ -43,6 +44,12 @@ def video_prompt(instruction: str, clip: ClipFacts) -> str:
     for fact in facts:
         text = f"{text.rstrip('.')}. {fact}" if text else fact
     return text
+
+
+def padded(texts: Sequence[Sequence[int]], padding: int) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
+    """Ids of all texts, the shorter ones filled up on the right, and a mask that is True on real tokens."""
+    real = pad_sequence([torch.ones(len(ids), dtype=torch.bool) for ids in texts], batch_first=True)
+    return pad_sequence([torch.tensor(ids) for ids in texts], batch_first=True, padding_value=padding), real
 
 
 class Cosmos3Text:
@@ -92,7 +99,7 @@ class Cosmos3Text:
             ConfigError: not even a prompt without an instruction fits ``max_length``.
         """
         ids = self._prompt_ids(instruction, clip)
-        if self.max_length is None or len(ids) <= self.max_length:
+        if self.max_length is None:
             return ids
         words = instruction.split()
         while words and len(ids) > self.max_length:
@@ -119,14 +126,7 @@ class Cosmos3Text:
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
     ) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b m"]]:
         """Ids of every clip's prompt."""
-        coded = [self.ids(text, clip) for text, clip in zip(texts, clips, strict=True)]
-        length = max(len(row) for row in coded)
-        ids = torch.full((len(coded), length), self._ending[0], dtype=torch.long)
-        mask = torch.zeros(len(coded), length, dtype=torch.bool)
-        for row, values in enumerate(coded):
-            ids[row, : len(values)] = torch.tensor(values)
-            mask[row, : len(values)] = True
-        return ids, mask
+        return padded([self.ids(text, clip) for text, clip in zip(texts, clips, strict=True)], self._ending[0])
 
 
 BYTE_OFFSET = 2
@@ -164,15 +164,8 @@ class ByteText:
         self, texts: Sequence[str], clips: Sequence[ClipFacts]
     ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
         """Ids of the texts alone."""
-        coded = [
-            [byte + BYTE_OFFSET for byte in text.lower().strip().encode()[: self.max_length - 1]] + [END_OF_TEXT]
-            for text in texts
-        ]
-        length = max(len(ids) for ids in coded)
-        ids = torch.zeros(len(coded), length, dtype=torch.long)
-        for row, values in zip(ids, coded, strict=True):
-            row[: len(values)] = torch.tensor(values)
-        return ids, ids != 0
+        cut = [text.lower().strip().encode()[: self.max_length - 1] for text in texts]
+        return padded([[*(byte + BYTE_OFFSET for byte in text), END_OF_TEXT] for text in cut], 0)
 
 
 def load_text_encoder(config: TextConfig, vocabulary_size: int) -> TextEncoder:
@@ -183,13 +176,12 @@ def load_text_encoder(config: TextConfig, vocabulary_size: int) -> TextEncoder:
         UnavailableError: there is no tokenizer at ``path``.
         CheckpointError: the tokenizer there is not a Cosmos3 model's.
     """
-    if config.kind == "cosmos3" and config.path is None:
+    if config.kind == "bytes":
+        encoder = ByteText(config.max_length)
+    elif config.path is None:
         raise ConfigError("The backbone's text tokenizer needs a folder.", where="text.path", expected="a path")
-    encoder = (
-        ByteText(config.max_length)
-        if config.path is None or config.kind == "bytes"
-        else Cosmos3Text(Path(config.path), max_length=config.max_length)
-    )
+    else:
+        encoder = Cosmos3Text(Path(config.path), max_length=config.max_length)
     if vocabulary_size < encoder.vocabulary_size:
         raise ConfigError(
             "The model's vocabulary is too small for this text.",

@@ -7,9 +7,7 @@ Axis legend: b batch, c channel, t frame, h w pixels; ``_l`` marks the latent gr
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -18,10 +16,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.errors import CheckpointError, DataError
-
-DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"
-FORMAT = "worldline.tokenizer"
+from worldline_core.errors import DataError
 
 
 @runtime_checkable
@@ -71,24 +66,6 @@ def check_latents(tokenizer: VideoTokenizer, latents: Tensor) -> None:
     if latents.ndim != 5 or latents.shape[1] != tokenizer.latent_channels:
         expected = f"(b, {tokenizer.latent_channels}, t, h, w)"
         raise DataError("Not latents of this tokenizer", expected=expected, got=tuple(latents.shape))
-
-
-def read_description(folder: Path) -> dict[str, Any]:
-    """The ``tokenizer.json`` of a folder.
-
-    Raises:
-        CheckpointError: it is missing, damaged, or of another format.
-    """
-    path = folder / DESCRIPTION
-    if not path.is_file():
-        raise CheckpointError("No tokenizer here", where=folder, expected=f"a folder with {DESCRIPTION}")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError("The tokenizer description is not JSON", where=path, got=str(error)) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise CheckpointError("Not a tokenizer", where=path, expected=FORMAT, got=content)
-    return content
 
 
 def resize_frame(frame: np.ndarray, size: tuple[int, int], *, out: np.ndarray) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from einops import rearrange, repeat
@@ -29,87 +28,17 @@ from worldline_core.model.block_causal_attention import (
     TeacherForcingAttention,
     block_bounds,
 )
-from worldline_core.model.layers import ActionEncoder, GenerationAttention, MixtureLayer, RMSNorm, TimeEmbedder
+from worldline_core.model.layers import (
+    ActionEncoder,
+    GenerationAttention,
+    MixtureLayer,
+    RMSNorm,
+    TimeEmbedder,
+    is_text_parameter,
+    velocity_of,
+)
 from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
 from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
-
-
-def velocity_of(
-    config: WorldModelConfig, emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor | None
-) -> Tensor:
-    """Velocity under the config's ``prediction``; in float32 where clean latents are emitted.
-
-    Args:
-        emitted: output of the head, ``(b v c t h w)``.
-        sigma: noise level, broadcastable to ``emitted``.
-        reference: clean latents of the first frame, ``(b v c 1 h w)``.
-
-    Raises:
-        ConfigError: residuals to the first frame are predicted, but there is none.
-    """
-    if config.prediction == "velocity":
-        return emitted
-    emitted, noisy = emitted.float(), noisy.float()
-    if config.prediction == "first_frame_residual":
-        if reference is None:
-            raise ConfigError("The cache holds no first frame", next_step="write the observed frame first")
-        if config.first_frame_std is not None:
-            return preconditioned_velocity(emitted, noisy, sigma, reference.float(), config.first_frame_std)
-        emitted = emitted + reference.float()
-    return (noisy - emitted) / sigma.clamp_min(config.minimum_sigma)
-
-
-def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, reference: Tensor, std: float) -> Tensor:
-    """Velocity of the posterior mean under z ~ N(reference, std^2), corrected by ``emitted`` posterior deviations.
-
-    With D = (1 - sigma)^2 std^2 + sigma^2 the posterior of z given the noisy latents has the mean
-    ``reference + (1 - sigma) std^2 / D (noisy - (1 - sigma) reference)`` and the deviation ``sigma std / sqrt(D)``.
-    ``(noisy - z) / sigma`` then has no division by sigma left.
-    """
-    spread = (1 - sigma) ** 2 * std**2 + sigma**2
-    mean = ((sigma - (1 - sigma) * std**2) * noisy - sigma * reference) / spread
-    return mean - std * emitted * spread.rsqrt()
-
-
-TEXT_PARAMETERS = (
-    "embed_tokens.",
-    "norm.",
-    ".to_q.",
-    ".to_k.",
-    ".to_v.",
-    ".to_out.",
-    ".norm_q.",
-    ".norm_k.",
-    ".mlp.",
-    ".input_layernorm.",
-    ".post_attention_layernorm.",
-)
-"""Name parts of the understanding tower's parameters; everything else belongs to the generation tower."""
-
-
-def is_text_parameter(name: str) -> bool:
-    """Whether a parameter belongs to the understanding (text) tower."""
-    return name.startswith(TEXT_PARAMETERS[:2]) or any(part in name for part in TEXT_PARAMETERS[2:])
-
-
-def initialise(model: nn.Module, num_layers: int, generator: torch.Generator | None = None) -> None:
-    """Starting values of a :class:`~worldline_core.model.world_model.WorldModel` that is trained from scratch.
-
-    Matrices get normals of one over the square root of their fan-in, those that write to the residual stream less
-    by the square root of twice the depth. The head, the action branch's output and the view vectors start at zero.
-    """
-    residual = (2 * num_layers) ** -0.5
-    for name, parameter in model.named_parameters():
-        if name.startswith(("proj_out.", "action_encoder.proj.", "view_embedding")):
-            nn.init.zeros_(parameter)
-        elif parameter.ndim < 2:
-            nn.init.constant_(parameter, 1.0 if "norm" in name else 0.0)
-        else:
-            small = name.startswith(("action_encoder.conv", "embed_tokens"))
-            std = 0.02 if small else parameter[0].numel() ** -0.5
-            if name.endswith(("to_add_out.weight", "to_out.weight", "down_proj.weight")):
-                std *= residual
-            nn.init.normal_(parameter, 0.0, std, generator=generator)
 
 
 @dataclass(frozen=True)
@@ -150,8 +79,23 @@ class WorldModel(nn.Module):
         self.gradient_checkpointing = False
 
     def initialise(self, generator: torch.Generator | None = None) -> None:
-        """Weights for training from scratch: small normals, residual outputs scaled by depth, head and actions zero."""
-        initialise(self, self.config.num_layers, generator)
+        """Starting values for training from scratch.
+
+        Matrices get normals of one over the square root of their fan-in, those that write to the residual stream less
+        by the square root of twice the depth. The head, the action branch's output and the view vectors start at zero.
+        """
+        residual = (2 * self.config.num_layers) ** -0.5
+        for name, parameter in self.named_parameters():
+            if name.startswith(("proj_out.", "action_encoder.proj.", "view_embedding")):
+                nn.init.zeros_(parameter)
+            elif parameter.ndim < 2:
+                nn.init.constant_(parameter, 1.0 if "norm" in name else 0.0)
+            else:
+                small = name.startswith(("action_encoder.conv", "embed_tokens"))
+                std = 0.02 if small else parameter[0].numel() ** -0.5
+                if name.endswith(("to_add_out.weight", "to_out.weight", "down_proj.weight")):
+                    std *= residual
+                nn.init.normal_(parameter, 0.0, std, generator=generator)
 
     def generation_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """What Stage II trains besides the action branch (docs/method.md section 4)."""
@@ -187,8 +131,8 @@ class WorldModel(nn.Module):
         by = (rearrange(by[0], "b n d -> b 1 n d"), rearrange(by[1], "b n d -> b 1 n d"))
         tokens = self.embed_tokens(text_ids)
         contexts = []
-        for index, layer in enumerate(self.layers):
-            _, tokens, context = layer(None, None, index, understanding=tokens, text_rotation=by)
+        for layer in self.layers:
+            tokens, context = layer.understand(tokens, by)
             contexts.append(context)
         padded = text_mask is not None and not bool(text_mask.all())
         return TextContext(tuple(contexts), text_mask.bool() if padded and text_mask is not None else None, size)
@@ -399,10 +343,9 @@ class WorldModel(nn.Module):
         for index, layer in enumerate(self.layers):
             context = None if text is None else text.layers[index]
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                advanced: Any = checkpoint(layer, tokens, attend, index, text=context, use_reentrant=False)
-                tokens = advanced[0]
+                tokens = checkpoint(layer, tokens, attend, index, context, use_reentrant=False)
             else:
-                tokens, _, _ = layer(tokens, attend, index, text=context)
+                tokens = layer(tokens, attend, index, context)
             if features_at == index + 1:
                 features = tokens
         return self.norm_moe_gen(tokens), features

@@ -32,7 +32,7 @@ class WorldModelConfig(StrictModel):
     rope_theta: float = Field(default=100.0, gt=1)
     """Small grids need high frequencies: with 5e6 most of them would not turn over 4 x 6 patches."""
     fps: float | None = Field(default=None, gt=0)
-    """When given, temporal positions advance by ``base_fps / fps`` a latent frame (Cosmos3's fps modulation)."""
+    """When given, temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation)."""
     base_fps: float = Field(default=24.0, gt=0)
     temporal_margin: float = Field(default=16.0, ge=0)
     """Gap on the temporal axis between the last text token and the first video token."""
@@ -45,7 +45,7 @@ class WorldModelConfig(StrictModel):
     spatial_compression: int = Field(default=8, ge=1)
     """Pixels a latent cell covers; only used to read offsets given in pixels."""
     view_embedding: bool = True
-    """A learned, zero-initialised vector a view. Not in Cosmos3 (a pretrained model keeps it off): RoPE tells a token
+    """A learned, zero-initialised vector per view. Not in Cosmos3 (a pretrained model keeps it off): RoPE tells a token
     where the others are, never where it is itself, which a small model trained from scratch learns slowly."""
 
     towers: Literal["both", "generation"] = "both"

@@ -157,7 +157,7 @@ _STEPS = (
     Step(
         "train_teacher",
         1,
-        "worldline_core.training.small_teacher",
+        "worldline_core.training.train_teacher",
         "train_teacher",
         "TeacherConfig",
         ("episodes",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from worldline_core.actions.action_maps import TEMPORAL_FACTOR
-from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
@@ -70,14 +71,43 @@ class RolloutConfig(StrictModel):
 
 
 @dataclass(frozen=True)
-class Job:
-    """One prediction: an episode, whose controls drive it, a seed, and how many frames it gets."""
+class Prediction:
+    """One video of every view to make: of an episode, driven by the controls of one, with a seed and a length."""
 
     position: int
     episode_id: str
     controls_of: str
     seed: int
     frames: int
+
+
+class FirstFrameCopy:
+    """The baseline: every predicted frame is the observed one, at the size of the recordings."""
+
+    steps = causal = None
+    frames_per_unit = TEMPORAL_FACTOR
+    block_seconds = ()
+
+    def __init__(self, episodes: EpisodeSet) -> None:
+        self.views = tuple(episodes.rows[0].views)
+        height, width = episodes.frames(0, self.views[0], [0]).shape[1:3]
+        self.image_size = (height, width)
+
+    def predict_batch(
+        self,
+        images: Float[Tensor, "b v 3 h w"],
+        tracks: Sequence[EpisodeTracks],
+        frames: Sequence[int],
+        seeds: Sequence[int],
+        *,
+        without_actions: bool = False,
+    ) -> list[dict[str, np.ndarray]]:
+        """As :meth:`WorldLine.predict_batch`; the controls and seeds play no part."""
+        del tracks, seeds, without_actions
+        return [
+            {view: np.repeat(video_to_frames(first[v, :, None]), count, axis=0) for v, view in enumerate(self.views)}
+            for first, count in zip(images, frames, strict=True)
+        ]
 
 
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -102,59 +132,54 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
     tracks = ActionTracks.open(Path(inputs["tracks"]))
     chosen = choose_episodes(config, episodes)
-    world = _load(config, inputs, episodes, tracks)
-    jobs = plan_jobs(config, episodes, tracks, chosen, TEMPORAL_FACTOR if world is None else world.frames_per_unit)
-    views, image_size = _form(world, episodes)
+    copying = config.sampler == "copy_first_frame"
+    world = FirstFrameCopy(episodes) if copying else _load(config, inputs, episodes, tracks)
+    planned = plan_predictions(config, episodes, tracks, chosen, world.frames_per_unit)
     writer = RolloutSetWriter(output, config.method, float(episodes.rows[0].fps), crf=config.crf)
     speed, first = SpeedLog(output / "run"), True
-    for batch in tqdm(list(batches(jobs, config.batch_size)), desc=f"rollout {config.method}", disable=None):
-        if all(writer.has(job.episode_id, job.seed, views) for job in batch):
-            for job in batch:
-                for view in views:
-                    writer.register(job.episode_id, job.seed, view, job.frames, image_size)
+    for batch in tqdm(list(batches(planned, config.batch_size)), desc=f"rollout {config.method}", disable=None):
+        if all(writer.has(item.episode_id, item.seed, world.views) for item in batch):
+            for item in batch:
+                for view in world.views:
+                    writer.register(item.episode_id, item.seed, view, item.frames, world.image_size)
             continue
-        predictions, elapsed = timed(partial(_predict, config, world, episodes, tracks, batch), config.device)
-        made = sum(job.frames for job in batch)
-        blocks = () if world is None else tuple(world.block_seconds)
-        speed.add(BatchTime(len(batch), made, elapsed.wall, blocks, first))
+        videos, elapsed = timed(partial(_predict, config, world, episodes, tracks, batch), config.device)
+        frames = sum(item.frames for item in batch)
+        speed.add(BatchTime(len(batch), frames, elapsed.wall, tuple(world.block_seconds), first))
         first = False
-        for job, frames in zip(batch, predictions, strict=True):
-            writer.add(job.episode_id, job.seed, frames)
+        for item, video in zip(batch, videos, strict=True):
+            writer.add(item.episode_id, item.seed, video)
     writer.close()
     facts: dict[str, Any] = {
-        "steps": None if world is None else world.steps,
+        "steps": world.steps,
         "batch_size": config.batch_size,
         "device": config.device,
         "device_name": device_name(config.device),
         "dtype": "bfloat16" if config.bfloat16 else "float32",
     }
-    if config.timed_blocks and world is not None:
-        job = jobs[0]
-        encoded = world.encode(_observed(world, episodes, [job]), [tracks.tracks(job.controls_of)], [job.frames])
-        times = world.time_blocks(*encoded, [job.seed], config.timed_blocks)
+    if config.timed_blocks and isinstance(world, WorldLine):
+        item = planned[0]
+        encoded = world.encode(_observed(world, episodes, [item]), [tracks.tracks(item.controls_of)], [item.frames])
+        times = world.time_blocks(*encoded, [item.seed], config.timed_blocks)
         facts["long_rollout"] = long_rollout(times, config.device)
     speed.close(facts)
     return {
         "method": config.method,
         "episodes": len(chosen),
-        "predictions": len(jobs),
-        "frames": sum(job.frames for job in jobs),
-        "checkpoint_kind": None if world is None else world.info.kind,
-        "steps": facts["steps"],
-        "recent_blocks": None if world is None or world.causal is None else world.causal.recent_blocks,
+        "predictions": len(planned),
+        "frames": sum(item.frames for item in planned),
+        "checkpoint_kind": world.info.kind if isinstance(world, WorldLine) else None,
+        "steps": world.steps,
+        "recent_blocks": None if world.causal is None else world.causal.recent_blocks,
     }
 
 
-def _load(
-    config: RolloutConfig, inputs: Mapping[str, Path], episodes: EpisodeSet, tracks: ActionTracks
-) -> WorldLine | None:
-    """The model, where one is needed, for these recordings.
+def _load(config: RolloutConfig, inputs: Mapping[str, Path], episodes: EpisodeSet, tracks: ActionTracks) -> WorldLine:
+    """The model for these recordings.
 
     Raises:
         CheckpointError: it is of the wrong kind for the sampler, or was trained with other controls.
     """
-    if config.sampler == "copy_first_frame":
-        return None
     world = WorldLine.from_pretrained(
         Path(inputs["checkpoint"]),
         tokenizer=Path(inputs["tokenizer"]),
@@ -170,61 +195,48 @@ def _load(
     return world
 
 
-def _form(world: WorldLine | None, episodes: EpisodeSet) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Views and image size (H, W) of the predictions: the model's, or where frames are copied the recordings'."""
-    if world is not None:
-        return world.views, world.image_size
-    views = tuple(episodes.rows[0].views)
-    recorded = episodes.frames(0, views[0], [0]).shape
-    return views, (recorded[1], recorded[2])
-
-
-def _observed(world: WorldLine | None, episodes: EpisodeSet, batch: Sequence[Job]) -> Float[Tensor, "b v 3 h w"]:
+def _observed(
+    world: WorldLine | FirstFrameCopy, episodes: EpisodeSet, batch: Sequence[Prediction]
+) -> Float[Tensor, "b v 3 h w"]:
     """First frames of every view in [-1, 1].
 
     Raises:
         DataError: an episode lacks a view.
     """
-    views, image_size = _form(world, episodes)
     firsts = []
-    for job in batch:
-        row = episodes.rows[job.position]
-        if not set(views) <= set(row.views):
+    for item in batch:
+        row = episodes.rows[item.position]
+        if not set(world.views) <= set(row.views):
             raise DataError(
-                "An episode lacks views the model needs", where=job.episode_id, expected=views, got=row.views
+                "An episode lacks views the model needs", where=item.episode_id, expected=world.views, got=row.views
             )
-        frames = [episodes.frames(job.position, view, [0]) for view in views]
-        firsts.append(torch.stack([frames_to_video(frame, image_size)[:, 0] for frame in frames]))
+        frames = [episodes.frames(item.position, view, [0]) for view in world.views]
+        firsts.append(torch.stack([frames_to_video(frame, world.image_size)[:, 0] for frame in frames]))
     return torch.stack(firsts)
 
 
 def _predict(
     config: RolloutConfig,
-    world: WorldLine | None,
+    world: WorldLine | FirstFrameCopy,
     episodes: EpisodeSet,
     tracks: ActionTracks,
-    batch: Sequence[Job],
+    batch: Sequence[Prediction],
 ) -> list[dict[str, np.ndarray]]:
-    """Predicted frames of every view of every job, the observed frame first.
+    """Predicted frames of every view, the observed frame first.
 
     Raises:
         CheckpointError: the model was trained with other controls than these.
     """
     images = _observed(world, episodes, batch)
-    if world is None:
-        views, _ = _form(world, episodes)
-        return [
-            {view: np.repeat(video_to_frames(first[v, :, None]), job.frames, axis=0) for v, view in enumerate(views)}
-            for first, job in zip(images, batch, strict=True)
-        ]
-    driven = [tracks.tracks(job.controls_of) for job in batch]
-    for track in driven:
-        world.contract.require(where=f"{tracks.root}, episode {track.episode_id}", controls=track.controls)
+    driven = [tracks.tracks(item.controls_of) for item in batch]
+    if isinstance(world, WorldLine):
+        for track in driven:
+            world.contract.require(where=f"{tracks.root}, episode {track.episode_id}", controls=track.controls)
     return world.predict_batch(
         images,
         driven,
-        [job.frames for job in batch],
-        [job.seed for job in batch],
+        [item.frames for item in batch],
+        [item.seed for item in batch],
         without_actions=config.actions == "zero",
     )
 
@@ -235,16 +247,16 @@ def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
     Raises:
         DataError: none matches.
     """
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     chosen = []
+    limit = config.max_episodes_per_embodiment
     for position in episodes.select(split=config.splits):
         row = episodes.rows[position]
         if config.banks is not None and row.bank not in config.banks:
             continue
         if config.embodiments is not None and row.embodiment not in config.embodiments:
             continue
-        counts[row.embodiment] = counts.get(row.embodiment, 0) + 1
-        limit = config.max_episodes_per_embodiment
+        counts[row.embodiment] += 1
         if limit is None or counts[row.embodiment] <= limit:
             chosen.append(position)
     if not chosen:
@@ -257,9 +269,9 @@ def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
     return chosen
 
 
-def plan_jobs(
+def plan_predictions(
     config: RolloutConfig, episodes: EpisodeSet, tracks: ActionTracks, chosen: Sequence[int], unit: int
-) -> list[Job]:
+) -> list[Prediction]:
     """Every prediction to make, with its length: 1 + k * ``unit`` frames.
 
     Raises:
@@ -273,21 +285,22 @@ def plan_jobs(
     if config.actions == "shuffled":
         embodiment_of = {row.episode_id: row.embodiment for row in episodes.rows}
         partners = shuffled_partners(list(partners), embodiment_of, tracks.episode_ids, config.seeds[0])
-    jobs = []
+    planned: list[Prediction] = []
     for position, row in zip(chosen, rows, strict=True):
         frames = 1 + (min(config.num_frames, row.num_frames) - 1) // unit * unit
         if frames < 1 + unit:
             raise DataError(
                 "An episode is too short to predict", where=row.episode_id, expected=1 + unit, got=row.num_frames
             )
-        jobs += [Job(position, row.episode_id, partners[row.episode_id], seed, frames) for seed in config.seeds]
-    return jobs
+        partner = partners[row.episode_id]
+        planned += [Prediction(position, row.episode_id, partner, seed, frames) for seed in config.seeds]
+    return planned
 
 
-def batches(jobs: Sequence[Job], size: int) -> Iterator[list[Job]]:
-    """Jobs of equal length together, in a fixed order."""
-    for frames in sorted({job.frames for job in jobs}):
-        same = [job for job in jobs if job.frames == frames]
+def batches(planned: Sequence[Prediction], size: int) -> Iterator[list[Prediction]]:
+    """Predictions of equal length together, in a fixed order."""
+    for frames in sorted({item.frames for item in planned}):
+        same = [item for item in planned if item.frames == frames]
         for start in range(0, len(same), size):
             yield same[start : start + size]
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 TIMES_FILE = "batches.jsonl"
@@ -56,14 +57,11 @@ def device_name(device: str) -> str:
     """The device in words: a GPU's name, or the processor and how many threads are used."""
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
-    return f"{_processor()}, {torch.get_num_threads()} threads of {os.cpu_count()} cores"
-
-
-def _processor() -> str:
     facts = Path("/proc/cpuinfo")
     lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    processor = names[0] if names else platform.processor() or platform.machine()
+    return f"{processor}, {torch.get_num_threads()} threads of {os.cpu_count()} cores"
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,10 @@ class SpeedLog:
 
     def __init__(self, run_folder: Path) -> None:
         self.folder = run_folder
-        self.times = _read(run_folder / TIMES_FILE)
+        self.times = [
+            BatchTime(**{**row, "block_seconds": tuple(row["block_seconds"])})
+            for row in read_json_lines(run_folder / TIMES_FILE)
+        ]
         content = "".join(f"{json.dumps(asdict(row))}\n" for row in self.times)
         write_bytes_atomic(run_folder / TIMES_FILE, content.encode())
 
@@ -104,17 +105,8 @@ class SpeedLog:
         write_json_atomic(self.folder / SPEED_FILE, {**facts, **summarise(self.times)})
 
 
-def _read(path: Path) -> list[BatchTime]:
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8")
-    # A kill may have cut the last line short.
-    rows = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
-    return [BatchTime(**{**row, "block_seconds": tuple(row["block_seconds"])}) for row in rows]
-
-
 def summarise(times: Sequence[BatchTime]) -> dict[str, Any]:
-    """Seconds a frame, and seconds of each block averaged over trajectories.
+    """Seconds per frame, and seconds of each block averaged over trajectories.
 
     The first batch of a call warms up; it counts only where there is no other. A block's mean is over the batches of
     the longest trajectories, so that all blocks are means over the same ones.

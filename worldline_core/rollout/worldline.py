@@ -22,7 +22,7 @@ from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
-from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip, sigmas_causal
@@ -132,7 +132,7 @@ class WorldLine:
                 expected=f"a folder {' or '.join(map(str, places))}",
                 next_step="give its folder as tokenizer=...",
             )
-        codec = load_tokenizer(place)
+        codec = load_tokenizer(place, device)
         info.contract.require(where=place, tokenizer=tokenizer_fingerprint(codec, place))
         return cls(
             model,
@@ -260,14 +260,9 @@ class WorldLine:
     def _sample(self, first: Tensor, maps: Tensor, seeds: Sequence[int]) -> Tensor:
         self.block_seconds = []
         if self.causal is None:
+            noise = Noise(seeds)
             return rollout_full_clip(
-                self.model,
-                first,
-                maps,
-                noise=Noise(seeds),
-                steps=self.steps,
-                views=self.views,
-                bfloat16=self.bfloat16,
+                self.model, first, maps, noise=noise, steps=self.steps, views=self.views, bfloat16=self.bfloat16
             )
         simulator = self.simulator(seeds)
         simulator.start(first, maps[:, :, :, :1])
@@ -292,7 +287,7 @@ class WorldLine:
             raise DataError(
                 "A prediction is driven by controls of an embodiment, or by tool poses",
                 expected="controls and embodiment, or tool_poses and gripper",
-                got=f"controls {_shape(controls)}, embodiment {embodiment}, tool_poses {_shape(tool_poses)}",
+                got={"controls": controls is not None, "embodiment": embodiment, "tool_poses": tool_poses is not None},
             )
         driven = np.asarray(controls if controls is not None else tool_poses, np.float64)
         frames, unit = len(driven), self.frames_per_unit
@@ -369,7 +364,3 @@ def _poses(cameras: Mapping[str, Camera], mounted: set[str], frames: int) -> tup
             "Wrist cameras are given in two ways", expected="a pose each, or a pose per frame each", got=forms
         )
     return poses, 2 in forms.values()
-
-
-def _shape(array: np.ndarray | None) -> object:
-    return None if array is None else np.shape(array)

@@ -35,11 +35,13 @@ def read_json(path: Path) -> JsonObject:
 
 
 def read_json_lines(path: Path) -> list[JsonObject]:
-    """The objects of a `.jsonl` file. A last line that a kill cut short is left out.
+    """The objects of a `.jsonl` file; none of an absent one. A last line that a kill cut short is left out.
 
     Raises:
         ArtifactError: a line before the last is not a JSON object.
     """
+    if not path.is_file():
+        return []
     rows: list[JsonObject] = []
     lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     for index, line in enumerate(lines):

@@ -11,7 +11,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,8 +21,10 @@ from worldline_core.actions.action_maps import latent_frame_indices, render_acti
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, WristProjection, collate_tracks
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.text import ClipFacts, TextEncoder
+from worldline_core.store.artifact_files import read_json_lines
+from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import PRIMARY, Clip, ClipBatch, ClipSource, ReadingConfig
+from worldline_core.training.clip_source import Clip, ClipBatch, ClipSource, ReadingConfig
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +52,103 @@ class ReadBatch:
     skipped: tuple[SkippedClip, ...] = ()
 
 
+class ClipReader:
+    """Reads the clips of micro-steps in this process. Pickled into loader processes, it opens its files there.
+
+    Args:
+        views: the model's view slots.
+        config: what to do with a clip that cannot be read.
+    """
+
+    def __init__(
+        self, source: ClipSource, sampler: ClipSampler, views: tuple[str, ...], config: ReadingConfig | None = None
+    ) -> None:
+        self.source = source
+        self.sampler = sampler
+        self.views = views
+        self.config = ReadingConfig() if config is None else config
+
+    @property
+    def max_bytes(self) -> int:
+        """Size of the largest batch."""
+        clip = int(np.prod(self.source.shape(self.sampler.longest))) * self.source.dtype.itemsize
+        return clip * max(size * len(ClipBatch((), view).slots(self.views)) for view, size in self.sampler.batch_kinds)
+
+    def read(self, index: int, memory: np.ndarray | None = None) -> ReadBatch:
+        """The clips of micro-step ``index``.
+
+        Args:
+            memory: uint8, `max_bytes` long, that the batch is read into; None for memory of its own.
+
+        Raises:
+            DataError: a clip cannot be read and is not to be skipped, or nothing readable can be found for it.
+            ArtifactError: the source does not hold what is asked of it.
+        """
+        wanted = self.sampler.clips(index)
+        out = self.source.room(wanted, self.views, memory)
+        clips: list[Clip] = []
+        skipped: list[SkippedClip] = []
+        for place, clip in enumerate(wanted.clips):
+            for attempt in range(_ATTEMPTS):
+                try:
+                    self.source.read(clip, self.source.recorded_views(clip, wanted, self.views), out[place])
+                except DataError as error:
+                    if self.config.on_unreadable == "raise":
+                        raise
+                    skipped.append(SkippedClip(index, clip, str(error)))
+                    clip = self.sampler.replacement(index, place, attempt)
+                else:
+                    clips.append(clip)
+                    break
+            else:
+                raise DataError(
+                    "No readable clip was found.",
+                    where=f"micro-step {index}, clip {place}",
+                    expected=f"one of {_ATTEMPTS} clips that can be read",
+                    got=skipped[-1].reason,
+                    next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
+                )
+        return ReadBatch(ClipBatch(tuple(clips), wanted.view), torch.from_numpy(out), tuple(skipped))
+
+
+class SkipLog:
+    """Counts the clips that a run skipped, in a file beside its training state: a continued run goes on counting.
+
+    What was skipped is a function of the micro-step, so a step that is done again after a kill adds nothing.
+    """
+
+    def __init__(self, folder: Path, rank: int, limit: int) -> None:
+        self.path = folder / f"skipped_clips-{rank}.jsonl"
+        self.limit = limit
+        self._rows = read_json_lines(self.path)
+
+    def add(self, skipped: Sequence[SkippedClip]) -> None:
+        """Write down what was skipped.
+
+        Raises:
+            DataError: more than ``limit`` clips have been skipped.
+        """
+        for item in skipped:
+            row = {"index": item.index, "clip": str(item.clip), "reason": item.reason}
+            if row not in self._rows:
+                logger.warning("Clip skipped: %s", item.reason)
+                self._rows.append(row)
+                write_bytes_atomic(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows).encode())
+        if len(self._rows) > self.limit:
+            raise DataError(
+                "Too many clips cannot be read.",
+                where=self.path,
+                expected=f"at most {self.limit} (input.max_skipped)",
+                got=len(self._rows),
+                next_step="the reasons are in this file; run filter again, or raise the limit",
+            )
+
+    @staticmethod
+    def count(folder: Path) -> int:
+        """Clips that all processes skipped."""
+        return sum(len(read_json_lines(path)) for path in folder.glob("skipped_clips-*.jsonl"))
+
+
 @dataclass(frozen=True)
 class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
@@ -70,100 +168,6 @@ class Batch:
     def names(self) -> tuple[str, ...]:
         """The episodes, for error messages."""
         return tuple(clip.episode_id for clip in self.clips)
-
-
-def batch_views(view: str | None, views: tuple[str, ...]) -> tuple[str, ...]:
-    """The model's view slots that a batch fills. The task-facing view takes the first whatever its source calls it."""
-    if view is None:
-        return views
-    return (views[0],) if view == PRIMARY else (view,)
-
-
-def clip_views(source: ClipSource, clip: Clip, view: str | None, views: tuple[str, ...]) -> tuple[str, ...]:
-    """The recorded views of a clip that fill those slots."""
-    return (source.row(clip.episode_id).primary_view,) if view == PRIMARY else batch_views(view, views)
-
-
-class BatchReader(Protocol):
-    """Reads micro-batches by their number: a `ClipReader` or a `ClipPrefetcher`."""
-
-    def read(self, index: int) -> ReadBatch: ...
-
-    def close(self) -> None: ...
-
-
-class ClipReader:
-    """Reads in this process. Pickled into loader processes, it opens its files there.
-
-    Args:
-        views: the model's view slots.
-        config: what to do with a clip that cannot be read.
-    """
-
-    def __init__(
-        self, source: ClipSource, sampler: ClipSampler, views: tuple[str, ...], config: ReadingConfig | None = None
-    ) -> None:
-        self.source = source
-        self.sampler = sampler
-        self.views = views
-        self.config = ReadingConfig() if config is None else config
-
-    @property
-    def max_bytes(self) -> int:
-        """Size of the largest batch."""
-        clip = int(np.prod(self.source.shape(self.sampler.longest))) * self.source.dtype.itemsize
-        return clip * max(size * len(batch_views(view, self.views)) for view, size in self.sampler.batch_kinds)
-
-    def read(self, index: int, buffer: np.ndarray | None = None) -> ReadBatch:
-        """The clips of micro-step ``index``.
-
-        Args:
-            buffer: uint8, `max_bytes` long, that the batch is read into; None for memory of its own.
-
-        Raises:
-            DataError: a clip cannot be read and is not to be skipped, or nothing readable can be found for it.
-            ArtifactError: the source does not hold what is asked of it.
-        """
-        wanted = self.sampler.clips(index)
-        out = _array(self.source, wanted, self.views, buffer)
-        clips: list[Clip] = []
-        skipped: list[SkippedClip] = []
-        for place, clip in enumerate(wanted.clips):
-            clips.append(self._read(index, place, clip, wanted.view, out[place], skipped))
-        return ReadBatch(ClipBatch(tuple(clips), wanted.view), torch.from_numpy(out), tuple(skipped))
-
-    def close(self) -> None:
-        """Nothing is held here that a batch does not need."""
-
-    def _read(
-        self, index: int, place: int, clip: Clip, view: str | None, out: np.ndarray, skipped: list[SkippedClip]
-    ) -> Clip:
-        """Read a clip into ``out``, or others in its place until one can be read; returns which one it was."""
-        for attempt in range(_ATTEMPTS):
-            try:
-                self.source.read(clip, clip_views(self.source, clip, view, self.views), out)
-            except DataError as error:
-                if self.config.on_unreadable == "raise":
-                    raise
-                skipped.append(SkippedClip(index, clip, str(error)))
-                clip = self.sampler.replacement(index, place, attempt)
-            else:
-                return clip
-        raise DataError(
-            "No readable clip was found.",
-            where=f"micro-step {index}, clip {place}",
-            expected=f"one of {_ATTEMPTS} clips that can be read",
-            got=skipped[-1].reason,
-            next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
-        )
-
-
-def _array(source: ClipSource, batch: ClipBatch, views: tuple[str, ...], buffer: np.ndarray | None) -> np.ndarray:
-    """Room for a batch, (b, v, ...)."""
-    shape = (len(batch.clips), len(batch_views(batch.view, views)), *source.shape(batch.clips[0].num_frames))
-    if buffer is None:
-        return np.empty(shape, source.dtype)
-    return buffer[: int(np.prod(shape)) * source.dtype.itemsize].view(source.dtype).reshape(shape)
 
 
 class ClipLoader:
@@ -204,9 +208,9 @@ class ClipLoader:
             ArtifactError: if the store or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        out = _array(self.store, batch, self.views, None)
+        out = self.store.room(batch, self.views)
         for clip, target in zip(batch.clips, out, strict=True):
-            self.store.read(clip, clip_views(self.store, clip, batch.view, self.views), target)
+            self.store.read(clip, self.store.recorded_views(clip, batch, self.views), target)
         return self.finish(ReadBatch(batch, torch.from_numpy(out)))
 
     def finish(self, read: ReadBatch) -> Batch:
@@ -215,8 +219,7 @@ class ClipLoader:
         Raises:
             ArtifactError: if the tracks lack an episode.
         """
-        clips = read.batch.clips
-        views = batch_views(read.batch.view, self.views)
+        clips, views = read.batch.clips, read.batch.slots(self.views)
         latents = self.store.latents(read.data, self.device)
         maps = None if self.tracks is None else self.action_maps(clips, views)
         ids = mask = None
@@ -240,67 +243,11 @@ class ClipLoader:
             raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
         cut = []
         for clip in clips:
-            frames = [clip.start + clip.stride * index for index in latent_frame_indices(clip.num_frames)]
+            frames = [clip.frames[index] for index in latent_frame_indices(clip.num_frames)]
             if clip.episode_id not in self._tracks:
                 self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
             tracks = self._tracks[clip.episode_id]
             cut.append(tracks.clip(frames, wrist_projection=self.wrist_projection, start=clip.start))
-        _, rows, columns = self.store.latent_shape
         tensors = collate_tracks(cut, views=views).to(self.device)
-        return render_action_maps(
-            tensors, cut[0].image_size, grid_size=(rows, columns), sigma_px_ref=self.tracks.sigma_px_ref
-        )
-
-
-class SkipLog:
-    """Counts the clips that a run skipped, in a file beside its training state: a continued run goes on counting.
-
-    What was skipped is a function of the micro-step, so a step that is done again after a kill adds nothing.
-    """
-
-    def __init__(self, folder: Path, rank: int, limit: int) -> None:
-        self.path = folder / f"skipped_clips-{rank}.jsonl"
-        self.limit = limit
-        self._seen = _logged([self.path])
-
-    def add(self, skipped: Sequence[SkippedClip]) -> None:
-        """Write down what was skipped.
-
-        Raises:
-            DataError: more than ``limit`` clips have been skipped.
-        """
-        for item in skipped:
-            line = json.dumps({"index": item.index, "clip": str(item.clip), "reason": item.reason})
-            if line in self._seen:
-                continue
-            logger.warning("Clip skipped: %s", item.reason)
-            self._seen.add(line)
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line + "\n")
-        if len(self._seen) > self.limit:
-            raise DataError(
-                "Too many clips cannot be read.",
-                where=self.path,
-                expected=f"at most {self.limit} (input.max_skipped)",
-                got=len(self._seen),
-                next_step="the reasons are in this file; run filter again, or raise the limit",
-            )
-
-    @staticmethod
-    def count(folder: Path, before: int) -> int:
-        """Clips that all processes skipped in the micro-steps before ``before``."""
-        lines = _logged(sorted(folder.glob("skipped_clips-*.jsonl")))
-        return sum(json.loads(line)["index"] < before for line in lines)
-
-
-def _logged(paths: Sequence[Path]) -> set[str]:
-    """Whole lines of the files: one that a kill cut short is written again."""
-    lines: set[str] = set()
-    for path in paths:
-        text = path.read_text(encoding="utf-8") if path.is_file() else ""
-        if text and not text.endswith("\n"):
-            text = text[: text.rfind("\n") + 1]
-            path.write_text(text, encoding="utf-8")
-        lines.update(text.splitlines())
-    return lines
+        grid_size = self.store.latent_shape[1:]
+        return render_action_maps(tensors, cut[0].image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)

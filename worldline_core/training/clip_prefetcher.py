@@ -1,44 +1,27 @@
-"""Processes that read clips ahead of training, in the order that training asks for them.
+"""Processes that read clips ahead of training, handed on in the order that training asks for them.
 
-Micro-step i belongs to process i modulo their number, and to one of a fixed number of slots in memory that all processes
-share: the order does not depend on which process is faster, and memory is bounded by the slots. Slots are reused, because
-the page faults of fresh shared memory cost about as much as decoding into it.
+Every micro-step has one of a fixed number of slots in memory that all processes share, so memory is bounded whichever
+process is faster. Slots are reused, because the page faults of fresh memory cost about as much as decoding into it.
 """
 
 from __future__ import annotations
 
-import mmap
 import multiprocessing
 import os
 import signal
-import tempfile
-from collections import deque
+import threading
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
-from multiprocessing import reduction
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 
-from worldline_core.errors import TrainingError, WorldLineError
+from worldline_core.errors import TrainingError
 from worldline_core.training.clip_loader import ClipReader, ReadBatch, SkippedClip
 from worldline_core.training.clip_source import ClipBatch
-
-_JOIN_SECONDS = 5.0
-
-
-@dataclass(frozen=True)
-class _Answer:
-    """What a process reports of a micro-step; the clips themselves lie in the slot."""
-
-    index: int
-    batch: ClipBatch
-    shape: tuple[int, ...]
-    skipped: tuple[SkippedClip, ...]
 
 
 class ClipPrefetcher:
@@ -56,17 +39,13 @@ class ClipPrefetcher:
         self._reader = reader
         self._stop = stop
         self._slots = workers * (prefetch + 1)
-        self._slot_bytes = -(-reader.max_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
-        self._first = self._next = self._sent = 0
-        self._workers: list[tuple[SpawnProcess, Connection]] = []
-        self._outstanding: deque[int] = deque()
+        context = multiprocessing.get_context("spawn")
+        shared = context.RawArray("B", self._slots * reader.max_bytes)
+        self._memory = _slots(shared, self._slots)
         self._pinned = torch.empty(reader.max_bytes, dtype=torch.uint8, pin_memory=True) if pinned else None
-        descriptor = _anonymous_file(self._slots * self._slot_bytes)
-        try:
-            self._memory = mmap.mmap(descriptor, self._slots * self._slot_bytes)
-            self._start(workers, descriptor)
-        finally:
-            os.close(descriptor)
+        self._pool = ProcessPoolExecutor(workers, context, _start_process, (reader, shared, self._slots))
+        self._reads: dict[int, Future[tuple[ClipBatch, tuple[SkippedClip, ...]]]] = {}
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -83,137 +62,75 @@ class ClipPrefetcher:
 
         Raises:
             DataError, ArtifactError: whatever reading raised in the process.
-            TrainingError: the process has ended; the message names the clips it was to read.
+            TrainingError: a process has ended; the message names the clips of the first batch that is missing.
         """
-        if not self._workers:
+        if self._closed:
             raise TrainingError("The loader is closed.", where=f"micro-step {index}")
-        if index != self._next:
-            self._restart(index)
-        self._next = index + 1
-        self._dispatch(index)
-        answer = self._receive(index)
-        if isinstance(answer, WorldLineError):
-            raise answer
-        count = int(np.prod(answer.shape))
-        dtype = self._reader.source.dtype
-        data = torch.from_numpy(np.frombuffer(self._memory, dtype, count, self._offset(index)).reshape(answer.shape))
-        return ReadBatch(answer.batch, self._staged(data), answer.skipped)
-
-    def close(self) -> None:
-        """End the processes; those that do not end by themselves are stopped."""
-        workers, self._workers = self._workers, []
-        for _, connection in workers:
-            connection.close()
-        for process, _ in workers:
-            process.join(_JOIN_SECONDS)
-            if process.is_alive():
-                process.terminate()
-                process.join()
-            process.close()
-
-    def _start(self, workers: int, descriptor: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        try:
-            for number in range(workers):
-                ours, theirs = context.Pipe()
-                process = context.Process(
-                    target=_serve,
-                    args=(self._reader, theirs, self._slots * self._slot_bytes, self._slot_bytes),
-                    name=f"clip loader {number}",
-                    daemon=True,
-                )
-                process.start()
-                theirs.close()  # so that the end of the process is the end of the connection
-                self._workers.append((process, ours))
-                reduction.send_handle(ours, descriptor, process.pid)
-        except BaseException:
-            self.close()
-            raise
-
-    def _offset(self, index: int) -> int:
-        return (index - self._first) % self._slots * self._slot_bytes
-
-    def _worker(self, index: int) -> tuple[SpawnProcess, Connection]:
-        return self._workers[(index - self._first) % len(self._workers)]
-
-    def _dispatch(self, index: int) -> None:
-        """Ask for everything that there is a slot for while ``index`` is in use."""
+        if index not in self._reads:
+            # Out of order: what is still being read ends first, because its slots are used again.
+            wait(self._reads.values())
+            self._reads.clear()
         end = index + self._slots if self._stop is None else min(index + self._slots, max(self._stop, index + 1))
-        for ahead in range(self._sent, end):
-            # That a process has ended is reported when its answer is missing: earlier answers can still be read.
-            with suppress(BrokenPipeError, ConnectionResetError):
-                self._worker(ahead)[1].send((ahead, self._offset(ahead)))
-            self._outstanding.append(ahead)
-            self._sent = ahead + 1
-
-    def _receive(self, index: int) -> _Answer | WorldLineError:
-        process, connection = self._worker(index)
         try:
-            answer_index, answer = connection.recv()
-        except (EOFError, ConnectionResetError):
-            process.join(_JOIN_SECONDS)
-            code = process.exitcode
-            clips = "; ".join(str(clip) for clip in self._reader.sampler.clips(index).clips)
+            self._submit(index)
+            with suppress(BrokenProcessPool):  # said when the first batch that is missing is asked for
+                for ahead in range(index + 1, end):
+                    self._submit(ahead)
+            batch, skipped = self._reads.pop(index).result()
+        except BrokenProcessPool as error:
             self.close()
             raise TrainingError(
                 "A loader process has ended.",
-                where=f"micro-step {index}: {clips}",
+                where=f"micro-step {index}: {'; '.join(map(str, self._reader.sampler.clips(index).clips))}",
                 expected="clips",
-                got="killed by a signal" if code is not None and code < 0 else f"exit code {code}",
+                got=error,
                 next_step="see its traceback above; if memory ran out, lower input.workers, input.prefetch or the batch",
-            ) from None
-        if self._outstanding.popleft() != index or answer_index != index:
-            raise TrainingError("Clips came out of order.", where=f"micro-step {index}", got=answer_index)
-        return answer
+            ) from error
+        data = torch.from_numpy(self._reader.source.room(batch, self._reader.views, self._memory[index % self._slots]))
+        if self._pinned is not None:
+            # The copy of the batch before may still be on its way to the GPU.
+            torch.cuda.current_stream().synchronize()
+            data = self._pinned[: data.nbytes].view(data.dtype).view(data.shape).copy_(data)
+        return ReadBatch(batch, data, skipped)
 
-    def _restart(self, index: int) -> None:
-        """Continue at another micro-step: what is still being read is awaited and dropped."""
-        while self._outstanding:
-            self._receive(self._outstanding[0])
-        self._first = self._sent = index
+    def _submit(self, index: int) -> None:
+        if index not in self._reads:
+            self._reads[index] = self._pool.submit(_read, index)
 
-    def _staged(self, data: torch.Tensor) -> torch.Tensor:
-        if self._pinned is None:
-            return data
-        # The copy of the batch before may still be on its way to the GPU.
-        torch.cuda.current_stream().synchronize()
-        target = self._pinned[: data.nbytes].view(data.dtype).view(data.shape)
-        return target.copy_(data)
+    def close(self) -> None:
+        """End the processes, each after the batch that it is reading."""
+        self._closed = True
+        self._pool.shutdown(cancel_futures=True)
 
 
-def _anonymous_file(size: int) -> int:
-    """A file without a name in memory: nothing is left behind however processes end, and /dev/shm has no say."""
-    if hasattr(os, "memfd_create"):
-        descriptor = os.memfd_create("worldline-clips")
-    else:
-        with tempfile.TemporaryFile() as file:
-            descriptor = os.dup(file.fileno())
-    os.ftruncate(descriptor, size)
-    return descriptor
+def _slots(shared: Any, count: int) -> np.ndarray:
+    return np.frombuffer(shared, np.uint8).reshape(count, -1)
 
 
-def _serve(reader: ClipReader, connection: Connection, memory_bytes: int, slot_bytes: int) -> None:
-    """A loader process: reads what it is asked for until the connection ends.
+# In a loader process: what it reads with, and the slots that it reads into.
+_process: tuple[ClipReader, np.ndarray]
 
-    Errors that name a clip are answers. Anything else ends the process with its traceback, and the training process
-    says which clips it was about.
-    """
+
+def _start_process(reader: ClipReader, shared: Any, slots: int) -> None:
     import cv2
 
+    global _process
+    _process = reader, _slots(shared, slots)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process, which closes this one
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    try:
-        descriptor = reduction.recv_handle(connection)
-        memory = mmap.mmap(descriptor, memory_bytes)
-        os.close(descriptor)
-        while True:
-            index, offset = connection.recv()
-            slot = np.frombuffer(memory, np.uint8, slot_bytes, offset)
-            try:
-                read = reader.read(index, slot)
-                connection.send((index, _Answer(index, read.batch, tuple(read.data.shape), read.skipped)))
-            except WorldLineError as error:
-                connection.send((index, error))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
+    threading.Thread(target=_end_with_training, daemon=True).start()
+
+
+def _end_with_training() -> None:
+    """A training process that is killed cannot end its loader processes: they notice and end by themselves."""
+    training = multiprocessing.parent_process()
+    if training is not None:
+        training.join()
+        os._exit(1)
+
+
+def _read(index: int) -> tuple[ClipBatch, tuple[SkippedClip, ...]]:
+    reader, slots = _process
+    read = reader.read(index, slots[index % len(slots)])
+    return read.batch, read.skipped

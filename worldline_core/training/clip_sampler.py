@@ -13,21 +13,15 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.training.clip_source import (
-    TEMPORAL_COMPRESSION,
-    Clip,
-    ClipBatch,
-    ClipRow,
-    ClipSource,
-    longest_clip,
-)
+from worldline_core.training.clip_source import Clip, ClipBatch, ClipRow, ClipSource, longest_clip
 
 JOINT = "joint"
 """In place of a view's name: all views of the model together."""
@@ -90,13 +84,9 @@ class EpochOrder:
 
     def epoch(self, index: int) -> int:
         """The epoch that batch ``index`` belongs to."""
-        low, high = 0, 1
-        while self.batches_before(high) <= index:
-            low, high = high, 2 * high
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self.batches_before(middle) <= index else (low, middle)
-        return low
+        # An epoch lacks, for each kind, at most what does not fill a batch.
+        most = (index + 1 + len(self.counts)) * self.batch // sum(self.counts) + 1
+        return bisect_right(range(most + 1), index, key=self.batches_before) - 1
 
     def locate(self, index: int) -> tuple[int, list[int]]:
         """(kind, numbers of the batch's clips within the kind) of batch ``index``."""
@@ -123,9 +113,9 @@ def _lengths(value: Any) -> Any:
         isinstance(v, int) for v in value.values()
     ):
         raise ValueError("a range of clip lengths has the whole numbers `from`, `to` and perhaps `step`")
-    step = value.get("step", TEMPORAL_COMPRESSION)
-    if step < 1 or step % TEMPORAL_COMPRESSION or value["to"] < value["from"]:
-        raise ValueError(f"a range of clip lengths rises in steps of a multiple of {TEMPORAL_COMPRESSION} frames")
+    step = value.get("step", TEMPORAL_FACTOR)
+    if step < 1 or step % TEMPORAL_FACTOR or value["to"] < value["from"]:
+        raise ValueError(f"a range of clip lengths rises in steps of a multiple of {TEMPORAL_FACTOR} frames")
     return tuple(range(value["from"], value["to"] + 1, step))
 
 
@@ -153,6 +143,23 @@ class ClipSampling(StrictModel):
     # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
     order: Literal["weighted", "epochs"] = Field(default="weighted", exclude_if=lambda value: value == "weighted")
     hop: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        odd = [length for length in self.lengths if length < 1 or (length - 1) % TEMPORAL_FACTOR]
+        if odd:
+            raise ValueError(f"lengths {odd}: a causal tokenizer codes clips of 4 k + 1 frames")
+        if self.length_weights is not None and len(self.length_weights) != len(self.lengths):
+            raise ValueError(f"length_weights: every one of the {len(self.lengths)} clip lengths needs one weight")
+        if self.order == "weighted" and self.hop is not None:
+            raise ValueError("hop: only epochs have one; set order to epochs, or leave it out")
+        weighted = self.length_weights is not None or self.source_weights or self.single_view_factor != 1
+        if self.order == "epochs" and weighted:
+            raise ValueError(
+                "order: epochs take every clip once, so they allow neither length_weights nor source_weights nor a "
+                "single_view_factor; take order weighted, or leave them out"
+            )
+        return self
 
 
 @dataclass
@@ -182,7 +189,7 @@ class ClipSampler:
         rows: the episodes to draw from (default: all of the source).
 
     Raises:
-        ConfigError: weights, order or hop do not fit together.
+        ConfigError: clips of the source do not start at every hop.
         DataError: no episode is long enough for any clip.
     """
 
@@ -198,7 +205,13 @@ class ClipSampler:
         world_size: int = 1,
         rows: Sequence[ClipRow] | None = None,
     ) -> None:
-        _check(config, source)
+        if config.hop is not None and config.hop % source.start_step:
+            raise ConfigError(
+                "Clips cannot start at every hop.",
+                where="clips.hop",
+                expected=f"a multiple of {source.start_step}, the frames between possible starts",
+                got=config.hop,
+            )
         self.batch_size = batch_size
         self.single_view_factor = config.single_view_factor
         self.seed = seed
@@ -301,43 +314,6 @@ class ClipSampler:
         place = int(np.searchsorted(kind.cumulative, number, side="right"))
         before = int(kind.cumulative[place - 1]) if place else 0
         return kind.clip(kind.rows[place], (number - before) * self.step)
-
-
-def _check(config: ClipSampling, source: ClipSource) -> None:
-    odd = [length for length in config.lengths if length < 1 or (length - 1) % TEMPORAL_COMPRESSION]
-    if odd:
-        raise ConfigError(
-            "A causal tokenizer cannot code clips of these lengths.",
-            where="clips.lengths",
-            expected="4 k + 1 frames",
-            got=odd,
-        )
-    if config.length_weights is not None and len(config.length_weights) != len(config.lengths):
-        raise ConfigError(
-            "Every clip length needs one weight.",
-            where="clips.length_weights",
-            expected=len(config.lengths),
-            got=len(config.length_weights),
-        )
-    if config.order == "weighted":
-        if config.hop is not None:
-            raise ConfigError("Only epochs have a hop.", where="clips.hop", expected="order: epochs, or no hop")
-        return
-    if config.length_weights is not None or config.source_weights or config.single_view_factor != 1:
-        raise ConfigError(
-            "Epochs take every clip once, so nothing can be weighted.",
-            where="clips.order",
-            expected="neither length_weights nor source_weights, and single_view_factor 1",
-            got="epochs with weights",
-            next_step="take order: weighted, or leave the weights out",
-        )
-    if config.hop is not None and config.hop % source.start_step:
-        raise ConfigError(
-            "Clips cannot start at every hop.",
-            where="clips.hop",
-            expected=f"a multiple of {source.start_step}, the frames between possible starts",
-            got=config.hop,
-        )
 
 
 def _normalised(weights: Sequence[float]) -> np.ndarray:

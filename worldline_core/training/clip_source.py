@@ -1,4 +1,4 @@
-"""Training clips: what one is, and the two sources they are read from (cached latents, frames of an EpisodeSet).
+"""Training clips: what one is, which episodes they are drawn from, and what a source of them can do.
 
 Reading is split in two so that it can run in other processes: `ClipSource.read` touches files and fills an array;
 `ClipSource.latents` turns that array into what the model sees, on the model's device.
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import EpisodeRow
@@ -27,7 +28,6 @@ from worldline_core.errors import ArtifactError, DataError
 
 logger = logging.getLogger(__name__)
 
-TEMPORAL_COMPRESSION = 4
 PRIMARY = "primary"
 """In place of a view's name: the task-facing view of each episode (Stage I)."""
 
@@ -59,6 +59,12 @@ class ClipBatch:
     clips: tuple[Clip, ...]
     view: str | None
 
+    def slots(self, views: tuple[str, ...]) -> tuple[str, ...]:
+        """The model's view slots, of ``views``, that the clips fill: the task-facing view always takes the first."""
+        if self.view is None:
+            return views
+        return (views[0],) if self.view == PRIMARY else (self.view,)
+
 
 def latent_frame_count(num_frames: int) -> int:
     """T_l = 1 + (T - 1) / 4 (docs/method.md section 2).
@@ -66,17 +72,17 @@ def latent_frame_count(num_frames: int) -> int:
     Raises:
         DataError: if ``num_frames`` is not one more than a multiple of four.
     """
-    if num_frames < 1 or (num_frames - 1) % TEMPORAL_COMPRESSION:
+    if num_frames < 1 or (num_frames - 1) % TEMPORAL_FACTOR:
         raise DataError(
             "A clip has a length that the causal tokenizer cannot encode.", expected="4 k + 1 frames", got=num_frames
         )
-    return 1 + (num_frames - 1) // TEMPORAL_COMPRESSION
+    return 1 + (num_frames - 1) // TEMPORAL_FACTOR
 
 
 def longest_clip(num_frames: int, start: int, stride: int) -> int:
     """Most frames, 4 k + 1, of a clip at ``start`` with ``stride`` in an episode of ``num_frames``."""
     steps = (num_frames - 1 - start) // stride
-    return 1 + TEMPORAL_COMPRESSION * (steps // TEMPORAL_COMPRESSION)
+    return 1 + TEMPORAL_FACTOR * (steps // TEMPORAL_FACTOR)
 
 
 @dataclass(frozen=True)
@@ -95,17 +101,9 @@ class ClipRow:
     @classmethod
     def of(cls, row: EpisodeRow, views: Sequence[str], **more: Any) -> Self:
         """The row of an EpisodeSet's row, with those of its views that clips have."""
-        return cls(
-            episode_id=row.episode_id,
-            num_frames=row.video_frames,
-            views=tuple(views),
-            source=row.source,
-            embodiment=row.embodiment,
-            split=row.split,
-            instruction=row.instruction,
-            primary_view=row.primary_view,
-            **more,
-        )
+        copied = ("episode_id", "source", "embodiment", "split", "instruction", "primary_view")
+        named = {name: getattr(row, name) for name in copied}
+        return cls(num_frames=row.video_frames, views=tuple(views), **named, **more)
 
 
 def named_rows(rows: Sequence[ClipRow]) -> list[list[Any]]:
@@ -170,6 +168,17 @@ class ClipSource(ABC):
     @abstractmethod
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
         """Latents (float32) of clips that were read, on ``device``."""
+
+    def recorded_views(self, clip: Clip, batch: ClipBatch, views: tuple[str, ...]) -> tuple[str, ...]:
+        """The views of a clip of the batch that fill its slots, by the names they have in the recording."""
+        return (self.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(views)
+
+    def room(self, batch: ClipBatch, views: tuple[str, ...], memory: np.ndarray | None = None) -> np.ndarray:
+        """An array (b, v, *shape) for a batch: at the start of ``memory`` (uint8) when it is given, else of its own."""
+        shape = (len(batch.clips), len(batch.slots(views)), *self.shape(batch.clips[0].num_frames))
+        if memory is None:
+            return np.empty(shape, self.dtype)
+        return memory[: int(np.prod(shape)) * self.dtype.itemsize].view(self.dtype).reshape(shape)
 
 
 class ReadingConfig(StrictModel):

@@ -14,14 +14,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.store.atomic import atomic_path, write_json_atomic
-from worldline_core.training.clip_source import TEMPORAL_COMPRESSION
 from worldline_core.training.latent_store import (
     LatentRow,
     Layout,
@@ -79,16 +79,12 @@ def encode_episode(
         return torch.stack([encode_clip(tokenizer, video[:, list(indices)], config.device) for video in videos])
 
     if layout == "groups":
-        starts = range(0, count, config.start_step)
-        singles = [
-            torch.cat([encode_clip(tokenizer, video[:, i : i + 1], config.device) for i in starts], 1)
-            for video in videos
-        ]
-        tensors[single_key(episode_id)] = torch.stack(singles)
+        singles = [stacked(range(start, start + 1)) for start in range(0, count, config.start_step)]
+        tensors[single_key(episode_id)] = torch.cat(singles, 2)
     for stride in config.strides:
-        period = TEMPORAL_COMPRESSION * stride
+        period = TEMPORAL_FACTOR * stride
         for start in range(0, count, config.start_step):
-            steps = TEMPORAL_COMPRESSION * ((count - 1 - start) // stride // TEMPORAL_COMPRESSION)
+            steps = TEMPORAL_FACTOR * ((count - 1 - start) // stride // TEMPORAL_FACTOR)
             indices = range(start, start + stride * steps + 1, stride)
             if layout == "clips":
                 tensors[clip_key(episode_id, stride, start)] = stacked(indices)
@@ -113,11 +109,11 @@ def choose_layout(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], config: E
     """
     if config.layout == "clips":
         return "clips"
-    span = 2 * TEMPORAL_COMPRESSION + 1
+    span = 2 * TEMPORAL_FACTOR + 1
     if video.shape[1] < span:
         raise DataError("An episode is too short to encode.", expected=f"{span} frames or more", got=video.shape[1])
     whole = encode_clip(tokenizer, video[:, :span], config.device)[:, 2]
-    later = encode_clip(tokenizer, video[:, TEMPORAL_COMPRESSION:span], config.device)[:, 1]
+    later = encode_clip(tokenizer, video[:, TEMPORAL_FACTOR:span], config.device)[:, 1]
     # One unit of half precision: different batch shapes may round the last bit differently.
     memoryless = bool(torch.allclose(whole.float(), later.float(), rtol=2e-3, atol=2e-3))
     if config.layout == "groups" and not memoryless:
@@ -137,9 +133,7 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
         DataError: if no episode is selected, or frames and index disagree.
     """
     episodes = EpisodeSet.open(inputs["episodes"])
-    tokenizer = load_tokenizer(inputs["tokenizer"])
-    if isinstance(tokenizer, torch.nn.Module):
-        tokenizer = tokenizer.to(config.device).eval()
+    tokenizer = load_tokenizer(inputs["tokenizer"], config.device)
     selected = _select(episodes, config)
 
     def video(index: int, view: str) -> Tensor:
@@ -176,13 +170,13 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
             "strides": list(config.strides),
             "views": list(config.views),
             "image_size": list(config.image_size),
-            "temporal_compression": TEMPORAL_COMPRESSION,
+            "temporal_compression": TEMPORAL_FACTOR,
             "tokenizer": tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"])),
             **facts,
         },
     )
-    frames_total = sum(row.num_frames for row in rows)
-    return {"episodes": len(rows), "frames": frames_total, "shards": len(shards), "layout": layout}
+    frames = sum(row.num_frames for row in rows)
+    return {"episodes": len(rows), "frames": frames, "shards": len(shards), "layout": layout}
 
 
 def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:

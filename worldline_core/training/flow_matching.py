@@ -21,15 +21,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.relational import (
-    PoolingShape,
-    RelationalConfig,
-    RelationalScales,
-    pool_features,
-    relational_losses,
-)
-from worldline_core.training.trainer import average_values
-from worldline_core.training.video_teacher import TeacherFeatures
+from worldline_core.training.relational import RelationalTerm
 
 
 class SigmaSampling(StrictModel):
@@ -139,36 +131,6 @@ def flow_matching_loss(
     return (error * noisy).sum() / (noisy.sum().clamp_min(1) * per_frame_values)
 
 
-class RelationalTerm:
-    """Teacher features, student layer and running scales of the relational terms."""
-
-    def __init__(self, config: RelationalConfig, teacher: TeacherFeatures, num_layers: int) -> None:
-        self.config = config
-        self.teacher = teacher
-        self.layer = config.student_layer or max(1, num_layers // 2)
-        self.scales = RelationalScales(config)
-
-    def add(
-        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], batch: Batch, step: int
-    ) -> tuple[Tensor, dict[str, float]]:
-        """The flow-matching loss plus the weighted relational terms."""
-        taught = self.teacher.features(batch.clips, batch.views, batch.frames).to(features.device)
-        student_shape = (features.shape[2], features.shape[3], features.shape[4])
-        teacher_shape = (taught.shape[2], taught.shape[3], taught.shape[4])
-        shape = PoolingShape.common(self.config, student_shape, teacher_shape)
-        intra, cross = relational_losses(pool_features(features, shape), pool_features(taught, shape), step)
-        # Over all processes, so that their scales stay equal and one saved state is everyone's.
-        seen = average_values({"flow": flow.item(), "intra": intra.item(), "cross": cross.item()})
-        scale_intra, scale_cross = self.scales.update(seen["flow"], seen["intra"], seen["cross"], step)
-        values = {
-            "relational_intra": intra.item(),
-            "relational_cross": cross.item(),
-            "scale_intra": scale_intra,
-            "scale_cross": scale_cross,
-        }
-        return flow + scale_intra * intra + scale_cross * cross, values
-
-
 class FlowMatchingObjective:
     """Flow matching on clips. The batch decides what conditions the model: text, action maps, or neither."""
 
@@ -220,12 +182,12 @@ class FlowMatchingObjective:
 
     def state(self) -> dict[str, Any]:
         """Running loss scales."""
-        return {} if self.relational is None else self.relational.scales.state()
+        return {} if self.relational is None else dict(self.relational.scales.ratios)
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from saved scales."""
         if self.relational is not None:
-            self.relational.scales.load_state(state)
+            self.relational.scales.ratios = dict(state)
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]:
         """Unweighted velocity loss, and the squared error of the clean latents, on a held-out batch.

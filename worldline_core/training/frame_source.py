@@ -1,9 +1,13 @@
-"""Clips read straight from an EpisodeSet: frames are decoded when they are needed, then encoded to latents."""
+"""Frames straight from an EpisodeSet: clips that are decoded and encoded when they are needed, and whole recordings.
+
+Stage I and II train on clips (`FrameSource`); the small tokenizer and the small teacher on recordings held in memory.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +16,13 @@ import torch
 from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from tqdm import tqdm
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.model.tokenizer import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, resize_frame
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, resize_frame
 from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, FrameInput
 
 logger = logging.getLogger(__name__)
@@ -72,9 +77,7 @@ class FrameSource(ClipSource):
             ConfigError: the tokenizer cannot code images of this size.
             UnavailableError: the decoder that is asked for cannot be loaded.
         """
-        tokenizer = load_tokenizer(tokenizer_folder)
-        if isinstance(tokenizer, torch.nn.Module):
-            tokenizer.to(device).eval()
+        tokenizer = load_tokenizer(tokenizer_folder, device)
         space = tokenizer.spatial_compression
         height, width = config.image_size
         if height % space or width % space:
@@ -179,3 +182,32 @@ def frame_rows(episodes: EpisodeSet, views: Sequence[str], *, primary_alone: boo
     if len(rows) < len(episodes):
         logger.info("%d of %d episodes lack a view that is trained on.", len(episodes) - len(rows), len(episodes))
     return rows
+
+
+@dataclass(frozen=True)
+class RecordedView:
+    """One view of one episode at the training size; ``name`` is episode/view."""
+
+    name: str
+    frames: UInt8[Tensor, "3 n h w"]
+
+
+def load_views(
+    episodes: EpisodeSet, positions: Sequence[int], image_size: tuple[int, int], minimum: int
+) -> list[RecordedView]:
+    """All views of the episodes at ``positions`` that have ``minimum`` frames or more, in memory.
+
+    Raises:
+        DataError: there is none.
+    """
+    views: list[RecordedView] = []
+    for position in tqdm(positions, desc="reading episodes", disable=None):
+        row = episodes.rows[position]
+        for view in row.views:
+            frames = episodes.frames(position, view)
+            if len(frames) >= minimum:
+                video = frames_to_video(frames, image_size)
+                views.append(RecordedView(f"{row.episode_id}/{view}", ((video + 1.0) * 127.5).round().to(torch.uint8)))
+    if not views:
+        raise DataError("No episode is long enough to train on", where=episodes.root, expected=f">= {minimum} frames")
+    return views

@@ -24,16 +24,10 @@ from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.atomic import atomic_path, write_json_atomic
-from worldline_core.training.clip_source import (
-    TEMPORAL_COMPRESSION,
-    Clip,
-    ClipRow,
-    ClipSource,
-    latent_frame_count,
-    longest_clip,
-)
+from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, latent_frame_count, longest_clip
 
 Layout = Literal["groups", "clips"]
 _INDEX, _DESCRIPTION = "index.parquet", "store.json"
@@ -180,7 +174,7 @@ class LatentStore(ClipSource):
             first = shard.get_slice(single_key(episode_id))[:, :, index : index + 1]
             if frames == 1:
                 return first
-            period = TEMPORAL_COMPRESSION * stride
+            period = TEMPORAL_FACTOR * stride
             offset, phase = divmod(start + stride, period)
             groups = shard.get_slice(group_key(episode_id, stride, phase))
             return torch.cat([first, groups[:, :, offset : offset + frames - 1]], dim=2)

@@ -7,22 +7,30 @@ adjacent bins of one view (intra), and the same bin of the head and one wrist vi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
+import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.training.clip_loader import Batch
+from worldline_core.training.clip_source import Clip
+from worldline_core.training.trainer import average_values
+from worldline_core.training.video_teacher import VideoTeacher
 
 
 class RelationalConfig(StrictModel):
     """Targets and caps of the two terms (paper: 0.03 and 0.005 of the flow-matching loss, caps 0.20 and 0.10).
 
-    ``bins`` and ``grid`` are upper bounds: a clip with fewer latent frames gets one bin a frame, a coarser token grid
+    ``bins`` and ``grid`` are upper bounds: a clip with fewer latent frames gets one bin per frame, a coarser token grid
     (of student or teacher, whichever is coarser) is not blown up.
     """
 
@@ -38,29 +46,17 @@ class RelationalConfig(StrictModel):
     cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher features stay in memory")
 
 
-@dataclass(frozen=True)
-class PoolingShape:
-    """Bins and grid that student and teacher share."""
-
-    bins: int
-    rows: int
-    columns: int
-
-    @classmethod
-    def common(cls, config: RelationalConfig, *shapes: tuple[int, int, int]) -> PoolingShape:
-        """The finest pooling that the config allows and every (t, h, w) has."""
-        return cls(
-            min(config.bins, *(shape[0] for shape in shapes)),
-            min(config.grid[0], *(shape[1] for shape in shapes)),
-            min(config.grid[1], *(shape[2] for shape in shapes)),
-        )
+def common_shape(config: RelationalConfig, *grids: tuple[int, ...]) -> tuple[int, int, int]:
+    """The finest (bins, rows, columns) that the config allows and every (t, h, w) of ``grids`` has."""
+    bins, rows, columns = (min(sizes) for sizes in zip((config.bins, *config.grid), *grids, strict=True))
+    return bins, rows, columns
 
 
-def pool_features(features: Float[Tensor, "b v t h w d"], shape: PoolingShape) -> Float[Tensor, "b v bins n d"]:
+def pool_features(features: Float[Tensor, "b v t h w d"], shape: tuple[int, int, int]) -> Float[Tensor, "b v bins n d"]:
     """Average over temporal bins and grid cells; tokens of a bin are rows-first."""
     views = features.shape[1]
     volume = rearrange(features.float(), "b v t h w d -> (b v) d t h w")
-    pooled = functional.adaptive_avg_pool3d(volume, (shape.bins, shape.rows, shape.columns))
+    pooled = functional.adaptive_avg_pool3d(volume, shape)
     return rearrange(pooled, "(b v) d t h w -> b v t (h w) d", v=views)
 
 
@@ -98,7 +94,10 @@ def relational_losses(
 
 
 class RelationalScales:
-    """Loss scales that follow moving averages of L_FM / L_rel, so that each weighted term is a fixed part of L_FM."""
+    """Loss scales that follow moving averages of L_FM / L_rel, so that each weighted term is a fixed part of L_FM.
+
+    ``ratios``: the averages so far, which are part of the training state.
+    """
 
     def __init__(self, config: RelationalConfig) -> None:
         self.config = config
@@ -119,10 +118,72 @@ class RelationalScales:
             scales.append(ramp * min(cap, target * self.ratios[name]))
         return scales[0], scales[1]
 
-    def state(self) -> dict[str, Any]:
-        """For the training state."""
-        return dict(self.ratios)
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from a training state."""
-        self.ratios = {name: float(value) for name, value in state.items()}
+class TeacherFeatures:
+    """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
+
+    def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
+        self.teacher = teacher
+        self.episodes = EpisodeSet.open(episodes)
+        self.cached_clips = cached_clips
+        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Tensor] = OrderedDict()
+
+    def features(
+        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n height width 3"] | None = None
+    ) -> Float[Tensor, "b v t h w d"]:
+        """Features of every clip and view.
+
+        Args:
+            frames: of these clips, where they are read already; else they are decoded here, at the size of the recording.
+        """
+        given = [None] * len(clips) if frames is None else list(frames)
+        # Half precision does not survive a stack under CPU autocast.
+        return torch.stack([self._clip(c, tuple(views), f).float() for c, f in zip(clips, given, strict=True)])
+
+    def _clip(
+        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n height width 3"] | None
+    ) -> Float[Tensor, "v t h w d"]:
+        key = (clip, views)
+        if key in self._cache:
+            self._cache.move_to_end(key)
+            return self._cache[key]
+        if frames is None:
+            position = self.episodes.position(clip.episode_id)
+            decoded = [self.episodes.frames(position, view, list(clip.frames)) for view in views]
+            frames = torch.from_numpy(np.stack(decoded))
+        video = rearrange(frames.float() / 255.0, "v t h w c -> v c t h w")
+        features = self.teacher.features(video).to("cpu", torch.float16)
+        # Computed and cached values must be the same bits, so that a resumed run equals an undisturbed one.
+        if self.cached_clips:
+            self._cache[key] = features
+            if len(self._cache) > self.cached_clips:
+                self._cache.popitem(last=False)
+        return features
+
+
+class RelationalTerm:
+    """Teacher features, student layer and running scales of the relational terms."""
+
+    def __init__(self, config: RelationalConfig, teacher: TeacherFeatures, num_layers: int) -> None:
+        self.config = config
+        self.teacher = teacher
+        self.layer = config.student_layer or max(1, num_layers // 2)
+        self.scales = RelationalScales(config)
+
+    def add(
+        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], batch: Batch, step: int
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The flow-matching loss plus the weighted relational terms."""
+        taught = self.teacher.features(batch.clips, batch.views, batch.frames).to(features.device)
+        shape = common_shape(self.config, features.shape[2:5], taught.shape[2:5])
+        intra, cross = relational_losses(pool_features(features, shape), pool_features(taught, shape), step)
+        # Over all processes, so that their scales stay equal and one saved state is everyone's.
+        seen = average_values({"flow": flow.item(), "intra": intra.item(), "cross": cross.item()})
+        scale_intra, scale_cross = self.scales.update(seen["flow"], seen["intra"], seen["cross"], step)
+        values = {
+            "relational_intra": intra.item(),
+            "relational_cross": cross.item(),
+            "scale_intra": scale_intra,
+            "scale_cross": scale_cross,
+        }
+        return flow + scale_intra * intra + scale_cross * cross, values

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -20,7 +21,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_loader import Batch, BatchReader, ClipLoader, ClipReader, SkipLog
+from worldline_core.training.clip_loader import Batch, ClipLoader, ClipReader, SkipLog
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_sampler import JOINT, ClipSampler, ClipSampling
 from worldline_core.training.clip_source import (
@@ -41,9 +42,8 @@ from worldline_core.training.trainer import (
     ParameterGroup,
     TrainerConfig,
     TrainingResult,
-    autocast,
+    held_out_losses,
     join_processes,
-    step_generator,
     train,
 )
 
@@ -153,23 +153,32 @@ class Stage:
             TrainingError: a loss or gradient is not finite.
             ArtifactError: a saved state is damaged or belongs to another run.
         """
-        config = self.config
+        config, trainer = self.config, self.config.trainer
         skips = SkipLog(self.output / "run", self.rank, config.input.max_skipped)
-        reader = self._reader(loader.views)
+        here = ClipReader(self.source, self.sampler, loader.views, config.input)
+        reading = nullcontext(here)
+        if config.input.workers:
+            reading = ClipPrefetcher(
+                here,
+                workers=config.input.workers,
+                prefetch=config.input.prefetch,
+                stop=trainer.steps * trainer.accumulation,
+                pinned=torch.device(trainer.device).type == "cuda",
+            )
+        with reading as reader:
 
-        def load(index: int) -> Batch:
-            read = reader.read(index)
-            skips.add(read.skipped)
-            return loader.finish(read)
+            def load(index: int) -> Batch:
+                read = reader.read(index)
+                skips.add(read.skipped)
+                return loader.finish(read)
 
-        try:
             return train(
-                config.trainer,
+                trainer,
                 groups=groups,
                 objective=objective,
                 load=load,
                 validate=validation_function(
-                    loader, config.clips, config.validation_splits, config.trainer, self.rows, objective, config.input
+                    loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
                 ),
                 output=self.output,
                 identity={
@@ -182,22 +191,6 @@ class Stage:
                 rank=self.rank,
                 world_size=self.world_size,
             )
-        finally:
-            reader.close()
-
-    def _reader(self, views: tuple[str, ...]) -> BatchReader:
-        """Reads in this process, or ahead in processes of its own."""
-        source, trainer = self.config.input, self.config.trainer
-        reader = ClipReader(self.source, self.sampler, views, source)
-        if not source.workers:
-            return reader
-        return ClipPrefetcher(
-            reader,
-            workers=source.workers,
-            prefetch=source.prefetch,
-            stop=trainer.steps * trainer.accumulation,
-            pinned=torch.device(trainer.device).type == "cuda",
-        )
 
     def save(
         self,
@@ -240,15 +233,12 @@ class Stage:
         if self.config.clips.order == "epochs":
             facts["epochs"] = self.sampler.epochs(micro_steps)
         if source.on_unreadable == "skip":
-            facts["skipped_clips"] = SkipLog.count(self.output / "run", micro_steps)
+            facts["skipped_clips"] = SkipLog.count(self.output / "run")
         return facts
 
 
 class ValidatedObjective(Protocol):
-    """An objective whose model can be measured on held-out clips."""
-
-    @property
-    def model(self) -> WorldModel: ...
+    """An objective that can be measured on held-out clips."""
 
     def validation_losses(self, batch: Batch, generator: torch.Generator) -> dict[str, float]: ...
 
@@ -284,22 +274,13 @@ def validation_function(
     sampler = ClipSampler(loader.store, clips, splits=splits, batch_size=size, seed=VALIDATION_SEED, rows=held_out)
     reader = ClipReader(loader.store, sampler, loader.views, reading)
 
-    def validate() -> dict[str, float]:
-        totals: dict[str, float] = {}
-        objective.model.eval()
-        for index in range(trainer.validation_batches):
-            read = reader.read(index)
-            for item in read.skipped:
-                logger.warning("Held-out clip skipped: %s", item.reason)
-            batch = loader.finish(read)
-            with autocast(trainer):
-                values = objective.validation_losses(batch, step_generator(VALIDATION_SEED, index, trainer.device))
-            for key, value in values.items():
-                totals[key] = totals.get(key, 0.0) + value / trainer.validation_batches
-        objective.model.train()
-        return totals
+    def load(index: int) -> Batch:
+        read = reader.read(index)
+        for item in read.skipped:
+            logger.warning("Held-out clip skipped: %s", item.reason)
+        return loader.finish(read)
 
-    return validate
+    return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
 
 
 def _open_source(

@@ -10,8 +10,9 @@ import torch
 from pydantic import Field
 
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
+from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.text import TextConfig, load_text_encoder
-from worldline_core.model.world_model import WorldModel, WorldModelConfig, is_text_parameter
+from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.training.clip_sampler import ClipSampling
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage import Stage, StageConfig

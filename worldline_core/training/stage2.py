@@ -16,11 +16,11 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.flow_matching import FlowMatchingObjective, RelationalTerm
-from worldline_core.training.relational import RelationalConfig
+from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherFeatures
 from worldline_core.training.stage import Stage, StageConfig
 from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
-from worldline_core.training.video_teacher import TeacherFeatures, load_teacher
+from worldline_core.training.video_teacher import load_teacher
 
 FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)
 

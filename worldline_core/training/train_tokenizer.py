@@ -21,11 +21,10 @@ from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.model.patch_tokenizer import PatchTokenizer, Refinement
-from worldline_core.model.video_tokenizer import DESCRIPTION, VideoTokenizer, read_description
+from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer, Refinement, fit_patch_tokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.store.atomic import write_json_atomic
-from worldline_core.training.fit_tokenizer import fit_patch_tokenizer
-from worldline_core.training.recorded_views import RecordedView, load_views
+from worldline_core.training.frame_source import RecordedView, load_views
 from worldline_core.training.trainer import (
     Objective,
     OptimizerConfig,
@@ -95,19 +94,9 @@ def select_episodes(episodes: EpisodeSet, splits: tuple[str, ...], limit: int | 
     return chosen
 
 
-def to_float(video: Tensor) -> Tensor:
+def to_video(frames: Tensor) -> Tensor:
     """uint8 to [-1, 1]."""
-    return video.float() / 127.5 - 1.0
-
-
-def fitting_clips(views: Sequence[RecordedView], config: TokenizerConfig, temporal: int) -> Iterator[Tensor]:
-    """Random clips, ``(1 3 t h w)``, one at a time, as the fit consumes them."""
-    generator = np.random.default_rng(config.seed)
-    for _ in range(config.fit_clips):
-        video = views[int(generator.integers(len(views)))].frames
-        length = min(config.clip_frames, 1 + (video.shape[1] - 1) // temporal * temporal)
-        start = int(generator.integers(video.shape[1] - length + 1))
-        yield to_float(video[None, :, start : start + length])
+    return frames.float() / 127.5 - 1.0
 
 
 def video_batch(
@@ -124,7 +113,7 @@ def video_batch(
         picked = np.sort(generator.integers(groups, size=3))
         index = [start, *(start + 1 + group * temporal + k for group in picked for k in range(temporal))]
         names.append(view.name)
-        batch.append(to_float(view.frames[:, index]))
+        batch.append(to_video(view.frames[:, index]))
     return tuple(names), torch.stack(batch)
 
 
@@ -222,9 +211,18 @@ def train_decoder(
 
 def _fitted(config: TokenizerConfig, views: Sequence[RecordedView], folder: Path) -> PatchTokenizer:
     """Bases fitted now, or by the call that was interrupted (eigenvectors are not the same bits on another machine)."""
+
+    def clips() -> Iterator[Tensor]:
+        generator = np.random.default_rng(config.seed)
+        for _ in range(config.fit_clips):
+            frames = views[int(generator.integers(len(views)))].frames
+            length = min(config.clip_frames, 1 + (frames.shape[1] - 1) // 4 * 4)
+            start = int(generator.integers(frames.shape[1] - length + 1))
+            yield to_video(frames[None, :, start : start + length])
+
     if not (folder / DESCRIPTION).is_file():
         fit_patch_tokenizer(
-            fitting_clips(views, config, 4),
+            clips(),
             channels=config.channels,
             motion_weight=config.motion_weight,
             whitening=config.whitening,
@@ -234,16 +232,10 @@ def _fitted(config: TokenizerConfig, views: Sequence[RecordedView], folder: Path
     return PatchTokenizer.load(folder)
 
 
-def peak_signal_to_noise(video: Tensor, other: Tensor) -> float:
-    """PSNR in dB of videos in [-1, 1], ``(b 3 t h w)``: per frame, then averaged."""
-    error = (video.clamp(-1, 1) - other.clamp(-1, 1)).square().mean(dim=(1, 3, 4)).clamp_min(1e-10)
-    return float((10 * torch.log10(4.0 / error)).mean())
-
-
 def clip_of(video: Tensor, frames: int, temporal: int) -> Tensor:
     """The first ``frames`` (or as many whole groups as there are) of ``uint8 (3, N, H, W)``, as ``(1 3 t h w)``."""
     length = 1 + (min(frames, video.shape[1]) - 1) // temporal * temporal
-    return video[None, :, :length].float() / 127.5 - 1.0
+    return to_video(video[None, :, :length])
 
 
 @torch.no_grad()
@@ -263,7 +255,8 @@ def reconstruction_metrics(tokenizer: VideoTokenizer, videos: list[Tensor], fram
         changed = ((clip - clip[:, :, :1]).abs().amax(dim=1, keepdim=True) > 0.1).float()
         for name, candidate in candidates.items():
             error = (clip - candidate.clamp(-1, 1)).square()
-            sums[f"psnr/{name}"] = sums.get(f"psnr/{name}", 0.0) + peak_signal_to_noise(clip, candidate)
+            per_frame = error.mean(dim=(1, 3, 4)).clamp_min(1e-10)
+            sums[f"psnr/{name}"] = sums.get(f"psnr/{name}", 0.0) + float((10 * torch.log10(4.0 / per_frame)).mean())
             inside = float((error * changed).sum() / (3 * changed.sum()).clamp_min(1))
             sums[f"changed_mse/{name}"] = sums.get(f"changed_mse/{name}", 0.0) + inside
         sums["latent_deviation"] = sums.get("latent_deviation", 0.0) + float(latents.square().mean().sqrt())
@@ -286,8 +279,8 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
     views = load_views(episodes, chosen, config.image_size, _SHORTEST)
     if "start" in inputs:
-        start = read_description(Path(inputs["start"]))["weights_sha256"]
         tokenizer = PatchTokenizer.load(Path(inputs["start"]))
+        start = tokenizer.weights_sha256
     else:
         start = ""
         tokenizer = _fitted(config, views, output / BASES)

@@ -179,6 +179,23 @@ def autocast(config: TrainerConfig) -> AbstractContextManager[object]:
     return torch.autocast(torch.device(config.device).type, dtype=torch.bfloat16)
 
 
+def held_out_losses[BatchT](
+    config: TrainerConfig,
+    load: Callable[[int], BatchT],
+    losses: Callable[[BatchT, torch.Generator], Mapping[str, float]],
+    seed: int,
+) -> dict[str, float]:
+    """Mean of ``losses`` over the first ``validation_batches`` that ``load`` gives, each time with the same noise."""
+    totals: dict[str, float] = {}
+    for index in range(config.validation_batches):
+        batch = load(index)
+        with autocast(config):
+            values = losses(batch, step_generator(seed, index, config.device))
+        for key, value in values.items():
+            totals[key] = totals.get(key, 0.0) + value / config.validation_batches
+    return totals
+
+
 def train[BatchT: NamedBatch](
     config: TrainerConfig,
     *,
@@ -214,7 +231,14 @@ def train[BatchT: NamedBatch](
     parameters = {f"{group.name}/{name}": value for group in groups for name, value in group.parameters.items()}
     if not parameters:
         raise ConfigError("There is nothing to train.", where=title, expected="at least one trainable parameter")
-    optimizer = _optimizer(config.optimizer, groups)
+    settings = config.optimizer
+    optimizer = torch.optim.AdamW(
+        [{"params": list(group.parameters.values())} for group in groups],
+        lr=settings.learning_rate,
+        betas=settings.betas,
+        weight_decay=settings.weight_decay,
+        fused=True,
+    )
     average = ExponentialAverage(parameters, config.ema_decay)
     # Another number of processes takes other batches: that is another run.
     digests = identity_digests({**identity, "processes": world_size})
@@ -230,9 +254,9 @@ def train[BatchT: NamedBatch](
     seen = 0
     progress = tqdm(total=config.steps, initial=first, desc=title, unit="step", disable=None if rank == 0 else True)
     for step in range(first, config.steps):
-        factor = schedule(step) if schedule else learning_rate_factor(config.optimizer, step, config.steps)
+        factor = schedule(step) if schedule else learning_rate_factor(settings, step, config.steps)
         for slot, group in zip(optimizer.param_groups, groups, strict=True):
-            slot["lr"] = config.optimizer.learning_rate * group.multiplier * factor
+            slot["lr"] = settings.learning_rate * group.multiplier * factor
         values, norm, size = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
         average.update(step)
         seen += size * world_size
@@ -243,7 +267,7 @@ def train[BatchT: NamedBatch](
         if done % config.log_every == 0 or done == config.steps:
             last = {key: value / count for key, value in sums.items()}
             sums, count = {}, 0
-            row = {"step": done, "learning_rate": config.optimizer.learning_rate * factor, **last}
+            row = {"step": done, "learning_rate": settings.learning_rate * factor, **last}
             seconds = time.monotonic() - started
             if log is not None and timings is not None:
                 log.add(row)
@@ -259,31 +283,13 @@ def train[BatchT: NamedBatch](
         progress.update(1)
         by_steps = config.save_every_steps and done % config.save_every_steps == 0
         if rank == 0 and (by_steps or time.monotonic() - saved_at >= config.save_every_seconds or done == config.steps):
-            facts = {
-                "step": done,
-                "identity": digests,
-                "sums": sums,
-                "count": count,
-                "last": last,
-                "objective": objective.state(),
-            }
+            facts = {"step": done, "identity": digests, "sums": sums, "count": count, "last": last}
+            facts["objective"] = objective.state()
             save_training_state(state_path, parameters, average, optimizer, facts)
             saved_at = time.monotonic()
     progress.close()
     names = [name for group in groups for name in group.parameters]
     return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
-
-
-def _optimizer(config: OptimizerConfig, groups: Sequence[ParameterGroup]) -> torch.optim.AdamW:
-    return torch.optim.AdamW(
-        [
-            {"params": list(group.parameters.values()), "lr": config.learning_rate * group.multiplier}
-            for group in groups
-        ],
-        betas=config.betas,
-        weight_decay=config.weight_decay,
-        fused=True,
-    )
 
 
 def _step[BatchT: NamedBatch](

@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from worldline_core.errors import ArtifactError
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic
 
 
@@ -26,25 +27,13 @@ class MetricsLog:
 
     def __init__(self, path: Path, resume_step: int) -> None:
         self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        kept = [line for line in _complete_lines(path) if json.loads(line)["step"] <= resume_step]
-        write_bytes_atomic(path, "".join(f"{line}\n" for line in kept).encode())
+        kept = [row for row in read_json_lines(path) if row["step"] <= resume_step]
+        write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in kept).encode())
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Append one row."""
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(row, allow_nan=False) + "\n")
-
-
-def _complete_lines(path: Path) -> list[str]:
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    # A kill may have cut the last line short.
-    return text[: text.rfind("\n") + 1].splitlines()
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """All rows of a log, for loss curves."""
-    return [json.loads(line) for line in _complete_lines(path)]
 
 
 class ExponentialAverage:
@@ -121,24 +110,6 @@ def identity_digests(identity: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def read_training_facts(path: Path) -> dict[str, Any]:
-    """The JSON facts of a state file.
-
-    Raises:
-        ArtifactError: if it is damaged.
-    """
-    try:
-        with safe_open(path, framework="pt") as stored:
-            return json.loads((stored.metadata() or {})["facts"])
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise ArtifactError(
-            "The training state is damaged.",
-            where=path,
-            got=repr(error),
-            next_step="delete it to start this run again",
-        ) from error
-
-
 @torch.no_grad()
 def load_training_state(
     path: Path,
@@ -155,7 +126,16 @@ def load_training_state(
     Raises:
         ArtifactError: if it is damaged, or belongs to a run with another configuration, model or other clips.
     """
-    facts = read_training_facts(path)
+    try:
+        with safe_open(path, framework="pt") as stored:
+            facts = json.loads((stored.metadata() or {})["facts"])
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise ArtifactError(
+            "The training state is damaged.",
+            where=path,
+            got=repr(error),
+            next_step="delete it to start this run again",
+        ) from error
     found = facts.get("identity", {})
     different = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
     if different:

@@ -1,30 +1,30 @@
-"""Frozen video encoders whose features the relational terms compare with, and a cache of the features of clips.
+"""Frozen video encoders whose features the relational terms compare with.
 
 ``SmallVideoTeacher`` is the embedded default (trained by the train_teacher step); ``VJepa2Teacher`` is V-JEPA 2 from a
-local folder. Neither is ever used with random weights.
+local folder. Neither is ever used with random weights. The features of both are the normalised outputs of their last
+four blocks, concatenated.
 """
 
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float
+from pydantic import Field, ValidationError
+from torch import Tensor, nn
 from torch.nn import functional
 
-from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.training.clip_source import Clip
-from worldline_core.training.small_teacher import DESCRIPTION, load_small_teacher
+from worldline_core.config import StrictModel
+from worldline_core.errors import CheckpointError, DataError, UnavailableError
+from worldline_core.model.checkpoint import fill, read_description, read_weights
 
-JEPA_BLOCKS = 4
+DESCRIPTION, WEIGHTS = "teacher.json", "teacher.safetensors"
+FORMAT = "worldline.small_video_teacher"
+TUBELET, BLOCKS = 4, 4
 
 
 class VideoTeacher(Protocol):
@@ -35,11 +35,122 @@ class VideoTeacher(Protocol):
     def features(self, frames: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b t2 h2 w2 d"]: ...
 
 
+def concatenated(outputs: list[Tensor], rows: int, columns: int) -> Float[Tensor, "b t h w d"]:
+    """Outputs of several blocks, ``(b n d)``, layer-normalised and side by side on their grid."""
+    normalised = torch.cat([functional.layer_norm(output.float(), output.shape[-1:]) for output in outputs], dim=-1)
+    return rearrange(normalised, "b (t h w) d -> b t h w d", h=rows, w=columns)
+
+
+class SmallTeacherShape(StrictModel):
+    """Size of the encoder. ``patch`` is the side of a tubelet in pixels of ``image_size`` (height, width)."""
+
+    image_size: tuple[int, int] = (64, 96)
+    patch: int = Field(default=16, ge=2)
+    max_groups: int = Field(default=33, ge=2, description="longest clip in latent frames")
+    hidden_size: int = Field(default=128, ge=8)
+    num_layers: int = Field(default=6, ge=BLOCKS)
+    num_heads: int = Field(default=4, ge=1)
+
+
+class SmallVideoTeacher(nn.Module):
+    """A masked-video transformer over tubelets: the first frame alone, then groups of four, as the tokenizer does.
+
+    In training part of the tubelets is hidden, and their pixels are predicted from the rest.
+    """
+
+    name = "small video teacher"
+
+    def __init__(self, shape: SmallTeacherShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.grid = (shape.image_size[0] // shape.patch, shape.image_size[1] // shape.patch)
+        values = 3 * TUBELET * shape.patch**2
+        width = shape.hidden_size
+        self.embed = nn.Linear(values, width)
+        self.position = nn.Parameter(torch.zeros(self.grid[0] * self.grid[1], width))
+        self.time = nn.Parameter(torch.zeros(shape.max_groups, width))
+        self.mask_token = nn.Parameter(torch.zeros(width))
+        self.blocks = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width,
+                shape.num_heads,
+                4 * width,
+                dropout=0.0,
+                activation="gelu",
+                batch_first=True,
+                norm_first=True,
+            )
+            for _ in range(shape.num_layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.head = nn.Linear(width, values)
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Weights for training: deterministic in the generator."""
+        for parameter in self.parameters():
+            if parameter.ndim > 1:
+                nn.init.normal_(parameter, 0.0, 0.02, generator=generator)
+
+    def tubelets(self, frames: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b t2 n p"]:
+        """Pixels of every tubelet; the first frame is repeated to fill its own.
+
+        Raises:
+            DataError: if the clip does not have 4 k + 1 frames, or more than the encoder has positions for.
+        """
+        batch, _, length = frames.shape[:3]
+        if (length - 1) % TUBELET or 1 + (length - 1) // TUBELET > self.shape.max_groups:
+            raise DataError(
+                "The teacher cannot read a clip of this length.",
+                expected=f"4 k + 1 frames, at most {1 + TUBELET * (self.shape.max_groups - 1)}",
+                got=length,
+            )
+        if tuple(frames.shape[-2:]) != self.shape.image_size:
+            flat = rearrange(frames, "b c t h w -> (b t) c h w")
+            flat = functional.interpolate(flat, self.shape.image_size, mode="area")
+            frames = rearrange(flat, "(b t) c h w -> b c t h w", b=batch)
+        frames = torch.cat([frames[:, :, :1].expand(-1, -1, TUBELET - 1, -1, -1), frames], dim=2)
+        size = self.shape.patch
+        return rearrange(frames, "b c (t k) (h p) (w q) -> b t (h w) (c k p q)", k=TUBELET, p=size, q=size)
+
+    def encode(
+        self, tubelets: Float[Tensor, "b t n p"], hidden: Bool[Tensor, "b t n"] | None = None
+    ) -> list[Float[Tensor, "b m d"]]:
+        """Outputs of the last four blocks."""
+        tokens = self.embed(tubelets * 2 - 1)
+        if hidden is not None:
+            tokens = torch.where(hidden[..., None], self.mask_token.to(tokens.dtype), tokens)
+        tokens = tokens + self.position + self.time[: tokens.shape[1], None]
+        tokens = rearrange(tokens, "b t n d -> b (t n) d")
+        outputs: list[Tensor] = []
+        for block in self.blocks:
+            tokens = block(tokens)
+            outputs.append(tokens)
+        return outputs[-BLOCKS:]
+
+    def masked_loss(self, frames: Float[Tensor, "b 3 t h w"], hidden: Bool[Tensor, "b bins n"]) -> Float[Tensor, ""]:
+        """Squared error of the hidden tubelets' pixels.
+
+        The target is the change against the clip's first frame, scaled by its deviation over the clip: predicting it
+        takes knowing what moves, not what the table looks like.
+        """
+        tubelets = self.tubelets(frames)
+        tokens = self.encode(tubelets, hidden)[-1]
+        predicted = rearrange(self.head(self.norm(tokens)), "b (t n) p -> b t n p", t=tubelets.shape[1])
+        target = tubelets - tubelets[:, :1]
+        target = target / (target.flatten(1).std(dim=1) + 0.02)[:, None, None, None]
+        error = ((predicted.float() - target) ** 2).mean(dim=-1)
+        return error[hidden].mean()
+
+    @torch.no_grad()
+    def features(self, frames: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b t2 h2 w2 d"]:
+        """Concatenated, normalised outputs of the last four blocks; frames in [0, 1]."""
+        return concatenated(self.encode(self.tubelets(frames.to(self.embed.weight.device))), *self.grid)
+
+
 class VJepa2Teacher:
     """V-JEPA 2 (paper: ViT-g/384), weights from a local transformers folder.
 
-    The outputs of the last four blocks are layer-normalised and concatenated. Frames are resized to the encoder's
-    crop size, because its rotary grid follows from it.
+    Frames are resized to the encoder's crop size, because its rotary grid follows from it.
     """
 
     name = "V-JEPA 2"
@@ -65,7 +176,7 @@ class VJepa2Teacher:
         self.side = self.crop // int(self.model.config.patch_size)  # pyright: ignore[reportArgumentType]
         self.tubelet: int = self.model.config.tubelet_size
         self._outputs: list[Tensor] = []
-        for layer in self.model.encoder.layer[-JEPA_BLOCKS:]:
+        for layer in self.model.encoder.layer[-BLOCKS:]:
             layer.register_forward_hook(self._keep)
 
     def _keep(self, module: torch.nn.Module, inputs: object, output: tuple[Tensor, ...] | Tensor) -> None:
@@ -88,20 +199,27 @@ class VJepa2Teacher:
         self._outputs.clear()
         parameter = next(self.model.parameters())
         self.model(pixel_values_videos=video.to(parameter.device, parameter.dtype), skip_predictor=True)
-        normalised = [functional.layer_norm(output.float(), output.shape[-1:]) for output in self._outputs]
+        features = concatenated(self._outputs, self.side, self.side)
         self._outputs.clear()
-        return rearrange(torch.cat(normalised, dim=-1), "b (t h w) d -> b t h w d", h=self.side, w=self.side)
+        return features
 
 
 def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
     """The teacher in ``folder``: the small one, or V-JEPA 2.
 
     Raises:
-        CheckpointError: if it holds neither.
+        CheckpointError: if it holds neither, or a damaged one.
         UnavailableError: if V-JEPA 2's weights are missing.
     """
-    if (folder / DESCRIPTION).is_file():
-        return load_small_teacher(folder).to(device)
+    path = folder / DESCRIPTION
+    if path.is_file():
+        try:
+            shape = SmallTeacherShape.model_validate(read_description(path, FORMAT, "small teacher").get("shape"))
+        except ValidationError as error:
+            raise CheckpointError("The small teacher's shape is not valid", where=path, got=str(error)) from error
+        teacher = SmallVideoTeacher(shape)
+        fill(teacher, read_weights(folder / WEIGHTS, None), where=folder / WEIGHTS, dtype=torch.float32)
+        return teacher.eval().requires_grad_(False).to(device)
     config = folder / "config.json"
     if config.is_file() and json.loads(config.read_text()).get("model_type") == "vjepa2":
         return VJepa2Teacher(folder, device)
@@ -112,45 +230,3 @@ def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
         got=sorted(path.name for path in folder.glob("*"))[:8],
         next_step="run train_teacher, or download V-JEPA 2",
     )
-
-
-class TeacherFeatures:
-    """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
-
-    def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
-        self.teacher = teacher
-        self.episodes = EpisodeSet.open(episodes)
-        self.cached_clips = cached_clips
-        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Tensor] = OrderedDict()
-
-    def features(
-        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n height width 3"] | None = None
-    ) -> Float[Tensor, "b v t h w d"]:
-        """Features of every clip and view.
-
-        Args:
-            frames: of these clips, where they are read already; else they are decoded here, at the size of the recording.
-        """
-        given = [None] * len(clips) if frames is None else list(frames)
-        # Half precision does not survive a stack under CPU autocast.
-        return torch.stack([self._clip(c, tuple(views), f).float() for c, f in zip(clips, given, strict=True)])
-
-    def _clip(
-        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n height width 3"] | None
-    ) -> Float[Tensor, "v t h w d"]:
-        key = (clip, views)
-        if key in self._cache:
-            self._cache.move_to_end(key)
-            return self._cache[key]
-        if frames is None:
-            position = self.episodes.position(clip.episode_id)
-            decoded = [self.episodes.frames(position, view, list(clip.frames)) for view in views]
-            frames = torch.from_numpy(np.stack(decoded))
-        video = rearrange(frames.float() / 255.0, "v t h w c -> v c t h w")
-        features = self.teacher.features(video).to("cpu", torch.float16)
-        # Computed and cached values must be the same bits, so that a resumed run equals an undisturbed one.
-        if self.cached_clips:
-            self._cache[key] = features
-            if len(self._cache) > self.cached_clips:
-                self._cache.popitem(last=False)
-        return features

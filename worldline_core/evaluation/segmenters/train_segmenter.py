@@ -23,6 +23,7 @@ from worldline_core.evaluation.metrics import frames_to_unit, video_iou
 from worldline_core.evaluation.segmenters.augmentation import augment, degrade
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.geometry.cameras import ImageTransform
+from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training.trainer import (
     Objective,
     OptimizerConfig,
@@ -31,7 +32,6 @@ from worldline_core.training.trainer import (
     step_generator,
     train,
 )
-from worldline_core.training.training_state import read_metrics
 
 HEAD = "head"
 
@@ -172,7 +172,7 @@ def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output:
         "metrics": metrics,
     }
     save_segmenter(output, config.widths, result.average, description)
-    losses = [row["loss"] for row in read_metrics(output / "metrics.jsonl")]
+    losses = [row["loss"] for row in read_json_lines(output / "metrics.jsonl")]
     return {"videos": len(videos), "steps": config.steps, "final_loss": float(np.mean(losses[-50:])), "iou": metrics}
 
 

@@ -1,7 +1,8 @@
-"""The Wan 2.2 video autoencoder, through diffusers, with the interface of every tokenizer here."""
+"""The video tokenizer of a folder: our patch tokenizer, or the Wan 2.2 autoencoder through diffusers."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,8 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.video_tokenizer import check_latents, check_video
+from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer, check_latents, check_video
 
 if TYPE_CHECKING:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
@@ -112,3 +114,30 @@ class WanTokenizer(nn.Module):
         except (OSError, ValueError, RuntimeError, SafetensorError) as error:
             raise CheckpointError("The Wan autoencoder cannot be read", where=root, got=str(error)) from error
         return cls(vae.eval().requires_grad_(False), where=root)
+
+
+def load_tokenizer(folder: Path, device: str = "cpu") -> VideoTokenizer:
+    """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.
+
+    Raises:
+        CheckpointError: the folder holds none, or a damaged one.
+    """
+    if (folder / "config.json").is_file() or (folder / "vae" / "config.json").is_file():
+        return WanTokenizer.load(folder).to(device)
+    return PatchTokenizer.load(folder).to(device)
+
+
+def tokenizer_fingerprint(tokenizer: VideoTokenizer, folder: Path) -> str:
+    """Name of the encoder, 16 hexadecimal digits, so that latents and models of one tokenizer stay together.
+
+    A patch tokenizer tells its encoder from its decoder: a better decoder keeps the latents valid. Otherwise it is a
+    digest of the folder's weights and configuration.
+    """
+    if isinstance(tokenizer, PatchTokenizer):
+        return tokenizer.encoder_digest[:16]
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.suffix in {".safetensors", ".json"} and path.name != "manifest.json":
+            digest.update(path.relative_to(folder).as_posix().encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
