@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
 from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.digest import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
@@ -134,7 +136,8 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert (world.steps, world.frames_per_unit) == (2, 8)
     passes.clear()
     first, maps = torch.randn(1, 3, 4, 4, 4), torch.randn(1, 3, 9, 5, 4, 4)
-    assert len(world.time_blocks(first, maps, [42], blocks=4)) == 4
+    times = long_rollout(partial(world.simulator, [42]), first, maps, blocks=4)
+    assert len(times["block_seconds"]) == 4
     assert set(passes) == {(2, 1, 1.0), (2, 1, 0.6)}
 
 

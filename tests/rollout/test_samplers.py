@@ -13,13 +13,13 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
 from worldline_core.rollout.samplers import (
+    FULL_STEPS,
     BlockCausalSimulator,
     Noise,
     euler_step,
     rollout_full_clip,
     shifted_sigmas,
     sigmas_causal,
-    sigmas_full,
 )
 
 
@@ -40,8 +40,8 @@ SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=CAUSAL_SI
 def test_nodes_of_the_samplers() -> None:
     assert shifted_sigmas(4, 5.0) == pytest.approx(CAUSAL_SIGMAS)
     assert sigmas_causal(SPEC) == sigmas_causal(SPEC, 4) == CAUSAL_SIGMAS
-    assert len(sigmas_full()) == 36
-    assert sigmas_full(2) == (1.0, 0.5, 0.0)
+    assert len(shifted_sigmas(FULL_STEPS)) == 36
+    assert shifted_sigmas(2) == (1.0, 0.5, 0.0)
     assert sigmas_causal(SPEC, 2) == pytest.approx((1.0, 5 / 6, 0.0))
     with pytest.raises(ConfigError, match="at least one step"):
         shifted_sigmas(0)

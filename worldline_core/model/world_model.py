@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from einops import rearrange, repeat
@@ -131,7 +132,7 @@ class WorldModel(nn.Module):
         by = (rearrange(by[0], "b n d -> b 1 n d"), rearrange(by[1], "b n d -> b 1 n d"))
         tokens = self.embed_tokens(text_ids)
         contexts = []
-        for layer in self.layers:
+        for layer in self._mixture():
             tokens, context = layer.understand(tokens, by)
             contexts.append(context)
         padded = text_mask is not None and not bool(text_mask.all())
@@ -268,6 +269,9 @@ class WorldModel(nn.Module):
         velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
 
+    def _mixture(self) -> Sequence[MixtureLayer]:
+        return cast("Sequence[MixtureLayer]", self.layers)
+
     def _check(self, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
         config = self.config
         expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
@@ -340,7 +344,7 @@ class WorldModel(nn.Module):
         if features_at is not None and not 1 <= features_at <= len(self.layers):
             raise ConfigError("features_at counts layers from 1", expected=f"1..{len(self.layers)}", got=features_at)
         features = None
-        for index, layer in enumerate(self.layers):
+        for index, layer in enumerate(self._mixture()):
             context = None if text is None else text.layers[index]
             if self.gradient_checkpointing and torch.is_grad_enabled():
                 tokens = checkpoint(layer, tokens, attend, index, context, use_reentrant=False)

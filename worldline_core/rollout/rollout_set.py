@@ -1,4 +1,4 @@
-"""Sets of predicted videos on disk: one mp4 a view and seed, and an index."""
+"""Sets of predicted videos on disk: one mp4 per view and seed, and an index."""
 
 from __future__ import annotations
 
@@ -14,22 +14,10 @@ import pyarrow.parquet as pq
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import atomic_path
 
 INDEX_FILE = "index.parquet"
-_SCHEMA = pa.schema(
-    [
-        ("episode_id", pa.string()),
-        ("method", pa.string()),
-        ("view", pa.string()),
-        ("seed", pa.int64()),
-        ("path", pa.string()),
-        ("num_frames", pa.int64()),
-        ("height", pa.int64()),
-        ("width", pa.int64()),
-        ("fps", pa.float64()),
-    ]
-)
 
 
 @dataclass(frozen=True)
@@ -45,6 +33,9 @@ class RolloutRow:
     height: int
     width: int
     fps: float
+
+
+_SCHEMA = row_schema(RolloutRow)
 
 
 def video_path(episode_id: str, seed: int, view: str) -> str:

@@ -19,6 +19,7 @@ from worldline_core.model.world_model_config import VIEWS
 VelocityField = Callable[[Tensor, float], Tensor]
 """Velocity at (state, noise level)."""
 FULL_STEPS = 35
+"""Euler steps of the whole-clip sampler, at even noise levels."""
 
 
 def shifted_sigmas(steps: int, shift: float = 1.0) -> tuple[float, ...]:
@@ -31,11 +32,6 @@ def shifted_sigmas(steps: int, shift: float = 1.0) -> tuple[float, ...]:
         raise ConfigError("A sampler needs at least one step and a positive shift", got=f"steps {steps}, shift {shift}")
     grid = [1.0 - step / steps for step in range(steps)]
     return (*(shift * s / (1.0 + (shift - 1.0) * s) for s in grid), 0.0)
-
-
-def sigmas_full(steps: int = FULL_STEPS) -> tuple[float, ...]:
-    """Even nodes of the whole-clip sampler."""
-    return shifted_sigmas(steps)
 
 
 def sigmas_causal(spec: CausalSpec, steps: int | None = None) -> tuple[float, ...]:
@@ -67,7 +63,7 @@ class Noise:
         self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def draw(self, shape: Sequence[int], device: torch.device | str = "cpu") -> Tensor:
-        """``(batch, *shape)``, one slice a seed."""
+        """``(batch, *shape)``, one slice per seed."""
         return torch.stack([torch.randn(tuple(shape), generator=g) for g in self._generators]).to(device)
 
     def copy(self) -> Noise:
@@ -116,7 +112,7 @@ def rollout_full_clip(
         return model(state, levels, action_maps=action_maps, text=text, views=views).velocity
 
     with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
-        return integrate(velocity, latents, sigmas_full(steps))
+        return integrate(velocity, latents, shifted_sigmas(steps))
 
 
 class BlockCausalSimulator:

@@ -11,11 +11,14 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from worldline_core.rollout.samplers import BlockCausalSimulator
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
@@ -45,12 +48,28 @@ def timed[T](work: Callable[[], T], device: str) -> tuple[T, Elapsed]:
     return result, Elapsed(time.perf_counter() - wall, time.process_time() - processor)
 
 
-def long_rollout(blocks: Sequence[Elapsed], device: str) -> dict[str, list[float]]:
-    """Times of the blocks of one long rollout; processor seconds only where the processor did the work."""
-    times = {"block_seconds": [block.wall for block in blocks]}
-    if torch.device(device).type == "cpu":
-        times["block_processor_seconds"] = [block.processor for block in blocks]
-    return times
+def long_rollout(
+    simulator: Callable[[], BlockCausalSimulator], first: Tensor, maps: Tensor, blocks: int, *, warm_up: int = 2
+) -> dict[str, list[float]]:
+    """What every block takes of one long rollout that goes on with its last controls; nothing of it is kept.
+
+    Processor seconds are given only where the processor did the work.
+
+    Args:
+        first, maps: observed latents ``(b v c h w)`` and the action maps of a clip ``(b v a t h w)``.
+        warm_up: blocks of another rollout before it, which are not counted.
+    """
+    device = str(maps.device)
+    times: list[Elapsed] = []
+    for count in (warm_up, blocks):
+        running = simulator()
+        running.start(first, maps[:, :, :, :1])
+        controls = maps[:, :, :, -running.spec.block_size :]
+        times = [timed(partial(running.step, controls), device)[1] for _ in range(count)]
+    seconds = {"block_seconds": [block.wall for block in times]}
+    if maps.device.type == "cpu":
+        seconds["block_processor_seconds"] = [block.processor for block in times]
+    return seconds
 
 
 def device_name(device: str) -> str:

@@ -26,7 +26,7 @@ from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprin
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip, sigmas_causal
-from worldline_core.rollout.speed import Elapsed, timed
+from worldline_core.rollout.speed import timed
 
 HEAD_VIEW = "head"
 
@@ -76,8 +76,6 @@ class WorldLine:
         self.model = model.to(device).eval().requires_grad_(False)
         self.info = info
         self.tokenizer = tokenizer
-        if isinstance(tokenizer, torch.nn.Module):
-            tokenizer.to(device).eval()
         self.device = device
         self.bfloat16 = bfloat16
         self.views = tuple(info.config.views)
@@ -244,18 +242,6 @@ class WorldLine:
             raise CheckpointError("Only a causal model goes block by block", expected="causal", got=self.info.kind)
         noise = Noise(seeds)
         return BlockCausalSimulator(self.model, self.causal, noise=noise, views=self.views, bfloat16=self.bfloat16)
-
-    def time_blocks(
-        self, first: Tensor, maps: Tensor, seeds: Sequence[int], blocks: int, *, warm_up: int = 2
-    ) -> list[Elapsed]:
-        """What every block takes of one long rollout that goes on with its last controls; nothing of it is kept."""
-        times: list[Elapsed] = []
-        for count in (warm_up, blocks):
-            simulator = self.simulator(seeds)
-            simulator.start(first, maps[:, :, :, :1])
-            controls = maps[:, :, :, -simulator.spec.block_size :]
-            times = [timed(partial(simulator.step, controls), self.device)[1] for _ in range(count)]
-        return times
 
     def _sample(self, first: Tensor, maps: Tensor, seeds: Sequence[int]) -> Tensor:
         self.block_seconds = []
