@@ -106,9 +106,7 @@ class WorldModel(nn.Module):
 
     def action_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
         """The action branch, trained at its own rate."""
-        for name, parameter in self.named_parameters():
-            if name.startswith("action_encoder."):
-                yield name, parameter
+        return self.action_encoder.named_parameters(prefix="action_encoder")
 
     def encode_text(self, text_ids: Tensor, text_mask: Tensor | None = None) -> TextContext:
         """Run the understanding tower over right-padded token ids ``(b m)``.
@@ -124,19 +122,15 @@ class WorldModel(nn.Module):
                 next_step="load the Stage I checkpoint with both towers, or leave the text out",
             )
         size = text_ids.shape[1]
-        if text_mask is None:
-            lengths = torch.full((len(text_ids),), size, device=text_ids.device)
-        else:
-            lengths = text_mask.sum(dim=1)
-        by = rotation(self.config, text_positions(lengths, size))
-        by = (rearrange(by[0], "b n d -> b 1 n d"), rearrange(by[1], "b n d -> b 1 n d"))
+        mask = torch.ones_like(text_ids, dtype=torch.bool) if text_mask is None else text_mask.bool()
+        cosine, sine = rotation(self.config, text_positions(mask.sum(dim=1), size))
+        by = (rearrange(cosine, "b n d -> b 1 n d"), rearrange(sine, "b n d -> b 1 n d"))
         tokens = self.embed_tokens(text_ids)
         contexts = []
         for layer in self._mixture():
             tokens, context = layer.understand(tokens, by)
             contexts.append(context)
-        padded = text_mask is not None and not bool(text_mask.all())
-        return TextContext(tuple(contexts), text_mask.bool() if padded and text_mask is not None else None, size)
+        return TextContext(tuple(contexts), None if bool(mask.all()) else mask, size)
 
     def forward(
         self,
@@ -254,8 +248,7 @@ class WorldModel(nn.Module):
         frame_sigma = repeat(sigma, "b blocks -> b (blocks size)", size=block_size)
         latents = torch.cat((clean[..., :history, :, :], noisy[..., 1:, :, :].to(clean.dtype)), dim=3)
         frame_sigma = torch.cat((frame_sigma.new_zeros(batch, history), frame_sigma), dim=1)
-        is_clean = torch.arange(history + frames - 1, device=noisy.device) < history
-        is_clean = repeat(is_clean, "t -> b t", b=batch)
+        is_clean = (torch.arange(history + frames - 1, device=noisy.device) < history).expand(batch, -1)
         maps = None
         if action_maps is not None:
             maps = torch.cat((action_maps[..., :history, :, :], action_maps[..., 1:, :, :]), dim=3)
