@@ -41,7 +41,14 @@ from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.clip_source import ClipRow, named_rows, training_rows
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage import validation_function
-from worldline_core.training.trainer import ParameterGroup, TrainerConfig, join_processes, train, wait_for_all
+from worldline_core.training.trainer import (
+    ParameterGroup,
+    TrainerConfig,
+    join_processes,
+    processes,
+    train,
+    wait_for_all,
+)
 
 __all__ = ["DistillConfig", "distill"]
 
@@ -82,8 +89,6 @@ class DistillationRun:
     rows: list[ClipRow]
     output: Path
     perceptual: PerceptualDistance | None
-    rank: int
-    world_size: int
 
     @classmethod
     def open(cls, config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> DistillationRun:
@@ -94,15 +99,12 @@ class DistillationRun:
         """
         output.mkdir(parents=True, exist_ok=True)
         device = config.teacher_forcing.trainer.device
-        rank, world_size = join_processes(device)
+        join_processes(device)
         info = read_checkpoint_info(Path(inputs["stage2"]))
         store, tracks = LatentStore.open(Path(inputs["latents"])), ActionTracks.open(Path(inputs["tracks"]))
         contract = info.contract
-        contract.require(
-            where=inputs["latents"],
-            tokenizer=store.description["tokenizer"],
-            grid_size=tuple(store.latent_shape[1:]),
-        )
+        found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
+        contract.require(where=inputs["latents"], **found)
         contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
         loader = ClipLoader(
             store,
@@ -120,8 +122,6 @@ class DistillationRun:
             rows=training_rows(store, EpisodeSet.open(Path(inputs["episodes"])), stage=2, tracks=tracks),
             output=output,
             perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
-            rank=rank,
-            world_size=world_size,
         )
 
     @property
@@ -168,14 +168,15 @@ class DistillationRun:
 
     def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, *, distributed: bool) -> ClipSampler:
         """Clips of the training splits; the same on every process unless `distributed`."""
+        rank, world_size = processes() if distributed else (0, 1)
         return ClipSampler(
             self.store,
             clips,
             splits=self.config.splits,
             batch_size=batch_size,
             seed=seed,
-            rank=self.rank if distributed else 0,
-            world_size=self.world_size if distributed else 1,
+            rank=rank,
+            world_size=world_size,
             rows=self.rows,
         )
 
@@ -188,7 +189,8 @@ class DistillationRun:
         settings = self.config.trajectory_regression.trajectories
         trainer = self.config.trajectory_regression.trainer
         folder = self._trajectory_folder
-        if self.rank == 0 and not (folder / INDEX).is_file():
+        first = processes()[0] == 0
+        if first and not (folder / INDEX).is_file():
             teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
             teacher.to(trainer.device).eval().requires_grad_(False)
             per_shard = min(settings.clips, settings.clips_per_shard)
@@ -202,7 +204,7 @@ class DistillationRun:
                 **settings.model_dump(mode="json"),
             }
             write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
-        if self.rank == 0:
+        if first:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
         wait_for_all()
 
@@ -213,8 +215,6 @@ class DistillationRun:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             generated_history=self.config.trajectory_regression.trajectories.history == "generated",
-            rank=self.rank,
-            world_size=self.world_size,
         )
         return loader.load
 
@@ -249,10 +249,8 @@ class DistillationRun:
                 "episodes": named_rows(self.rows),
             },
             title=step.replace("_", " "),
-            rank=self.rank,
-            world_size=self.world_size,
         )
-        if self.rank == 0:
+        if processes()[0] == 0:
             trained = {name: result.average[name] for name, _ in model.named_parameters()}
             write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
             save_checkpoint(

@@ -31,6 +31,7 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.digest import digest_file
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_source import Clip, ClipBatch
+from worldline_core.training.trainer import processes
 
 INDEX = "trajectories.json"
 
@@ -157,16 +158,12 @@ class TrajectoryLoader:
         batch_size: int,
         seed: int,
         generated_history: bool,
-        rank: int = 0,
-        world_size: int = 1,
     ) -> None:
         self.store = store
         self.loader = loader
         self.batch_size = batch_size
         self.seed = seed
         self.generated_history = generated_history
-        self.rank = rank
-        self.world_size = world_size
         # A batch has one shape, so its clips have one length: a group is drawn by its size, then clips within it.
         lengths = [clip.num_frames for clip in store.clips(range(len(store)))]
         self._groups = [
@@ -178,8 +175,9 @@ class TrajectoryLoader:
         """The batch of micro-step `index` (of this rank)."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         group = self._groups[int(random.choice(len(self._groups), p=self._shares))]
-        draws = random.integers(len(group), size=self.batch_size * self.world_size)
-        rows = [group[int(draw)] for draw in draws[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]]
+        rank, world_size = processes()
+        draws = random.integers(len(group), size=self.batch_size * world_size)
+        rows = [group[int(draw)] for draw in draws[rank * self.batch_size : (rank + 1) * self.batch_size]]
         batch = self.loader.load(ClipBatch(self.store.clips(rows), None))
         nodes = self.store.nodes(rows).to(self.loader.device)
         history = batch.latents

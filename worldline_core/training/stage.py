@@ -44,6 +44,7 @@ from worldline_core.training.trainer import (
     TrainingResult,
     held_out_losses,
     join_processes,
+    processes,
     train,
 )
 
@@ -70,7 +71,7 @@ class StageConfig(StrictModel):
 
 @dataclass(frozen=True)
 class Stage:
-    """One run of a stage: the model, the clips it is trained on, and which process of how many this is.
+    """One run of a stage: the model, and the clips it is trained on.
 
     Attributes:
         start: digest of the weights that the run begins with, or "scratch"; parent_kind: that checkpoint's kind.
@@ -86,8 +87,6 @@ class Stage:
     episodes: EpisodeSet
     source: ClipSource
     rows: list[ClipRow]
-    rank: int
-    world_size: int
 
     @classmethod
     def open(
@@ -110,7 +109,7 @@ class Stage:
             UnavailableError: the decoder that is asked for cannot be loaded.
         """
         device = config.trainer.device
-        processes = join_processes(device)
+        join_processes(device)
         torch.manual_seed(config.trainer.seed)
         model, parent = load_model()
         model.to(device).train()
@@ -118,7 +117,7 @@ class Stage:
         source = _open_source(config, inputs, episodes, model.config.views)
         rows = training_rows(source, episodes, stage=number, tracks=tracks)
         start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
-        return cls(config, title, output, model, start, kind, episodes, source, rows, *processes)
+        return cls(config, title, output, model, start, kind, episodes, source, rows)
 
     @property
     def training_rows(self) -> list[ClipRow]:
@@ -129,14 +128,15 @@ class Stage:
     def sampler(self) -> ClipSampler:
         """Which clips every micro-step trains on."""
         trainer = self.config.trainer
+        rank, world_size = processes()
         return ClipSampler(
             self.source,
             self.config.clips,
             splits=self.config.splits,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
-            rank=self.rank,
-            world_size=self.world_size,
+            rank=rank,
+            world_size=world_size,
             rows=self.rows,
         )
 
@@ -154,7 +154,7 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config, trainer = self.config, self.config.trainer
-        skips = SkipLog(self.output / "run", self.rank, config.input.max_skipped)
+        skips = SkipLog(self.output / "run", processes()[0], config.input.max_skipped)
         here = ClipReader(self.source, self.sampler, loader.views, config.input)
         reading = nullcontext(here)
         if config.input.workers:
@@ -188,8 +188,6 @@ class Stage:
                     "episodes": named_rows(self.rows),
                 },
                 title=self.title,
-                rank=self.rank,
-                world_size=self.world_size,
             )
 
     def save(
@@ -202,7 +200,8 @@ class Stage:
     ) -> dict[str, Any]:
         """Write the averaged weights (the first process alone does) and return the counts of the run."""
         trainer = self.config.trainer
-        if self.rank == 0:
+        rank, world_size = processes()
+        if rank == 0:
             save_checkpoint(
                 self.output,
                 self.model,
@@ -220,7 +219,7 @@ class Stage:
                 },
                 state_dict={**self.model.state_dict(), **result.average},
             )
-        clips = trainer.steps * trainer.batch_size * trainer.accumulation * self.world_size
+        clips = trainer.steps * trainer.batch_size * trainer.accumulation * world_size
         return {"steps": trainer.steps, "clips": clips}
 
     def _input_facts(self) -> dict[str, Any]:

@@ -36,19 +36,23 @@ from worldline_core.training.training_state import (
 _PROCESS_TIMEOUT = timedelta(hours=24)
 
 
-def join_processes(device: str) -> tuple[int, int]:
-    """(rank, world size) as torchrun sets them; (0, 1) otherwise. Joins the process group when there is one.
+def join_processes(device: str) -> None:
+    """Join the processes that torchrun has started to share a run; nothing happens where this one is alone.
 
     Call it before anything is moved to ``device``: on GPUs it makes "cuda" this process's own card.
     """
-    world_size = int(os.environ.get("WORLD_SIZE", "1"))
-    rank = int(os.environ.get("RANK", "0"))
-    if world_size > 1 and not torch.distributed.is_initialized():
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not torch.distributed.is_initialized():
         on_gpu = torch.device(device).type == "cuda"
         if on_gpu:
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         torch.distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PROCESS_TIMEOUT)
-    return rank, world_size
+
+
+def processes() -> tuple[int, int]:
+    """(rank, number) of the processes that share this run; (0, 1) where this one is alone."""
+    if not torch.distributed.is_initialized():
+        return 0, 1
+    return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
 def wait_for_all() -> None:
@@ -207,8 +211,6 @@ def train[BatchT: NamedBatch](
     identity: Mapping[str, Any],
     title: str,
     schedule: Callable[[int], float] | None = None,
-    rank: int = 0,
-    world_size: int = 1,
 ) -> TrainingResult:
     """Train until ``config.steps``; called again with the same ``output``, it continues from the last saved state.
 
@@ -240,6 +242,7 @@ def train[BatchT: NamedBatch](
         fused=True,
     )
     average = ExponentialAverage(parameters, config.ema_decay)
+    rank, world_size = processes()
     # Another number of processes takes other batches: that is another run.
     digests = identity_digests({**identity, "processes": world_size})
     state_path = output / STATE_FILE
@@ -257,7 +260,7 @@ def train[BatchT: NamedBatch](
         factor = schedule(step) if schedule else learning_rate_factor(settings, step, config.steps)
         for slot, group in zip(optimizer.param_groups, groups, strict=True):
             slot["lr"] = settings.learning_rate * group.multiplier * factor
-        values, norm, size = _step(config, objective, load, optimizer, parameters, step, title, rank, world_size)
+        values, norm, size = _step(config, objective, load, optimizer, parameters, step, title)
         average.update(step)
         seen += size * world_size
         values["gradient_norm"] = norm
@@ -300,10 +303,9 @@ def _step[BatchT: NamedBatch](
     parameters: Mapping[str, nn.Parameter],
     step: int,
     title: str,
-    rank: int,
-    world_size: int,
 ) -> tuple[dict[str, float], float, int]:
     """One optimiser step: mean metrics of its micro-steps, the gradient norm before clipping, examples of this rank."""
+    rank, world_size = processes()
     optimizer.zero_grad(set_to_none=True)
     totals: dict[str, float] = {}
     size = 0
