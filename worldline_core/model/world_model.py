@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from einops import rearrange, repeat
@@ -340,7 +340,8 @@ class WorldModel(nn.Module):
         for index, layer in enumerate(self._mixture()):
             context = None if text is None else text.layers[index]
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens = checkpoint(layer, tokens, attend, index, context, use_reentrant=False)
+                advanced: Any = checkpoint(layer, tokens, attend, index, context, use_reentrant=False)
+                tokens = advanced
             else:
                 tokens = layer(tokens, attend, index, context)
             if features_at == index + 1:
