@@ -204,8 +204,7 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
 
     from worldline_core.data.episodes.episode_set import EpisodeSetWriter
     from worldline_core.training.clip_source import training_rows
-    from worldline_core.training.encode_latents import EncodeLatentsConfig, encode_latents
-    from worldline_core.training.latent_store import LatentStore
+    from worldline_core.training.latent_store import EncodeLatentsConfig, LatentStore, encode_latents
     from worldline_core.training.stage1 import Stage1Config, train_stage1
 
     torch.set_num_threads(1)

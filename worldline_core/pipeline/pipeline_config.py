@@ -24,7 +24,7 @@ from worldline_core.rollout.rollout import RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
-from worldline_core.training.encode_latents import EncodeLatentsConfig
+from worldline_core.training.latent_store import EncodeLatentsConfig
 from worldline_core.training.stage1 import Stage1Config
 from worldline_core.training.stage2 import Stage2Config
 

@@ -129,7 +129,7 @@ _STEPS = (
     Step(
         "encode_latents",
         1,
-        "worldline_core.training.encode_latents",
+        "worldline_core.training.latent_store",
         "encode_latents",
         "EncodeLatentsConfig",
         ("episodes", "tokenizer"),
