@@ -85,7 +85,7 @@ class ClipReader:
             ArtifactError: the source does not hold what is asked of it.
         """
         wanted = self.sampler.clips(index)
-        out = self.source.room(wanted, self.views, memory)
+        out = self.source.batch_array(wanted, self.views, memory)
         clips: list[Clip] = []
         skipped: list[SkippedClip] = []
         for place, clip in enumerate(wanted.clips):
@@ -208,7 +208,7 @@ class ClipLoader:
             ArtifactError: if the store or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        out = self.store.room(batch, self.views)
+        out = self.store.batch_array(batch, self.views)
         for clip, target in zip(batch.clips, out, strict=True):
             self.store.read(clip, self.store.recorded_views(clip, batch, self.views), target)
         return self.finish(ReadBatch(batch, torch.from_numpy(out)))

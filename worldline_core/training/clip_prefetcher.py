@@ -86,7 +86,9 @@ class ClipPrefetcher:
                 got=error,
                 next_step="see its traceback above; if memory ran out, lower input.workers, input.prefetch or the batch",
             ) from error
-        data = torch.from_numpy(self._reader.source.room(batch, self._reader.views, self._memory[index % self._slots]))
+        data = torch.from_numpy(
+            self._reader.source.batch_array(batch, self._reader.views, self._memory[index % self._slots])
+        )
         if self._pinned is not None:
             # The copy of the batch before may still be on its way to the GPU.
             torch.cuda.current_stream().synchronize()

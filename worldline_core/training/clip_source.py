@@ -173,7 +173,7 @@ class ClipSource(ABC):
         """The views of a clip of the batch that fill its slots, by the names they have in the recording."""
         return (self.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(views)
 
-    def room(self, batch: ClipBatch, views: tuple[str, ...], memory: np.ndarray | None = None) -> np.ndarray:
+    def batch_array(self, batch: ClipBatch, views: tuple[str, ...], memory: np.ndarray | None = None) -> np.ndarray:
         """An array (b, v, *shape) for a batch: at the start of ``memory`` (uint8) when it is given, else of its own."""
         shape = (len(batch.clips), len(batch.slots(views)), *self.shape(batch.clips[0].num_frames))
         if memory is None:
