@@ -124,7 +124,6 @@ class PatchTokenizer(nn.Module):
         self.refinement = Refinement(
             self.temporal_compression, self.config.refinement_width, self.config.refinement_depth
         )
-        self.metadata: dict[str, Any] = {}
         self.weights_sha256 = ""
 
     @property
@@ -228,7 +227,7 @@ class PatchTokenizer(nn.Module):
                 "version": VERSION,
                 "kind": self.KIND,
                 "config": self.config.model_dump(mode="json"),
-                "metadata": dict(self.metadata if metadata is None else metadata),
+                "metadata": dict(metadata or {}),
                 "weights_sha256": hashlib.sha256(content).hexdigest(),
             },
         )
@@ -250,7 +249,6 @@ class PatchTokenizer(nn.Module):
             raise CheckpointError("The tokenizer's config is not valid", where=path, got=str(error)) from error
         weights = folder / WEIGHTS
         fill(tokenizer, read_weights(weights, content["weights_sha256"]), where=weights, dtype=torch.float32)
-        tokenizer.metadata = dict(content.get("metadata", {}))
         tokenizer.weights_sha256 = content["weights_sha256"]
         return tokenizer.eval().requires_grad_(False)
 
