@@ -72,7 +72,7 @@ class TeacherForcingAttention:
     ) -> Tensor:
         queries, keys = rotate(queries, self.by), rotate(keys, self.by)
         clean_length = sum(self.sizes[:-1])
-        mixed = []
+        mixed: list[Tensor] = []
         stop = 0
         for size in self.sizes[:-1]:
             start, stop = stop, stop + size

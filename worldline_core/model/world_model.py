@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import torch
 from einops import rearrange, repeat
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
@@ -126,7 +126,7 @@ class WorldModel(nn.Module):
         cosine, sine = rotation(self.config, text_positions(mask.sum(dim=1), size))
         by = (rearrange(cosine, "b n d -> b 1 n d"), rearrange(sine, "b n d -> b 1 n d"))
         tokens = self.embed_tokens(text_ids)
-        contexts = []
+        contexts: list[tuple[Tensor, Tensor]] = []
         for layer in self._mixture():
             tokens, context = layer.understand(tokens, by)
             contexts.append(context)
@@ -336,12 +336,11 @@ class WorldModel(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         if features_at is not None and not 1 <= features_at <= len(self.layers):
             raise ConfigError("features_at counts layers from 1", expected=f"1..{len(self.layers)}", got=features_at)
-        features = None
+        features: Tensor | None = None
         for index, layer in enumerate(self._mixture()):
             context = None if text is None else text.layers[index]
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                advanced: Any = checkpoint(layer, tokens, attend, index, context, use_reentrant=False)
-                tokens = advanced
+                tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
             else:
                 tokens = layer(tokens, attend, index, context)
             if features_at == index + 1:
