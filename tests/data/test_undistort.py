@@ -16,10 +16,11 @@ from pydantic import ValidationError
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap import writer as mcap_writer
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.writer import write_episode_mcap
@@ -72,6 +73,25 @@ def distorted_sample(make: Make, lens: Distortion | None) -> tuple:
     return replace(episode, cameras={**episode.cameras, "head": head}), frames, masks
 
 
+def write_mcap_of_lens(
+    path: Path,
+    episode: Episode,
+    frames: dict[str, np.ndarray],
+    lens: Distortion | dict[str, Any],
+    masks: dict[str, np.ndarray] | None = None,
+) -> None:
+    """A file whose head camera states a lens; this project's own recordings have none."""
+    stated = lens
+    if isinstance(lens, Distortion):
+        names = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
+        model = "rational_polynomial" if len(lens.coefficients) > 5 else names[lens.model]
+        stated = {"distortion_model": model, "D": list(lens.coefficients)}
+    of_pinhole = mcap_writer._calibration
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap_writer, "_calibration", lambda c: of_pinhole(c) | (stated if c.view == "head" else {}))
+        mcap_writer.write_episode_mcap(path, episode, frames, masks)
+
+
 def curated_mcap(tmp_path: Path, **changes: Any) -> EpisodeSet:
     source = {"kind": "mcap", "path": str(tmp_path / "mcap")}
     settings = {"sources": [source], "image_size": (60, 80), "video_crf": 0, **changes}
@@ -91,7 +111,7 @@ def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sa
     lens = LENSES[model]
     episode, frames, masks = distorted_sample(sample, lens)
     path = tmp_path / "mcap" / "0.mcap"
-    write_episode_mcap(path, episode, frames, robot_masks=masks, distortions={"head": lens})
+    write_mcap_of_lens(path, episode, frames, lens, masks)
     with path.open("rb") as stream:
         (message,) = [json.loads(m.data) for _, c, m in make_reader(stream).iter_messages(["/head/calibration"])]
     assert message["distortion_model"] == model
@@ -121,7 +141,7 @@ def test_undistortion_and_every_fit_agree_with_k(tmp_path: Path, sample: Make, f
     lens = LENSES["plumb_bob"]
     episode, frames, masks = distorted_sample(sample, lens)
     path = tmp_path / "mcap" / "0.mcap"
-    write_episode_mcap(path, episode, frames, robot_masks=masks, distortions={"head": lens})
+    write_mcap_of_lens(path, episode, frames, lens, masks)
     curated = curated_mcap(tmp_path, image_size=(64, 64), fit=fit)
     camera = curated.episode(0).cameras["head"]
     image = curated.frames(0, "head")[4].astype(float)
@@ -148,17 +168,10 @@ def test_unusable_lenses_are_quarantined_with_their_numbers(tmp_path: Path, samp
     folds = Distortion("radtan", (-0.9, 0.1, 0.0, 0.0))
     write_episode_mcap(tmp_path / "mcap" / "0.mcap", episode, frames)
     second = replace(episode, episode_id="folds", state=episode.state + 0.01)
-    write_episode_mcap(tmp_path / "mcap" / "1.mcap", second, frames, distortions={"head": folds})
+    write_mcap_of_lens(tmp_path / "mcap" / "1.mcap", second, frames, folds)
     third = replace(episode, episode_id="unknown", state=episode.state + 0.02)
     path = tmp_path / "mcap" / "2.mcap"
-    write_episode_mcap(path, third, frames)
-    with pytest.MonkeyPatch.context() as patch:
-        from worldline_core.data.mcap import writer as mcap_writer
-
-        original = mcap_writer._calibration
-        changed = lambda *a, **k: {**original(*a, **k), "distortion_model": "double_sphere", "D": [0.1]}  # noqa: E731
-        patch.setattr(mcap_writer, "_calibration", changed)
-        write_episode_mcap(path, third, frames)
+    write_mcap_of_lens(path, third, frames, {"distortion_model": "double_sphere", "D": [0.1]})
     curated = curated_mcap(tmp_path)
     assert [row.episode_id for row in curated.rows] == [episode.episode_id]
     rows = {row.episode_id: row for row in curated.quarantine()}
@@ -195,7 +208,7 @@ def test_a_lens_can_be_declared_for_a_format_without_a_place_for_it(tmp_path: Pa
     lens = {"model": "radtan", "coefficients": [0.1, 0.0, 0.0, 0.0]}
     given = {"path": tmp_path, "fps": 30, "distortions": {"head": lens}}
     config = AgibotGesimSourceConfig.model_validate(given)
-    assert config.lenses == {"head": Distortion("radtan", (0.1, 0.0, 0.0, 0.0))}
+    assert config.distortions["head"].distortion == Distortion("radtan", (0.1, 0.0, 0.0, 0.0))
     lens["coefficients"] = [0.1]
     with pytest.raises(ValidationError, match="incomplete"):
         AgibotGesimSourceConfig.model_validate(given)

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import timing as resampling
 from worldline_core.data.mcap.images import spoiled_frames
-from worldline_core.data.mcap.timing import Clock, in_order
+from worldline_core.data.mcap.timing import Clock, hold, in_order, instants, interpolated_poses, linear, nearest, slerp
 
 MS = 1_000_000
 
@@ -24,7 +23,7 @@ def test_slerp_is_that_of_scipy_whatever_the_sign(seed: int) -> None:
     quaternions = Rotation.random(12, rng=rng).as_quat() * rng.choice([-1.0, 1.0], (12, 1))
     places = rng.normal(size=(12, 3))
     grid = np.sort(rng.integers(times[0], times[-1], 30))
-    found = resampling.poses(times, np.concatenate([places, quaternions], axis=1), grid)
+    found = interpolated_poses(times, np.concatenate([places, quaternions], axis=1), grid)
     expected = Slerp(times.astype(float), Rotation.from_quat(quaternions))(grid.astype(float))
     assert (Rotation.from_quat(found[:, 3:]).inv() * expected).magnitude().max() < 1e-6
     for axis in range(3):
@@ -37,28 +36,28 @@ def test_nearest_and_linear_are_those_of_a_search(seed: int, count: int) -> None
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.integers(1, 50, count))
     grid = np.sort(rng.integers(times[0] - 20, times[-1] + 20, 25))
-    found = resampling.nearest(times, grid)
+    found = nearest(times, grid)
     distance = np.abs(times[None] - grid[:, None])
     assert np.array_equal(np.abs(times[found] - grid), distance.min(axis=1))
     values = rng.normal(size=(count, 2))
-    linear = resampling.linear(times, values, grid)
-    assert np.allclose(linear[:, 1], np.interp(grid, times, values[:, 1]))
-    held = resampling.hold(times, values, grid)
+    interpolated = linear(times, values, grid)
+    assert np.allclose(interpolated[:, 1], np.interp(grid, times, values[:, 1]))
+    held = hold(times, values, grid)
     last = [max([i for i in range(count) if times[i] <= t], default=0) for t in grid]
     assert np.array_equal(held, values[last])
 
 
 def test_equal_quaternions_and_half_turns_are_interpolated() -> None:
     same = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert np.allclose(resampling.slerp(same, same, np.array([0.3])), same)
+    assert np.allclose(slerp(same, same, np.array([0.3])), same)
     turned = np.array([[0.0, 0.0, 1.0, 0.0]])
-    half = resampling.slerp(same, turned, np.array([0.5]))
+    half = slerp(same, turned, np.array([0.5]))
     assert np.allclose(np.abs(half), np.sqrt([[0, 0, 0.5, 0.5]]))
 
 
 @pytest.mark.parametrize("fps", [30.0, 29.97, 10.0, 7.5])
 def test_instants_do_not_drift(fps: float) -> None:
-    grid = resampling.instants(1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + 3600 * 10**9, fps)
+    grid = instants(1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + 3600 * 10**9, fps)
     assert len(grid) == int(3600 * fps + 1e-6) + 1
     exact = np.arange(len(grid)) / fps * 1e9
     assert np.abs((grid - grid[0]) - exact).max() <= 1

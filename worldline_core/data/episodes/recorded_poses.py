@@ -17,6 +17,7 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
+from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.rotations import rotation_deviation, rotation_from_quaternion_xyzw
 from worldline_core.geometry.transforms import MAX_ROTATION_DEVIATION, RotationRepair, repair_rotations
 
@@ -63,13 +64,17 @@ class RecordedCameras:
 
     Attributes:
         tracks: by view.
+        lenses: of the views whose images are not those of a pinhole.
     """
 
     def __init__(self) -> None:
         self.tracks: dict[str, CameraTrack] = {}
+        self.lenses: dict[str, Distortion] = {}
         self._repairs: dict[str, RotationRepair] = {}
 
-    def add(self, view: str, K: np.ndarray, pose: CameraPose, size: tuple[int, ...]) -> None:
+    def add(
+        self, view: str, K: np.ndarray, pose: CameraPose, size: tuple[int, ...], lens: Distortion | None = None
+    ) -> None:
         """Add a view.
 
         Args:
@@ -77,6 +82,8 @@ class RecordedCameras:
         """
         self.tracks[view] = CameraTrack.from_pose(view, K, pose, width=size[1], height=size[0])
         self._repairs[view] = pose.repair
+        if lens is not None:
+            self.lenses[view] = lens
 
     def notes(self) -> dict[str, str | int | float]:
         """`repair_notes` of the views."""

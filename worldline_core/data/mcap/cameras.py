@@ -9,14 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import timing as resampling
+from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.messages import Calibration, Transform
-from worldline_core.data.mcap.timing import Arrivals, Timing, check_gaps, in_order
+from worldline_core.data.mcap.timing import Arrivals, Timing, check_gaps, in_order, interpolated_poses
 from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig, ViewTopics
 from worldline_core.geometry.cameras import ImageTransform
-from worldline_core.geometry.distortion import Distortion, distortion_from_ros
+from worldline_core.geometry.distortion import distortion_from_ros
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw, rigid_inverse
 
 FIXED_TOLERANCE = 1e-6
@@ -55,17 +54,21 @@ class _Edge:
 
         Raises: RejectedInputError (invalid_extrinsics) for a quaternion without length.
         """
-        values = np.array(self.values, np.float64)
-        length = np.linalg.norm(values[:, 3:], axis=1)
-        if not (np.isfinite(values).all() and (length > 1e-6).all()):
-            raise RejectedInputError(
-                "invalid_extrinsics",
-                "Transform is not finite or has a quaternion without direction",
-                where=self.where,
-                evidence={"parent": self.parent, "child": self.child},
-            )
-        values[:, 3:] /= length[:, None]
+        values = unit_poses(self.values, "invalid_extrinsics", self.where)
         return values[-1:] if self.fixed else values[self.arrivals.order]
+
+
+def unit_poses(poses: Sequence[tuple[float, ...]], reason: Reason, where: str) -> np.ndarray:
+    """Poses x y z qx qy qz qw as (n, 7) with quaternions of unit length.
+
+    Raises: RejectedInputError of this reason for one that is not finite, or has a quaternion without length.
+    """
+    values = np.array(poses, np.float64)
+    length = np.linalg.norm(values[:, 3:], axis=1)
+    if not (np.isfinite(values).all() and (length > 1e-6).all()):
+        raise RejectedInputError(reason, "Pose is not finite or has a quaternion without direction", where=where)
+    values[:, 3:] /= length[:, None]
+    return values
 
 
 class TransformTree:
@@ -132,25 +135,24 @@ class TransformTree:
 
     def moving_times(self, base: str, frame: str) -> list[np.ndarray]:
         """Times of every moving transform between two connected frames."""
-        edges = [self._edges[child] for child in self._between(base, frame)]
+        edges = [self._edges[child] for side in self._between(base, frame) for child in side]
         return [edge.arrivals.times_ns for edge in edges if not edge.fixed]
 
-    def _between(self, base: str, frame: str) -> list[str]:
-        """Frames whose transforms lead from one to the other."""
+    def _between(self, base: str, frame: str) -> tuple[list[str], list[str]]:
+        """Frames from the base, and from the frame, up to the first frame above both (which is in neither list)."""
         up, down = self.chain(base), self.chain(frame)
         common = next((name for name in down if name in up), None)
         if common is None:
-            parents = {child: edge.parent for child, edge in self._edges.items()}
+            known = ", ".join(f"{edge.parent} -> {child}" for child, edge in sorted(self._edges.items()))
             raise RejectedInputError(
                 "missing_calibration",
                 "No transforms lead from the base to a frame",
                 where=self._where,
                 expected=f"{base} -> {frame}",
-                got=", ".join(f"{parents[child]} -> {child}" for child in sorted(parents)) or "no transforms",
+                got=known or "no transforms",
                 next_step="correct base_frame and the frames, or name all topics of transforms",
-                evidence={"base": base, "frame": frame, "frames": sorted({*parents, *parents.values()})},
             )
-        return up[: up.index(common)] + down[: down.index(common)]
+        return up[: up.index(common)], down[: down.index(common)]
 
     def poses(self, base: str, frame: str, grid_ns: np.ndarray) -> np.ndarray:
         """(t, 4, 4) T_base_frame at the instants; linear in place and slerp in rotation of every transform between.
@@ -158,22 +160,19 @@ class TransformTree:
         Raises: RejectedInputError: missing_calibration where the frames are not connected, time_gap where a moving
             transform is missing for too long.
         """
-        self._between(base, frame)
-        return rigid_inverse(self._to_root(base, frame, grid_ns)) @ self._to_root(frame, base, grid_ns)
+        up, down = self._between(base, frame)
+        return rigid_inverse(self._product(up, grid_ns)) @ self._product(down, grid_ns)
 
-    def _to_root(self, frame: str, other: str, grid_ns: np.ndarray) -> np.ndarray:
-        """Pose of a frame in the first frame above both it and the other."""
-        above = set(self.chain(other))
+    def _product(self, frames: list[str], grid_ns: np.ndarray) -> np.ndarray:
+        """Pose of the first of these frames, each the child of the next, in the parent of the last."""
         pose = np.tile(np.eye(4), (len(grid_ns), 1, 1))
-        for child in self.chain(frame):
-            if child in above:
-                break
+        for child in frames:
             edge = self._edges[child]
             times_ns = edge.arrivals.times_ns
             if not edge.fixed:
                 where = f"{self._where}, transform {edge.parent} -> {child}"
                 check_gaps(times_ns, int(grid_ns[0]), int(grid_ns[-1]), self._max_gap_s, self._max_gap_s, where)
-            values = resampling.poses(times_ns, edge.poses, grid_ns)
+            values = interpolated_poses(times_ns, edge.poses, grid_ns)
             pose = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:]) @ pose
         return pose
 
@@ -200,7 +199,7 @@ def read_tree(
     """
 
     def read_static(topics: Iterable[str], stop_ns: int | None) -> TransformTree:
-        tree = TransformTree(file.shown, config.max_gap_s, config.max_disorder_s)
+        tree = TransformTree(file.path, config.max_gap_s, config.max_disorder_s)
         present = [topic for topic in topics if topic in file.topics]
         for received in file.messages(present, None, stop_ns) if present else ():
             tree.add(received.value, [received.log_ns] * len(received.value), static=True)
@@ -208,10 +207,10 @@ def read_tree(
 
     tree = read_static(config.static_transforms, None)
     for stream in (streams[topic] for topic in config.transforms if topic in streams):
-        offset_ns = timing.offset_ns(stream.topic)
+        offset_ns = config.offset_ns(stream.topic)
         for transforms, time_ns in zip(stream.values, timing.times_ns(stream), strict=True):
             times = [int(time_ns)] * len(transforms)
-            if timing.source == "header":  # every transform of a message has its own
+            if config.time == "header":  # every transform of a message has its own
                 times = [transform.stamp_ns + offset_ns for transform in transforms]
             tree.add(transforms, times, static=False)
     if start_ns is not None and not all(tree.connected(config.base_frame, frame) for frame in wanted):
@@ -232,7 +231,7 @@ def read_calibration(file: McapFile, streams: Mapping[str, Stream], topics: View
         values = streams[topics.calibration].values
     else:
         values = [received.value for received in file.messages([topics.calibration]) if received.kind == "calibration"]
-    where = f"{file.shown}, topic {topics.calibration}"
+    where = f"{file.path}, topic {topics.calibration}"
     if not values:
         raise RejectedInputError("missing_calibration", "Calibration topic has no messages", where=where)
     first = values[0]
@@ -248,35 +247,31 @@ def read_calibration(file: McapFile, streams: Mapping[str, Stream], topics: View
     return first
 
 
-class CalibratedCameras(RecordedCameras):
-    """The cameras of one episode with their lenses.
+def add_camera(
+    cameras: RecordedCameras,
+    view: str,
+    calibration: Calibration,
+    poses: np.ndarray,
+    *,
+    where: object,
+    frame: str,
+    topic: str | None,
+    rectified: bool = False,
+) -> None:
+    """Add a view from its calibration message and its poses (n or 1, 4, 4) in the base.
 
-    Attributes:
-        lenses: of the views whose images are not those of a pinhole.
+    Args:
+        where, frame, topic: file, frame and topic that they are of, for messages.
+        rectified: the images are rectified: P holds their K, and no lens is left.
+
+    Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lenses: dict[str, Distortion] = {}
-
-    def calibrate(
-        self, view: str, calibration: Calibration, poses: np.ndarray, *, frame: str, topic: str, rectified: bool = False
-    ) -> None:
-        """Add a view from its calibration message and its poses (n or 1, 4, 4) in the base.
-
-        Args:
-            frame, topic: where both were found, for messages.
-            rectified: the images are rectified: P holds their K, and no lens is left.
-
-        Raises: RejectedInputError: singular_intrinsics, invalid_extrinsics, invalid_distortion.
-        """
-        K, size = _intrinsics(calibration, rectified=rectified, where=topic)
-        self.add(view, K, camera_pose(view, poses, where=frame), size)
-        evidence = {"view": view, "model": calibration.model, "coefficients": list(calibration.D)}
-        with rejected_as("invalid_distortion", topic, evidence):
-            lens = None if rectified else distortion_from_ros(calibration.model, calibration.D, None)
-        if lens is not None:
-            self.lenses[view] = lens
+    at = f"{where}, topic {topic}"
+    K, size = _intrinsics(calibration, rectified=rectified, where=at)
+    pose = camera_pose(view, poses, where=f"{where}, frame {frame}")
+    with rejected_as("invalid_distortion", at):
+        lens = None if rectified else distortion_from_ros(calibration.model, calibration.D, None)
+    cameras.add(view, K, pose, size, lens)
 
 
 def fixed_or_moving(poses: np.ndarray) -> np.ndarray:

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import ARRAYS, Episode, EpisodeDescription
-from worldline_core.data.episodes.recorded_poses import rejected_as
+from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode, EpisodeDescription
+from worldline_core.data.episodes.recorded_poses import RecordedCameras, rejected_as
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.plain_files import parse_json, well_formed
-from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap.cameras import CalibratedCameras
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
+from worldline_core.data.mcap.cameras import add_camera
 from worldline_core.data.mcap.file import McapFile, Stream, read_streams
-from worldline_core.data.mcap.images import EpisodeImages, ImageTrack
+from worldline_core.data.mcap.images import ImageTrack
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
 from worldline_core.data.mcap.writer import EPISODE_METADATA, FORMAT_VERSION
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
@@ -33,7 +33,7 @@ def exported_episode_id(file: McapFile) -> str:
 
     Raises: RejectedInputError (unreadable) when the file is damaged or holds no episode of this project.
     """
-    with well_formed(file.shown, f"metadata {EPISODE_METADATA}"):
+    with well_formed(file.path, f"metadata {EPISODE_METADATA}"):
         return str(_metadata(file)["episode_id"])
 
 
@@ -43,7 +43,7 @@ def read_exported_episode(file: McapFile) -> LoadedEpisode:
     Raises: RejectedInputError: unreadable, length_mismatch or missing_calibration where messages are missing.
     """
     about = _metadata(file)
-    with well_formed(file.shown, "an episode as this project writes it"):
+    with well_formed(file.path, "an episode as this project writes it"):
         return _assembled(file, about)
 
 
@@ -52,17 +52,17 @@ def _metadata(file: McapFile) -> dict[str, Any]:
         raise RejectedInputError(
             "unreadable",
             "MCAP file holds no episode of a known layout",
-            where=file.shown,
+            where=file.path,
             expected=f"a metadata record {EPISODE_METADATA}",
             got=", ".join(file.metadata) or "none",
         )
-    where = f"{file.shown}, {EPISODE_METADATA}"
+    where = f"{file.path}, {EPISODE_METADATA}"
     about = {key: parse_json(value, where) for key, value in file.metadata[EPISODE_METADATA].items()}
     if about.get("format_version") not in READABLE_VERSIONS:
         raise RejectedInputError(
             "unreadable",
             "MCAP episode has another version",
-            where=file.shown,
+            where=file.path,
             expected=" or ".join(map(str, READABLE_VERSIONS)),
             got=about.get("format_version"),
         )
@@ -80,23 +80,21 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         **dict.fromkeys((f"/{view}/calibration" for view in moving), ("calibration",)),
         **dict.fromkeys((f"/{view}/{kind}" for view in views for kind in ("image", "robot_mask")), IMAGE_KINDS),
     }
-    streams = read_streams(file, roles, None, None)
+    streams = read_streams(file, roles)
     joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
-    images = {view: _track(_all_of(streams, f"/{view}/image", video_frames, file)) for view in views}
-    masks = {view: _track(streams[f"/{view}/robot_mask"]) for view in views if f"/{view}/robot_mask" in streams}
+    images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
+    masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
     poses: dict[str, list[Transform]] = {}
     for message in streams["/tf"].values if "/tf" in streams else ():
         for transform in message:
             poses.setdefault(transform.child, []).append(transform)
 
-    cameras = CalibratedCameras()
+    cameras = RecordedCameras()
     for view in moving:
         topic, frame = f"/{view}/calibration", f"{view}_camera"
         (calibration,) = _all_of(streams, topic, 1, file).values
         camera_poses = _poses(poses, frame, num_frames if moving[view] else 1, file)
-        cameras.calibrate(
-            view, calibration, camera_poses, frame=f"{file.shown}, frame {frame}", topic=f"{file.shown}, topic {topic}"
-        )
+        add_camera(cameras, view, calibration, camera_poses, where=file.path, frame=frame, topic=topic)
     tools = [_poses(poses, f"tool_{arm}", num_frames, file) for arm in range(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)
@@ -112,31 +110,23 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         gripper=None if about["gripper"] is None else np.array(about["gripper"], dtype=ARRAYS["gripper"].dtype),
         video_frames=about["video_frames"],
     )
-    reader = EpisodeImages(file, images, cameras.tracks, {view: f"/{view}/calibration" for view in moving})
+    tracks = {view: _track(file, images[view], cameras.tracks.get(view)) for view in views}
 
     def robot_masks(view: str) -> np.ndarray | None:
-        return np.stack([image[..., 0] > 127 for image in masks[view].frames(file)]) if view in masks else None
+        return np.stack([image[..., 0] > 127 for image in masks[view].frames()]) if view in masks else None
 
-    return LoadedEpisode(episode, views, reader, robot_masks, cameras.lenses)
+    return LoadedEpisode(episode, views, lambda view: tracks[view].frames(), robot_masks, cameras.lenses)
 
 
 def _all_of(streams: Mapping[str, Stream], topic: str, count: int, file: McapFile) -> Stream:
     found = len(streams[topic].log_ns) if topic in streams else 0
-    if found != count or count == 0:
-        raise RejectedInputError(
-            "length_mismatch",
-            "Messages are missing",
-            where=f"{file.shown}, topic {topic}",
-            expected=f"{max(count, 1)} messages",
-            got=f"{found} messages",
-            evidence={"topic": topic, "expected": count, "found": found},
-        )
+    check_length("Messages", f"{file.path}, topic {topic}", states=max(count, 1), unit="messages", found=found)
     return streams[topic]
 
 
-def _track(stream: Stream) -> ImageTrack:
+def _track(file: McapFile, stream: Stream, camera: CameraTrack | None = None) -> ImageTrack:
     every = np.arange(len(stream.log_ns))
-    return ImageTrack(stream.topic, stream.kind, None, None, order=every, chosen=every)
+    return ImageTrack(file, stream.topic, stream.kind, (None, None), every, every, camera=camera)
 
 
 def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: McapFile) -> np.ndarray:
@@ -145,11 +135,10 @@ def _poses(found: Mapping[str, list[Transform]], child: str, count: int, file: M
         raise RejectedInputError(
             "missing_calibration",
             "Transforms are missing",
-            where=f"{file.shown}, frame {child}",
+            where=f"{file.path}, frame {child}",
             expected=count,
             got=len(transforms),
-            evidence={"frame": child, "expected": count, "found": len(transforms)},
         )
     values = np.array([transform.values for transform in transforms], dtype=np.float64)
-    with rejected_as("invalid_extrinsics", f"{file.shown}, frame {child}", {"frame": child}):
+    with rejected_as("invalid_extrinsics", f"{file.path}, frame {child}", {"frame": child}):
         return pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])

@@ -28,17 +28,12 @@ from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, MessageDecoder
 
 # What the library raises for a damaged file: its own errors, and those of the decompressors and parsers below it.
 _DAMAGE = (
-    McapError, zstandard.ZstdError, EOFError, ValueError, RuntimeError, LookupError, struct.error, OverflowError, MemoryError,
+    McapError, zstandard.ZstdError, EOFError, OSError, ValueError, RuntimeError, LookupError, struct.error, OverflowError, MemoryError,
 )  # fmt: skip
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK = 0x06
 _DATA_END = 0x0F
 _LZ4_RATIO = 255
-
-
-READING_MARGIN_NS = 10**9
-"""Messages logged up to this long before and after an episode are read too: their own time may lie within it, and the instants at
-its ends need a message on both sides."""
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * 8 + 29
 
@@ -62,14 +57,14 @@ class McapFile:
     """
 
     def __init__(self, path: AnyPath) -> None:
-        self.path = self.shown = path
-        self._decoder = MessageDecoder(self.shown)
+        self.path = path
+        self._decoder = MessageDecoder(path)
         _ = self._summary
 
     @cached_property
     def _summary(self) -> Summary | None:
         """None where the file is complete but has no summary; then it is read from the beginning."""
-        check_chunks(regular_file(self.path, "MCAP file"), self.shown)
+        check_chunks(regular_file(self.path, "MCAP file"), self.path)
         with self._opened(indexed=True) as reader:
             return reader.get_summary()
 
@@ -102,12 +97,12 @@ class McapFile:
         Raises: RejectedInputError (missing_topic) for a file without messages.
         """
         statistics = self._summary.statistics if self._summary is not None else None
-        if statistics is not None:
-            first = statistics.message_start_time if statistics.message_count else None
-        else:
+        if statistics is None:
             first = min((record.log_time for _, _, record in self._records(None)), default=None)
+        else:
+            first = statistics.message_start_time if statistics.message_count else None
         if first is None:
-            raise RejectedInputError("missing_topic", "MCAP file holds no messages", where=self.shown)
+            raise RejectedInputError("missing_topic", "MCAP file holds no messages", where=self.path)
         return first
 
     def check_topics(self, wanted: Collection[str]) -> None:
@@ -117,11 +112,10 @@ class McapFile:
             raise RejectedInputError(
                 "missing_topic",
                 "MCAP file lacks a topic",
-                where=self.shown,
+                where=self.path,
                 expected=", ".join(missing),
                 got=", ".join(f"{topic} ({schema})" for topic, schema in self.topics.items()) or "no topics",
                 next_step="correct the topics in curate.sources[]",
-                evidence={"missing": missing, "found": sorted(self.topics)},
             )
 
     def messages(
@@ -150,20 +144,26 @@ class McapFile:
     @contextmanager
     def _opened(self, *, indexed: bool) -> Iterator[McapReader]:
         path = regular_file(self.path, "MCAP file")
-        try:
-            with path.open("rb") as stream:
-                if path.stat().st_size < _SMALLEST_BYTES:
-                    raise EOFError(f"{path.stat().st_size} bytes")
-                kind = SeekingReader if indexed else NonSeekingReader
-                yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
-        except _DAMAGE as error:
-            raise RejectedInputError(
-                "unreadable",
-                "MCAP file is damaged or was not finished",
-                where=self.shown,
-                got=repr(error)[:200],
-                next_step="copy the file again, or repair it with `mcap recover`",
-            ) from error
+        with _undamaged(self.path), path.open("rb") as stream:
+            if path.stat().st_size < _SMALLEST_BYTES:
+                raise EOFError(f"{path.stat().st_size} bytes")
+            kind = SeekingReader if indexed else NonSeekingReader
+            yield kind(stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
+
+
+@contextmanager
+def _undamaged(where: object) -> Iterator[None]:
+    try:
+        yield
+    except _DAMAGE as error:
+        raise RejectedInputError(
+            "unreadable",
+            "MCAP file is damaged or was not finished",
+            where=where,
+            expected="a complete MCAP file",
+            got=repr(error)[:200],
+            next_step="copy the file again, or repair it with `mcap recover`",
+        ) from error
 
 
 @dataclass
@@ -187,23 +187,15 @@ class Stream:
     frame: str = ""
 
     def add(self, received: Received) -> None:
-        if received.kind != self.kind:
-            raise RejectedInputError(
-                "unknown_schema",
-                "Messages of a topic are of several schemas",
-                where=f"topic {self.topic}",
-                expected=self.kind,
-                got=received.kind,
-            )
         self.stamps_ns.append(received.stamp_ns)
         self.log_ns.append(received.log_ns)
         self.publish_ns.append(received.publish_ns)
-        if self.kind in IMAGE_KINDS:
-            self.frame = self.frame or received.value.frame
-            if self.kind == "video":
-                self.key_frames.append(received.value.is_key_frame)
-        else:
+        if self.kind not in IMAGE_KINDS:
             self.values.append(received.value)
+            return
+        self.frame = self.frame or received.value.frame
+        if self.kind == "video":
+            self.key_frames.append(received.value.is_key_frame)
 
     @property
     def headed(self) -> bool:
@@ -217,32 +209,27 @@ class Stream:
 
 
 def read_streams(
-    file: McapFile, roles: Mapping[str, tuple[Kind, ...]], start_ns: int | None, stop_ns: int | None
+    file: McapFile, roles: Mapping[str, tuple[Kind, ...]], start_ns: int | None = None, stop_ns: int | None = None
 ) -> dict[str, Stream]:
-    """All messages of the topics of `roles` (topic -> kinds that it may be of) around an episode, by topic.
+    """All messages of the topics of `roles` (topic -> kinds that it may be of) with start <= log time < stop, by topic.
 
-    Args:
-        start_ns, stop_ns: log times of the episode; None: the whole file.
-
-    Raises: RejectedInputError: unknown_schema for a topic that is of none of the kinds its role needs; unreadable.
+    Raises: RejectedInputError: unknown_schema for a topic that is of none of the kinds its role needs, or of several;
+        unreadable.
     """
     streams: dict[str, Stream] = {}
-    first = None if start_ns is None else max(start_ns - READING_MARGIN_NS, 0)
-    last = None if stop_ns is None else stop_ns + READING_MARGIN_NS
-    for received in file.messages(roles, first, last):
-        if received.topic not in streams:
-            if received.kind not in roles[received.topic]:
-                raise RejectedInputError(
-                    "unknown_schema",
-                    "Topic has messages of another kind than its role needs",
-                    where=f"{file.shown}, topic {received.topic}",
-                    expected=" or ".join(roles[received.topic]),
-                    got=f"{received.kind} ({file.topics.get(received.topic, '')})",
-                    next_step="correct the topics in curate.sources[]",
-                    evidence={"topic": received.topic, "kind": received.kind},
-                )
-            streams[received.topic] = Stream(received.topic, received.kind)
-        streams[received.topic].add(received)
+    for received in file.messages(roles, start_ns, stop_ns):
+        topic, kind = received.topic, received.kind
+        expected = (streams[topic].kind,) if topic in streams else roles[topic]
+        if kind not in expected:
+            raise RejectedInputError(
+                "unknown_schema",
+                "Topic has messages of another kind than its role or its first message",
+                where=f"{file.path}, topic {topic}",
+                expected=" or ".join(expected),
+                got=f"{kind} ({file.topics.get(topic, '')})",
+                next_step="correct the topics in curate.sources[]",
+            )
+        streams.setdefault(topic, Stream(topic, kind)).add(received)
     return streams
 
 
@@ -252,59 +239,42 @@ def check_chunks(path: Path, where: object) -> None:
     Raises: RejectedInputError: too_large, or unreadable for what is no MCAP file or breaks off.
     """
     size = path.stat().st_size
-    try:
-        with path.open("rb") as stream:
-            if stream.read(len(_MAGIC)) != _MAGIC:
-                raise _damaged(where, "another beginning than that of an MCAP file")
-            position = len(_MAGIC)
-            while position < size:
-                stream.seek(position)
-                opcode, length = struct.unpack("<BQ", stream.read(9))
-                position += 9 + length
-                if opcode == _DATA_END:
-                    return
-                if position > size:
-                    raise _damaged(where, f"a record of {length} bytes where {size - position + length} are left")
-                if opcode == _CHUNK:
-                    _check_chunk(stream, length, where)
-    except (struct.error, OSError) as error:
-        raise _damaged(where, str(error)) from error
+    with _undamaged(where), path.open("rb") as stream:
+        if stream.read(len(_MAGIC)) != _MAGIC:
+            raise ValueError("another beginning than that of an MCAP file")
+        position = len(_MAGIC)
+        while position < size:
+            stream.seek(position)
+            opcode, length = struct.unpack("<BQ", stream.read(9))
+            position += 9 + length
+            if opcode == _DATA_END:
+                return
+            if position > size:
+                raise EOFError(f"a record of {length} bytes where {size - position + length} are left")
+            if opcode == _CHUNK:
+                unpacked = _unpacked_bytes(stream, length)
+                if unpacked > MAX_CHUNK_BYTES:
+                    raise too_large(
+                        "MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes"
+                    )
 
 
-def _check_chunk(stream: BinaryIO, length: int, where: object) -> None:
+def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
+    """Bytes that the chunk of this length, which begins here, unpacks to: the larger of what its header and its frame say.
+
+    Raises: ValueError, or what the decompressors raise, for a damaged chunk.
+    """
     *_, declared, _, name_length = struct.unpack("<QQQII", stream.read(32))
-    if declared > MAX_CHUNK_BYTES:
-        raise too_large("MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=declared, unit="bytes")
     if name_length > 32:
-        raise _damaged(where, f"a name of a compression of {name_length} bytes")
+        raise ValueError(f"a name of a compression of {name_length} bytes")
     compression = stream.read(name_length)
     packed_length = struct.unpack("<Q", stream.read(8))[0]
     if packed_length > length:
-        raise _damaged(where, f"a chunk of {packed_length} bytes in a record of {length}")
-    head = stream.read(min(packed_length, 32))
-    unpacked = declared
+        raise ValueError(f"a chunk of {packed_length} bytes in a record of {length}")
     if compression == b"zstd":
-        try:
-            unpacked = max(0, zstandard.frame_content_size(head))  # -1: not stated, `declared` is then the bound
-        except zstandard.ZstdError as error:
-            raise _damaged(where, str(error)) from error
-    elif compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES:
+        return max(declared, zstandard.frame_content_size(stream.read(min(packed_length, 32))))  # -1: not stated
+    if compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES >= declared:
         # An lz4 frame may unpack to more than it states; only a frame of this length can unpack to too much.
-        stream.seek(-len(head), 1)
-        unpacked = _lz4_size(stream.read(packed_length), where)
-    if unpacked > MAX_CHUNK_BYTES:
-        raise too_large("MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes")
-
-
-def _lz4_size(packed: bytes, where: object) -> int:
-    """Bytes that a frame unpacks to, at most one more than allowed."""
-    try:
-        return len(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=MAX_CHUNK_BYTES + 1))
-    except RuntimeError as error:
-        raise _damaged(where, str(error)) from error
-
-
-def _damaged(where: object, got: str) -> RejectedInputError:
-    return RejectedInputError(
-        "unreadable", "MCAP file is damaged", where=where, expected="a complete MCAP file", got=got
-    )
+        frame = lz4.frame.LZ4FrameDecompressor().decompress(stream.read(packed_length), max_length=MAX_CHUNK_BYTES + 1)
+        return max(declared, len(frame))
+    return declared

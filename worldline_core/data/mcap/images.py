@@ -5,7 +5,7 @@ Memory holds the images that lie out of order in the file, and one decoded image
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -34,32 +34,43 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 @dataclass(frozen=True)
 class ImageTrack:
-    """Which images of a topic are which frames of an episode.
+    """Which images of a topic are which frames of a view.
 
     Attributes:
-        start_ns, stop_ns: log times within which the topic's messages were counted; None: the whole file.
+        around_ns: log times between which the topic's messages were counted; None: the file's beginning or end.
         order: (n,) index, in the order of the file, of the message that is i-th in time.
         chosen: (t,) index, in order of time, of the image of each frame; ascending, an image may repeat.
         key_frames: of a video, (n,) in order of time, whether decoding can begin there.
+        camera: whose calibrated size the images must have; None: any size.
     """
 
+    file: McapFile
     topic: str
     kind: Kind
-    start_ns: int | None
-    stop_ns: int | None
+    around_ns: tuple[int | None, int | None]
     order: np.ndarray
     chosen: np.ndarray
     key_frames: np.ndarray | None = None
+    camera: CameraTrack | None = None
 
-    def frames(self, file: McapFile) -> Iterator[np.ndarray]:
+    def frames(self) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB of each frame, in order.
 
-        Raises: RejectedInputError: unreadable, truncated_video, too_large.
+        Raises: RejectedInputError: unreadable, truncated_video, too_large; missing_calibration when the images are not of
+            the size that is calibrated.
         """
-        where = f"{file.shown}, topic {self.topic}"
-        decoded = self._video(file, where) if self.kind == "video" else self._images(file, where)
+        where = f"{self.file.path}, topic {self.topic}"
+        decoded = self._video(where) if self.kind == "video" else self._images(where)
         number, image = next(decoded)
         shape = image.shape
+        if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
+            raise RejectedInputError(
+                "missing_calibration",
+                "Calibration is of another image size",
+                where=f"{where}, view {self.camera.view}",
+                expected=f"{shape[1]}x{shape[0]}",
+                got=f"{self.camera.width}x{self.camera.height}",
+            )
         for wanted in self.chosen:
             while number < wanted:
                 number, image = next(decoded)
@@ -73,41 +84,38 @@ class ImageTrack:
                 )
             yield image
 
-    def _images(self, file: McapFile, where: str) -> Iterator[tuple[int, np.ndarray]]:
-        for number, value in self._in_time(file, np.unique(self.chosen)):
+    def _images(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
+        for number, value in self._in_time(np.unique(self.chosen)):
             place = f"{where}, image {number}"
             yield number, _raw_pixels(value, place) if isinstance(value, RawImage) else decode_image(value.data, place)
 
-    def _video(self, file: McapFile, where: str) -> Iterator[tuple[int, np.ndarray]]:
+    def _video(self, where: str) -> Iterator[tuple[int, np.ndarray]]:
         """Frames from the last key frame before the first chosen one on."""
-        keys = (
-            np.flatnonzero(self.key_frames[: self.chosen[0] + 1]) if self.key_frames is not None else np.zeros(0, int)
-        )
-        if len(keys) == 0:
+        keys = np.flatnonzero([] if self.key_frames is None else self.key_frames[: self.chosen[0] + 1])
+        if not len(keys):
             raise RejectedInputError(
                 "truncated_video",
                 "No key frame comes before the first frame of the episode",
                 where=where,
+                expected=f"a key frame up to image {self.chosen[0]}",
                 next_step="begin the episode later",
-                evidence={"first_frame": int(self.chosen[0])},
             )
         numbers = np.arange(keys[-1], self.chosen[-1] + 1)
         expected = iter(numbers)
-        for number, image in _decoded(self._in_time(file, numbers), where):
+        for number, image in _decoded(self._in_time(numbers), where):
             if number != next(expected, None):
                 raise _lost_frame(where, number)
             yield number, image
         if next(expected, None) is not None:
             raise _lost_frame(where, None)
 
-    def _in_time(self, file: McapFile, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
+    def _in_time(self, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
         """(place in time, what the message says) for these places, ascending."""
         place = {int(message): number for number, message in enumerate(self.order)}
         waiting: dict[int, Any] = {}
         wanted = [int(number) for number in numbers]
         needed, done = set(wanted), 0
-        counted = file.messages([self.topic], self.start_ns, self.stop_ns)
-        for message, received in enumerate(counted):
+        for message, received in enumerate(self.file.messages([self.topic], *self.around_ns)):
             number = place.get(message, -1)
             if number in needed:
                 waiting[number] = received.value
@@ -119,47 +127,10 @@ class ImageTrack:
         raise RejectedInputError(
             "changed_while_reading",
             "File holds fewer images than when it was first read",
-            where=f"{file.shown}, topic {self.topic}",
+            where=f"{self.file.path}, topic {self.topic}",
             expected=len(wanted),
             got=done,
         )
-
-
-@dataclass(frozen=True)
-class EpisodeImages:
-    """View -> the frames of an episode, one after the other.
-
-    Attributes:
-        calibrations: topics of the calibrated views, for messages.
-    """
-
-    file: McapFile
-    tracks: Mapping[str, ImageTrack]
-    cameras: Mapping[str, CameraTrack]
-    calibrations: Mapping[str, str | None]
-
-    def __call__(self, view: str) -> Iterator[np.ndarray]:
-        """uint8 (H, W, 3) RGB.
-
-        Raises: RejectedInputError: as `ImageTrack.frames`; missing_calibration when the images are not of the size that is
-            calibrated.
-        """
-        camera = self.cameras.get(view)
-        for image in self.tracks[view].frames(self.file):
-            if camera is not None and image.shape[:2] != (camera.height, camera.width):
-                raise RejectedInputError(
-                    "missing_calibration",
-                    "Calibration is of another image size",
-                    where=f"{self.file.shown}, topic {self.calibrations[view]}",
-                    expected=f"{image.shape[1]}x{image.shape[0]}",
-                    got=f"{camera.width}x{camera.height}",
-                    evidence={
-                        "view": view,
-                        "calibrated": [camera.height, camera.width],
-                        "images": list(image.shape[:2]),
-                    },
-                )
-            yield image
 
 
 def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
@@ -200,9 +171,7 @@ def _decoded(messages: Iterator[tuple[int, EncodedImage]], where: str) -> Iterat
         for frame in decoder.decode(None) if decoder is not None else ():
             yield _picture(frame, where)
     except av.error.FFmpegError as error:
-        raise RejectedInputError(
-            "truncated_video", "Video cannot be decoded", where=where, got=str(error), evidence={"error": str(error)}
-        ) from error
+        raise RejectedInputError("truncated_video", "Video cannot be decoded", where=where, got=str(error)) from error
 
 
 def _picture(frame: av.VideoFrame, where: str) -> tuple[int, np.ndarray]:
@@ -219,7 +188,6 @@ def _lost_frame(where: str, number: int | None) -> RejectedInputError:
         where=where if number is None else f"{where}, frame {number}",
         expected="one frame per message, each decodable from those before it",
         next_step="cut the recording at the damage",
-        evidence={"frame": number},
     )
 
 

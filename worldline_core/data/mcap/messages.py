@@ -1,16 +1,16 @@
 """What messages of ROS 2 and Foxglove schemas say, whatever they are encoded in (CDR, protobuf, JSON).
 
-A message is decoded by the schema that the file itself holds; its fields, be it an object (ROS 2, protobuf) or a mapping
-(JSON), are then read into the classes of this module.
+A message is decoded into an object by the schema that the file itself holds; its fields are then read into the classes of
+this module.
 """
 
 from __future__ import annotations
 
 import base64
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from google.protobuf.message import DecodeError
@@ -137,43 +137,27 @@ class Pose:
     values: tuple[float, ...]
 
 
-def _get(raw: Any, *names: str) -> Any:
-    """The first of these fields that the message has, be it an object or a JSON mapping."""
-    for name in names:
-        if isinstance(raw, Mapping):
-            if name in raw:
-                return raw[name]
-        elif hasattr(raw, name):
-            return getattr(raw, name)
-    raise KeyError(" or ".join(names))
-
-
-def _has(raw: Any, name: str) -> bool:
-    return name in raw if isinstance(raw, Mapping) else hasattr(raw, name)
-
-
-def _is_set(raw: Any, name: str) -> bool:
-    """Whether an optional field has a value; protobuf shows an unset number as 0."""
-    return bool(raw.HasField(name)) if hasattr(raw, "HasField") else _has(raw, name)
+def _first_of(raw: Any, *names: str) -> Any:
+    """The first of these fields that the message has: ROS 2, protobuf and JSON spell some of them differently."""
+    return getattr(raw, next((name for name in names if hasattr(raw, name)), names[0]))
 
 
 def _nanoseconds(time: Any) -> int:
-    return int(_get(time, "sec", "seconds")) * 10**9 + int(_get(time, "nanosec", "nsec", "nanos"))
+    return int(_first_of(time, "sec", "seconds")) * 10**9 + int(_first_of(time, "nanosec", "nsec", "nanos"))
 
 
 def _stated_time(raw: Any) -> int | None:
     """Header time [ns]; None where the schema has none."""
-    if _has(raw, "header"):
-        return _nanoseconds(_get(_get(raw, "header"), "stamp"))
-    return _nanoseconds(_get(raw, "timestamp")) if _has(raw, "timestamp") else None
+    if hasattr(raw, "header"):
+        return _nanoseconds(raw.header.stamp)
+    return _nanoseconds(raw.timestamp) if hasattr(raw, "timestamp") else None
 
 
 def _frame(raw: Any) -> str:
-    return str(_get(_get(raw, "header"), "frame_id") if _has(raw, "header") else _get(raw, "frame_id"))
+    return str((raw.header if hasattr(raw, "header") else raw).frame_id)
 
 
-def _bytes(raw: Any) -> bytes:
-    data = _get(raw, "data")
+def _bytes(data: Any) -> bytes:
     return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
 
 
@@ -182,78 +166,58 @@ def _numbers(values: Any) -> tuple[float, ...]:
 
 
 def _encoded(raw: Any) -> EncodedImage:
-    return EncodedImage(_frame(raw), _bytes(raw), str(_get(raw, "format")))
+    return EncodedImage(_frame(raw), _bytes(raw.data), str(raw.format))
 
 
 def _raw_image(raw: Any) -> RawImage:
-    return RawImage(
-        _frame(raw),
-        _bytes(raw),
-        str(_get(raw, "encoding")),
-        int(_get(raw, "width")),
-        int(_get(raw, "height")),
-        int(_get(raw, "step")),
-    )
+    size = int(raw.width), int(raw.height), int(raw.step)
+    return RawImage(_frame(raw), _bytes(raw.data), str(raw.encoding), *size)
 
 
 def _calibration(raw: Any) -> Calibration:
     binning, roi = (0, 0), (0, 0, 0, 0)
-    if _has(raw, "binning_x"):
-        binning = int(_get(raw, "binning_x")), int(_get(raw, "binning_y"))
-        region = _get(raw, "roi")
-        roi = tuple(int(_get(region, name)) for name in ("x_offset", "y_offset", "width", "height"))
-    return Calibration(
-        _frame(raw),
-        int(_get(raw, "width")),
-        int(_get(raw, "height")),
-        str(_get(raw, "distortion_model")),
-        _numbers(_get(raw, "D", "d")),
-        _numbers(_get(raw, "K", "k")),
-        _numbers(_get(raw, "P", "p")),
-        binning,
-        (roi[0], roi[1], roi[2], roi[3]),
-    )
+    if hasattr(raw, "binning_x"):
+        binning, region = (int(raw.binning_x), int(raw.binning_y)), raw.roi
+        roi = int(region.x_offset), int(region.y_offset), int(region.width), int(region.height)
+    D, K, P = (_numbers(_first_of(raw, name, name.lower())) for name in "DKP")
+    return Calibration(_frame(raw), int(raw.width), int(raw.height), str(raw.distortion_model), D, K, P, binning, roi)
 
 
 def _joints(raw: Any) -> Joints:
-    if _has(raw, "joints"):  # foxglove.JointStates: one record per joint, its readings optional
-        joints = list(_get(raw, "joints"))
-        readings = {
-            field: tuple(float(_get(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)
-            for field in ("position", "velocity", "effort")
-        }
-        return Joints(tuple(str(_get(joint, "name")) for joint in joints), **readings)
-    velocity, effort = (_numbers(_get(raw, field)) if _has(raw, field) else () for field in ("velocity", "effort"))
-    names = tuple(str(name) for name in _get(raw, "name"))
-    return Joints(names, _numbers(_get(raw, "position")), velocity, effort)
+    if not hasattr(raw, "joints"):
+        velocity, effort = (_numbers(getattr(raw, field, ())) for field in ("velocity", "effort"))
+        return Joints(tuple(str(name) for name in raw.name), _numbers(raw.position), velocity, effort)
+    joints = list(raw.joints)  # foxglove.JointStates: one record per joint, its readings optional
+    position, velocity, effort = (
+        tuple(float(getattr(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)
+        for field in ("position", "velocity", "effort")
+    )
+    return Joints(tuple(str(joint.name) for joint in joints), position, velocity, effort)
+
+
+def _is_set(raw: Any, name: str) -> bool:
+    """Whether an optional field has a value; protobuf shows an unset number as 0."""
+    return bool(raw.HasField(name)) if hasattr(raw, "HasField") else hasattr(raw, name)
 
 
 def _pose_values(position: Any, orientation: Any) -> tuple[float, ...]:
-    return (*(float(_get(position, axis)) for axis in "xyz"), *(float(_get(orientation, axis)) for axis in "xyzw"))
+    return (
+        *(float(getattr(position, axis)) for axis in "xyz"),
+        *(float(getattr(orientation, axis)) for axis in "xyzw"),
+    )
 
 
 def _transform(raw: Any) -> Transform:
-    if _has(raw, "header"):  # geometry_msgs/TransformStamped
-        inner, stamp = _get(raw, "transform"), _stated_time(raw)
-        parent = _frame(raw)
+    if hasattr(raw, "header"):  # geometry_msgs/TransformStamped
+        inner, stamp, parent = raw.transform, raw.header.stamp, raw.header.frame_id
     else:
-        inner, stamp, parent = raw, _nanoseconds(_get(raw, "timestamp")), str(_get(raw, "parent_frame_id"))
-    values = _pose_values(_get(inner, "translation"), _get(inner, "rotation"))
-    return Transform(parent.lstrip("/"), str(_get(raw, "child_frame_id")).lstrip("/"), stamp or 0, values)
-
-
-def _transforms(raw: Any) -> tuple[Transform, ...]:
-    return tuple(_transform(item) for item in (_get(raw, "transforms") if _has(raw, "transforms") else [raw]))
-
-
-def _pose(raw: Any) -> Pose:
-    pose = _get(raw, "pose")
-    return Pose(_frame(raw).lstrip("/"), _pose_values(_get(pose, "position"), _get(pose, "orientation")))
+        inner, stamp, parent = raw, raw.timestamp, raw.parent_frame_id
+    values = _pose_values(inner.translation, inner.rotation)
+    return Transform(str(parent).lstrip("/"), str(raw.child_frame_id).lstrip("/"), _nanoseconds(stamp), values)
 
 
 def _marker(raw: Any) -> str:
-    value = _get(raw, "data")
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return str(raw.data).lower() if isinstance(raw.data, bool) else str(raw.data)
 
 
 _READERS: dict[Kind, Callable[[Any], Any]] = {
@@ -262,11 +226,18 @@ _READERS: dict[Kind, Callable[[Any], Any]] = {
     "raw_image": _raw_image,
     "calibration": _calibration,
     "joints": _joints,
-    "numbers": lambda raw: _numbers(_get(raw, "data")),
-    "transforms": _transforms,
-    "pose": _pose,
+    "numbers": lambda raw: _numbers(raw.data),
+    "transforms": lambda raw: tuple(map(_transform, raw.transforms if hasattr(raw, "transforms") else [raw])),
+    "pose": lambda raw: Pose(_frame(raw).lstrip("/"), _pose_values(raw.pose.position, raw.pose.orientation)),
     "marker": _marker,
 }
+
+
+def _as_object(value: Any) -> Any:
+    """Parsed JSON with mappings as objects, whose fields are read like those of the other encodings."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: _as_object(field) for name, field in value.items()})
+    return [_as_object(item) for item in value] if isinstance(value, list) else value
 
 
 # What the decoders raise for bytes that are not of their schema; the ROS 2 parser raises plain subclasses of these.
@@ -317,13 +288,12 @@ class MessageDecoder:
                 expected="CDR with ros2msg, protobuf or JSON of " + ", ".join(SCHEMA_KINDS),
                 got=f"{name or 'no schema'} ({channel.message_encoding or 'no encoding'}, {encoding})",
                 next_step="name another topic, or convert the recording",
-                evidence={"topic": channel.topic, "schema": name, "encoding": channel.message_encoding},
             )
         return kind, decoder
 
     def _decoder(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any] | None:
         if channel.message_encoding == "json":
-            return partial(parse_json, where=f"{self._where}, topic {channel.topic}")
+            return lambda data: _as_object(parse_json(data, f"{self._where}, topic {channel.topic}"))
         try:
             found = (factory.decoder_for(channel.message_encoding, schema) for factory in self._factories)
             return next((decoder for decoder in found if decoder is not None), None)

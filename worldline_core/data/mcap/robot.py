@@ -8,11 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import timing as resampling
-from worldline_core.data.mcap.cameras import TransformTree
+from worldline_core.data.mcap.cameras import TransformTree, unit_poses
 from worldline_core.data.mcap.file import Stream
-from worldline_core.data.mcap.messages import Joints, Pose
-from worldline_core.data.mcap.timing import Arrivals, TimeError, Timing, in_order
+from worldline_core.data.mcap.messages import Joints
+from worldline_core.data.mcap.timing import (
+    Arrivals,
+    Timing,
+    hold,
+    in_order,
+    interpolated_poses,
+    largest_prediction_error,
+    linear,
+)
 from worldline_core.data.mcap.topics_config import ArmReadings, ArmTopics, McapTopicsSourceConfig, TopicReadings
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
@@ -29,27 +36,48 @@ class Signal:
     def times_ns(self) -> np.ndarray:
         return self.arrivals.times_ns
 
-    def at(self, grid_ns: np.ndarray, how: str) -> np.ndarray:
-        """(t, d) at the instants."""
-        fill = resampling.hold if how == "hold" else resampling.linear
-        return fill(self.times_ns, self.values, grid_ns)
+
+@dataclass(frozen=True)
+class _Track:
+    """What is measured, or commanded, of one arm."""
+
+    readings: ArmReadings
+    joints: Signal
+    gripper: Signal
+
+    def at(self, grid_ns: np.ndarray) -> tuple[np.ndarray, int]:
+        """(t, joints + 1) joints [rad] and opening at the instants, and how many openings lay outside of 0..1."""
+        joints, fingers = (
+            (hold if readings.resample == "hold" else linear)(signal.times_ns, signal.values, grid_ns)
+            for readings, signal in ((self.readings.joints, self.joints), (self.readings.gripper, self.gripper))
+        )
+        if self.readings.joints.unit == "deg":
+            joints = np.deg2rad(joints)
+        opening, outside = self.readings.gripper.range.opening(fingers.mean(axis=1))
+        return np.concatenate([joints, opening[:, None]], axis=1), outside
 
 
 @dataclass(frozen=True)
-class _ArmSignals:
-    """One arm: (joints, gripper) measured and commanded, and the tool's poses with the frame that they are given in."""
+class _Arm:
+    """One arm.
+
+    Attributes:
+        tool: poses of the tool, where a topic has them.
+        frame: of the transforms: the one that the tool's poses are given in or, without them, the tool itself.
+    """
 
     topics: ArmTopics
-    state: tuple[Signal, Signal]
-    command: tuple[Signal, Signal] | None
-    tool: tuple[Signal, str] | None
+    state: _Track
+    command: _Track | None
+    tool: Signal | None
+    frame: str | None
 
 
 @dataclass(frozen=True)
 class RobotSignals:
     """All arms, before resampling."""
 
-    arms: tuple[_ArmSignals, ...]
+    arms: tuple[_Arm, ...]
 
     @property
     def commanded(self) -> bool:
@@ -57,9 +85,8 @@ class RobotSignals:
 
     @property
     def frames(self) -> list[str]:
-        """Frames that must be reached from the base: of tools, and those that tool poses are given in."""
-        found = [arm.topics.tool_frame for arm in self.arms if arm.topics.tool_frame is not None]
-        return [frame.lstrip("/") for frame in found] + [arm.tool[1] for arm in self.arms if arm.tool is not None]
+        """Frames that must be reached from the base."""
+        return [arm.frame for arm in self.arms if arm.frame is not None]
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -78,7 +105,8 @@ class RobotSignals:
         """Every signal once."""
         found: list[Signal] = []
         for arm in self.arms:
-            found += [*arm.state, *(arm.command or ()), *(arm.tool[:1] if arm.tool is not None else ())]
+            found += [signal for track in (arm.state, arm.command) if track for signal in (track.joints, track.gripper)]
+            found += [arm.tool] if arm.tool is not None else []
         return found
 
     def arrivals(self) -> list[Arrivals]:
@@ -86,51 +114,34 @@ class RobotSignals:
         return list({(signal.topic, len(signal.times_ns)): signal.arrivals for signal in self.signals()}.values())
 
     def vectors(self, grid_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """State and action (t, J) float64, and how many gripper readings were clipped."""
-        states, actions, clipped = [], [], 0
-        for arm in self.arms:
-            state, outside = _vector(arm.topics.state, arm.state, grid_ns)
-            action, outside_too = state, 0
-            if arm.command is not None and arm.topics.command is not None:
-                action, outside_too = _vector(arm.topics.command, arm.command, grid_ns)
-            states.append(state)
-            actions.append(action)
-            clipped += outside + outside_too
-        return np.concatenate(states, axis=1), np.concatenate(actions, axis=1), clipped
+        """State and action (t, J) float64, and how many gripper readings were clipped; without commands the action
+        repeats the state."""
+        state = [arm.state.at(grid_ns) for arm in self.arms]
+        action = [arm.command.at(grid_ns) for arm in self.arms if arm.command is not None]
+        states, actions = (np.concatenate([part for part, _ in track], axis=1) for track in (state, action or state))
+        return states, actions, sum(outside for _, outside in state + action)
 
     def tools(self, tree: TransformTree, base: str, grid_ns: np.ndarray) -> np.ndarray | None:
         """(t, A, 4, 4) T_base_tool where it is recorded, else None."""
         poses: list[np.ndarray] = []
         for arm in self.arms:
-            if arm.tool is not None:
-                signal, frame = arm.tool
-                values = resampling.poses(signal.times_ns, signal.values, grid_ns)
-                T_frame_tool = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])
-                poses.append(T_frame_tool if frame == base else tree.poses(base, frame, grid_ns) @ T_frame_tool)
-            elif arm.topics.tool_frame is not None:
-                poses.append(tree.poses(base, arm.topics.tool_frame.lstrip("/"), grid_ns))
+            if arm.frame is None:
+                continue
+            if arm.tool is None:
+                poses.append(tree.poses(base, arm.frame, grid_ns))
+                continue
+            values = interpolated_poses(arm.tool.times_ns, arm.tool.values, grid_ns)
+            pose = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:])
+            poses.append(pose if arm.frame == base else tree.poses(base, arm.frame, grid_ns) @ pose)
         return np.stack(poses, axis=1) if poses else None
-
-    def time_errors(self, grid_ns: np.ndarray) -> dict[str, TimeError]:
-        return {f"topic {signal.topic}": TimeError.of(signal.times_ns, grid_ns) for signal in self.signals()}
 
     def prediction_error_rad(self) -> float:
         """Largest distance of a measured joint from the line through its neighbours in time."""
         errors = []
         for arm in self.arms:
-            error = resampling.largest_prediction_error(arm.state[0].times_ns, arm.state[0].values)
+            error = largest_prediction_error(arm.state.joints.times_ns, arm.state.joints.values)
             errors.append(float(np.deg2rad(error)) if arm.topics.state.joints.unit == "deg" else error)
         return max(errors)
-
-
-def _vector(readings: ArmReadings, signals: tuple[Signal, Signal], grid_ns: np.ndarray) -> tuple[np.ndarray, int]:
-    """(t, joints + 1) joints [rad] and opening, and how many openings lay outside of 0..1."""
-    joints = signals[0].at(grid_ns, readings.joints.resample)
-    if readings.joints.unit == "deg":
-        joints = np.deg2rad(joints)
-    raw = signals[1].at(grid_ns, readings.gripper.resample).mean(axis=1)
-    opening, outside = readings.gripper.range.opening(raw)
-    return np.concatenate([joints, opening[:, None]], axis=1), outside
 
 
 def read_robot(
@@ -141,19 +152,19 @@ def read_robot(
     Raises: RejectedInputError: missing_column, invalid_tool_pose, clock_jump.
     """
 
-    def read(readings: ArmReadings) -> tuple[Signal, Signal]:
+    def track(readings: ArmReadings) -> _Track:
         joints, gripper = (
             _read_signal(streams[each.topic], each, timing, config.max_disorder_s, where)
             for each in (readings.joints, readings.gripper)
         )
-        return joints, gripper
+        return _Track(readings, joints, gripper)
 
-    arms: list[_ArmSignals] = []
+    arms: list[_Arm] = []
     for arm in config.arms:
-        tool = None
+        tool, frame = None, None if arm.tool_frame is None else arm.tool_frame.lstrip("/")
         if arm.tool_pose is not None:
-            tool = _read_poses(streams[arm.tool_pose], timing, config.max_disorder_s, where)
-        arms.append(_ArmSignals(arm, read(arm.state), None if arm.command is None else read(arm.command), tool))
+            tool, frame = _read_tool(streams[arm.tool_pose], timing, config.max_disorder_s, where)
+        arms.append(_Arm(arm, track(arm.state), None if arm.command is None else track(arm.command), tool, frame))
     return RobotSignals(tuple(arms))
 
 
@@ -185,28 +196,18 @@ def _read_signal(
     return Signal(stream.topic, arrivals, np.array(rows, np.float64)[arrivals.order])
 
 
-def _read_poses(stream: Stream, timing: Timing, max_disorder_s: float, where: object) -> tuple[Signal, str]:
+def _read_tool(stream: Stream, timing: Timing, max_disorder_s: float, where: object) -> tuple[Signal, str]:
     """Poses (n, 7) of a topic, quaternions of unit length, and the frame that they are given in.
 
     Raises: RejectedInputError: invalid_tool_pose, clock_jump.
     """
     at = f"{where}, topic {stream.topic}"
-    poses = [value for value in stream.values if isinstance(value, Pose)]
-    frames = sorted({pose.frame for pose in poses})
-    values = np.array([pose.values for pose in poses], np.float64)
-    length = np.linalg.norm(values[:, 3:], axis=1)
-    usable = bool(np.isfinite(values).all() and (length > 1e-6).all())
-    if len(frames) != 1 or not usable:
+    values = unit_poses([pose.values for pose in stream.values], "invalid_tool_pose", at)
+    frames = sorted({pose.frame for pose in stream.values})
+    if len(frames) != 1:
         raise RejectedInputError(
-            "invalid_tool_pose",
-            "Tool poses change their frame"
-            if usable
-            else "Tool pose is not finite or has a quaternion without direction",
-            where=at,
-            expected="one frame and unit quaternions",
-            got=", ".join(frames) or "no poses",
+            "invalid_tool_pose", "Tool poses change their frame", where=at, expected="one frame", got=", ".join(frames)
         )
-    values[:, 3:] /= length[:, None]
     arrivals = in_order(timing.times_ns(stream), at, max_disorder_s)
     return Signal(stream.topic, arrivals, values[arrivals.order]), frames[0]
 
@@ -225,5 +226,4 @@ def _missing(stream: Stream, readings: TopicReadings, where: str) -> RejectedInp
         where=where,
         expected=f"{readings.field} of {', '.join(wanted)}",
         got=got,
-        evidence={"topic": stream.topic, "expected": list(wanted)},
     )

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import Stream
+from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig
 
-TimeSource = Literal["header", "log", "publish"]
 _DRIFT_BINS = 8
 # In a shorter recording the jitter of transport hides the drift.
 _MIN_DRIFT_SECONDS = 30.0
@@ -64,42 +63,37 @@ class Timing:
         headerless: topics that are timed by their log time because their messages state none.
     """
 
-    source: TimeSource
-    offsets_ms: Mapping[str, float]
+    config: McapTopicsSourceConfig
     to_clock_ns: int
     clocks: Mapping[str, Clock]
     skew_ms: float
     headerless: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls,
-        streams: Mapping[str, Stream],
-        source: TimeSource,
-        offsets_ms: Mapping[str, float],
-        max_skew_ms: float,
-        reference: str,
-        where: object,
-    ) -> Timing:
+    def of(cls, config: McapTopicsSourceConfig, streams: Mapping[str, Stream], where: object) -> Timing:
         """Look at the stamps of all topics.
 
-        Args:
-            reference: topic whose least delay leads from log time to header time, for messages that have no header: that of
-                the joints, which commands must fit (where it has headers, else the topic with the least delay).
+        The least delay of the joints' topic, which commands must fit, leads from log time to header time for messages that
+        have no header (where joints have none, the least of all topics does).
 
         Raises: RejectedInputError: clock_skew where header times are to count and disagree by more than allowed, or are
             not set.
         """
+        by_header = config.time == "header"
         headed = [stream for stream in streams.values() if stream.headed and stream.kind != "calibration"]
-        headerless = tuple(
-            stream.topic for stream in streams.values() if not stream.headed and stream.kind != "transforms"
-        )
-        if source == "header":
-            for stream in headed:
-                _check_stamped(stream, where)
+        unset = next((stream for stream in headed if not stream.stamped), None) if by_header else None
+        if unset is not None:
+            raise RejectedInputError(
+                "clock_skew",
+                "Messages have no header time",
+                where=f"{where}, topic {unset.topic}",
+                expected="a header time in every message",
+                got=f"0 in {sum(not stamp for stamp in unset.stamps_ns)} of {len(unset.stamps_ns)}",
+                next_step="set time: log",
+            )
         clocks = {
             stream.topic: Clock.of(
-                np.array(stream.stamps_ns, np.int64) + round(offsets_ms.get(stream.topic, 0.0) * 1e6),
+                np.array(stream.stamps_ns, np.int64) + config.offset_ns(stream.topic),
                 np.array(stream.log_ns, np.int64),
             )
             for stream in headed
@@ -107,39 +101,37 @@ class Timing:
         }
         least = {topic: clock.least_delay_ms for topic, clock in clocks.items()}
         skew = max(least.values()) - min(least.values()) if least else 0.0
-        if source == "header" and skew > max_skew_ms:
+        if by_header and skew > config.max_clock_skew_ms:
             raise RejectedInputError(
                 "clock_skew",
                 "Clocks of topics disagree",
                 where=where,
-                expected=f"least delays within {max_skew_ms} ms of each other",
+                expected=f"least delays within {config.max_clock_skew_ms} ms of each other",
                 got=", ".join(f"{topic}: {delay:.1f} ms" for topic, delay in sorted(least.items())),
                 next_step="declare time_offsets_ms, or set time: log",
                 evidence={"skew_ms": skew, "least_delay_ms": least},
             )
-        shift = 0
-        if least and source == "header":
-            shift = round(least.get(reference, min(least.values())) * 1e6)
-        return cls(source, offsets_ms, shift, clocks, skew, headerless if source == "header" else ())
+        if not by_header:
+            return cls(config, 0, clocks, skew, ())
+        reference = config.arms[0].state.joints.topic
+        shift = round(least.get(reference, min(least.values())) * 1e6) if least else 0
+        headerless = (s.topic for s in streams.values() if not s.headed and s.kind != "transforms")
+        return cls(config, shift, clocks, skew, tuple(headerless))
 
     def times_ns(self, stream: Stream) -> np.ndarray:
-        """(n,) times of a topic's messages [ns] on the clock that `source` chooses."""
-        if self.source == "publish":
+        """(n,) times of a topic's messages [ns] on the clock that the configuration chooses."""
+        if self.config.time == "publish":
             return np.array(stream.publish_ns, np.int64)
-        if self.source == "log":
+        if self.config.time == "log":
             return np.array(stream.log_ns, np.int64)
         if not stream.headed:
             return np.array(stream.log_ns, np.int64) - self.to_clock_ns
-        return np.array(stream.stamps_ns, np.int64) + self.offset_ns(stream.topic)
-
-    def offset_ns(self, topic: str) -> int:
-        """What is added to a topic's header times."""
-        return round(self.offsets_ms.get(topic, 0.0) * 1e6)
+        return np.array(stream.stamps_ns, np.int64) + self.config.offset_ns(stream.topic)
 
     def notes(self) -> dict[str, str | float | int]:
         """What an episode's conventions say about its clocks."""
         drifts = [abs(clock.drift_ppm) for clock in self.clocks.values() if clock.drift_ppm is not None]
-        found: dict[str, str | float | int] = {"time": self.source, "clock_skew_ms": round(self.skew_ms, 6)}
+        found: dict[str, str | float | int] = {"time": self.config.time, "clock_skew_ms": round(self.skew_ms, 6)}
         if self.clocks:
             found["header_to_log_ms"] = "; ".join(
                 f"{topic}: least {clock.least_delay_ms:.3f}, median {clock.median_delay_ms:.3f}"
@@ -150,20 +142,6 @@ class Timing:
         if self.headerless:
             found["timed_by_log"] = ", ".join(sorted(self.headerless))
         return found
-
-
-def _check_stamped(stream: Stream, where: object) -> None:
-    if not stream.stamped:
-        missing = sum(1 for stamp in stream.stamps_ns if not stamp)
-        raise RejectedInputError(
-            "clock_skew",
-            "Messages have no header time",
-            where=f"{where}, topic {stream.topic}",
-            expected="a header time in every message",
-            got=f"0 in {missing} of {len(stream.stamps_ns)}",
-            next_step="set time: log",
-            evidence={"topic": stream.topic, "without_time": missing},
-        )
 
 
 @dataclass(frozen=True)
@@ -281,8 +259,8 @@ def nearest(times_ns: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
     right = np.clip(np.searchsorted(times_ns, grid_ns), 1, max(len(times_ns) - 1, 1))
     if len(times_ns) == 1:
         return np.zeros(len(grid_ns), dtype=np.int64)
-    left = right - 1
-    return np.where(grid_ns - times_ns[left] <= times_ns[right] - grid_ns, left, right)
+    earlier = grid_ns - times_ns[right - 1] <= times_ns[right] - grid_ns
+    return np.where(earlier, right - 1, right)
 
 
 def hold(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
@@ -322,7 +300,7 @@ def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
 
-def poses(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
+def interpolated_poses(times_ns: np.ndarray, values: np.ndarray, grid_ns: np.ndarray) -> np.ndarray:
     """(t, 7) from poses (n, 7) x y z qx qy qz qw: linear in place, slerp in rotation; constant beyond the ends.
 
     Quaternions must be of unit length.

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import Episode, Outcome
+from worldline_core.data.episodes.episode import CameraTrack, Episode, Outcome
+from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import timing as resampling
-from worldline_core.data.mcap.cameras import CalibratedCameras, fixed_or_moving, read_calibration, read_tree
-from worldline_core.data.mcap.file import READING_MARGIN_NS, McapFile, Stream, read_streams
-from worldline_core.data.mcap.images import EpisodeImages, ImageTrack, spoiled_frames
+from worldline_core.data.mcap.cameras import add_camera, fixed_or_moving, read_calibration, read_tree
+from worldline_core.data.mcap.file import McapFile, Stream, read_streams
+from worldline_core.data.mcap.images import ImageTrack, spoiled_frames
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind
 from worldline_core.data.mcap.robot import RobotSignals, read_robot
-from worldline_core.data.mcap.timing import Arrivals, TimeError, Timing, check_gaps, in_order
+from worldline_core.data.mcap.timing import Arrivals, TimeError, Timing, check_gaps, in_order, instants, nearest
 from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig
 
 LAYOUT = "mcap topics"
@@ -28,6 +28,9 @@ _KINDS: dict[str, tuple[Kind, ...]] = {
     "tool poses": ("pose",),
     "transforms": ("transforms",),
 }
+_READING_MARGIN_NS = 10**9
+"""Messages logged up to this long before and after an episode are read too: their own time may lie within it, and the instants at
+its ends need a message on both sides."""
 _TOGETHER_NS = 1_000_000
 """Topics that begin within a millisecond begin together: no image is left out for that."""
 
@@ -67,45 +70,41 @@ def read_topics_episode(
     Raises: RejectedInputError with the reason.
     """
     start_log, stop_log = segment.log_times(file)
-    streams = _streams(config, file, start_log, stop_log)
-    reference = config.arms[0].state.joints.topic
-    timing = Timing.of(streams, config.time, config.time_offsets_ms, config.max_clock_skew_ms, reference, file.shown)
-    robot = read_robot(config, streams, timing, file.shown)
+    around = (
+        None if start_log is None else max(start_log - _READING_MARGIN_NS, 0),
+        None if stop_log is None else stop_log + _READING_MARGIN_NS,
+    )
+    streams = _streams(config, file, around)
+    timing = Timing.of(config, streams, file.path)
+    robot = read_robot(config, streams, timing, file.path)
     images = {
-        view: in_order(
-            timing.times_ns(streams[topics.image]), f"{file.shown}, topic {topics.image}", config.max_disorder_s
-        )
-        for view, topics in config.views.items()
+        view: in_order(timing.times_ns(streams[each.image]), f"{file.path}, topic {each.image}", config.max_disorder_s)
+        for view, each in config.views.items()
     }
-    read = {view: read_calibration(file, streams, topics) for view, topics in config.views.items()}
+    read = {view: read_calibration(file, streams, each) for view, each in config.views.items()}
     calibrations = {view: calibration for view, calibration in read.items() if calibration is not None}
     frames = {
         view: (config.views[view].frame or calibration.frame or streams[config.views[view].image].frame).lstrip("/")
         for view, calibration in calibrations.items()
     }
-    tree = read_tree(config, file, streams, timing, start_log, [*frames.values(), *robot.frames])
-    clock = timing.to_clock_ns
-    extent = (
-        None if start_log is None else start_log - clock,
-        None if stop_log is None else stop_log - clock,
-    )
-    moving = [
-        times for frame in (*frames.values(), *robot.frames) for times in tree.moving_times(config.base_frame, frame)
-    ]
-    grid = _grid(config, file, images, robot, moving, extent)
+    wanted = [*frames.values(), *robot.frames]
+    tree = read_tree(config, file, streams, timing, start_log, wanted)
+    moving = [times for frame in wanted for times in tree.moving_times(config.base_frame, frame)]
+    start, stop = (None if log_ns is None else log_ns - timing.to_clock_ns for log_ns in (start_log, stop_log))
+    grid = _grid(config, file, images, robot, moving, start, stop)
     chosen = {view: _chosen_images(config, file, view, arrivals, grid) for view, arrivals in images.items()}
-    cameras = CalibratedCameras()
+    cameras = RecordedCameras()
     for view, frame in frames.items():
         topics = config.views[view]
         poses = fixed_or_moving(tree.poses(config.base_frame, frame, grid))
-        cameras.calibrate(
-            view, calibrations[view], poses, frame=f"{file.shown}, frame {frame}",
-            topic=f"{file.shown}, topic {topics.calibration}", rectified=topics.rectified,
+        add_camera(
+            cameras, view, calibrations[view], poses,
+            where=file.path, frame=frame, topic=topics.calibration, rectified=topics.rectified,
         )  # fmt: skip
     state, action, outside = robot.vectors(grid)
     tools = robot.tools(tree, config.base_frame, grid)
     errors = {f"image {view}": TimeError.of(arrivals.times_ns, grid) for view, arrivals in images.items()}
-    errors |= robot.time_errors(grid)
+    errors |= {f"topic {signal.topic}": TimeError.of(signal.times_ns, grid) for signal in robot.signals()}
     if moving:
         errors |= {"transforms": max((TimeError.of(times, grid) for times in moving), key=lambda error: error.max_ms)}
     arrivals = [*images.values(), *robot.arrivals()]
@@ -141,21 +140,15 @@ def read_topics_episode(
             **cameras.notes(),
         },
     )
-    around = (
-        None if start_log is None else max(start_log - READING_MARGIN_NS, 0),
-        None if stop_log is None else stop_log + READING_MARGIN_NS,
-    )
     tracks = {
-        view: _track(streams[topics.image], images[view], chosen[view], around, file)
-        for view, topics in config.views.items()
+        view: _track(file, streams[each.image], images[view], chosen[view], around, cameras.tracks.get(view))
+        for view, each in config.views.items()
     }
-    topics_of = {view: topics.calibration for view, topics in config.views.items()}
-    reader = EpisodeImages(file, tracks, cameras.tracks, topics_of)
-    return LoadedEpisode(episode, tuple(config.views), reader, distortions=cameras.lenses)
+    return LoadedEpisode(episode, tuple(config.views), lambda view: tracks[view].frames(), distortions=cameras.lenses)
 
 
 def _streams(
-    config: McapTopicsSourceConfig, file: McapFile, start_log: int | None, stop_log: int | None
+    config: McapTopicsSourceConfig, file: McapFile, around_ns: tuple[int | None, int | None]
 ) -> dict[str, Stream]:
     """Every topic that the episode needs. Transforms are optional here: a missing one is reported where a pose needs it.
 
@@ -168,17 +161,16 @@ def _streams(
     file.check_topics(roles)
     needed = set(roles) - topics["calibrations"]
     roles |= {topic: _KINDS["transforms"] for topic in config.transforms if topic in file.topics}
-    streams = read_streams(file, roles, start_log, stop_log)
+    streams = read_streams(file, roles, *around_ns)
     silent = sorted(needed - set(streams))
     if silent:
         raise RejectedInputError(
             "missing_topic",
             "A topic has no messages during the episode",
-            where=file.shown,
+            where=file.path,
             expected=", ".join(silent),
             got=", ".join(f"{topic}: {len(stream.log_ns)}" for topic, stream in sorted(streams.items()))
             or "no messages",
-            evidence={"missing": silent},
         )
     return streams
 
@@ -189,7 +181,8 @@ def _grid(
     images: Mapping[str, Arrivals],
     robot: RobotSignals,
     moving: list[np.ndarray],
-    extent: tuple[int | None, int | None],
+    start_ns: int | None,
+    stop_ns: int | None,
 ) -> np.ndarray:
     """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first topic ends.
 
@@ -197,28 +190,27 @@ def _grid(
     """
     named = {f"topic {config.views[view].image}": arrivals.times_ns for view, arrivals in images.items()}
     named |= {f"topic {signal.topic}": signal.times_ns for signal in robot.signals()}
-    start = min(times[0] for times in named.values()) if extent[0] is None else extent[0]
-    stop = max(times[-1] for times in named.values()) if extent[1] is None else extent[1]
+    start = min(times[0] for times in named.values()) if start_ns is None else start_ns
+    stop = max(times[-1] for times in named.values()) if stop_ns is None else stop_ns
     of_images = {f"topic {topics.image}" for topics in config.views.values()}
     for name, times in named.items():
         # Gaps between images are judged in `_chosen_images`, by the distance of instants from the nearest image.
         max_gap = float("inf") if name in of_images else config.max_gap_s
-        check_gaps(times, int(start), int(stop), max_gap, config.max_trim_s, f"{file.shown}, {name}")
+        check_gaps(times, int(start), int(stop), max_gap, config.max_trim_s, f"{file.path}, {name}")
     everything = [*named.values(), *moving]
     first = max(int(start), *(int(times[0]) for times in everything))
     last = min(int(stop), *(int(times[-1]) for times in everything))
     primary = images[config.timing_view].times_ns
     begin = int(np.searchsorted(primary, first - _TOGETHER_NS))
-    grid = resampling.instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
+    grid = instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
     if len(grid) < 2:
         raise RejectedInputError(
             "too_short",
             "Topics overlap for less than two frames",
-            where=file.shown,
+            where=file.path,
             expected=f"at least {1 / config.fps:.3f} s",
             got=f"{max(last - first, 0) / 1e9:.3f} s",
             next_step="if the topics' clocks differ, set time: log or time_offsets_ms",
-            evidence={"frames": len(grid)},
         )
     return grid
 
@@ -230,7 +222,7 @@ def _chosen_images(
 
     Raises: RejectedInputError: wrong_fps for a camera that is slower than the wanted rate, time_gap where images are missing.
     """
-    where = f"{file.shown}, topic {config.views[view].image}"
+    where = f"{file.path}, topic {config.views[view].image}"
     if arrivals.median_step_ns * config.fps > 1.25e9:
         raise RejectedInputError(
             "wrong_fps",
@@ -241,7 +233,7 @@ def _chosen_images(
             next_step="lower the source's fps",
             evidence={"wanted_fps": config.fps, "measured_fps": float(1e9 / arrivals.median_step_ns)},
         )
-    chosen = resampling.nearest(arrivals.times_ns, grid)
+    chosen = nearest(arrivals.times_ns, grid)
     distance = np.abs(arrivals.times_ns[chosen] - grid) * config.fps / 1e9
     if distance.max() > config.max_image_distance_frames:
         worst = int(np.argmax(distance))
@@ -262,7 +254,12 @@ def _chosen_images(
 
 
 def _track(
-    stream: Stream, arrivals: Arrivals, chosen: np.ndarray, around: tuple[int | None, int | None], file: McapFile
+    file: McapFile,
+    stream: Stream,
+    arrivals: Arrivals,
+    chosen: np.ndarray,
+    around_ns: tuple[int | None, int | None],
+    camera: CameraTrack | None,
 ) -> ImageTrack:
     """Raises: RejectedInputError (truncated_video) for video frames that depend on a lost message."""
     keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
@@ -273,24 +270,21 @@ def _track(
             raise RejectedInputError(
                 "truncated_video",
                 "Video frames depend on a message that is missing",
-                where=f"{file.shown}, topic {stream.topic}, frame {first}",
+                where=f"{file.path}, topic {stream.topic}, frame {first}",
                 expected=f"a message every {arrivals.median_step_ns / 1e6:.1f} ms between key frames",
                 got=f"{int(spoiled.sum())} of {len(chosen)} frames after a gap, before the next key frame",
                 next_step="cut the recording at the gap",
                 evidence={"first_frame": first, "frames": int(spoiled.sum())},
             )
-    return ImageTrack(stream.topic, stream.kind, *around, arrivals.order, chosen, keys)
+    return ImageTrack(file, stream.topic, stream.kind, around_ns, arrivals.order, chosen, keys, camera)
 
 
 def _resampling_notes(errors: Mapping[str, TimeError]) -> dict[str, str | float | int]:
+    by_topic = {
+        name: {"max_ms": round(error.max_ms, 6), "mean_ms": round(error.mean_ms, 6)} for name, error in errors.items()
+    }
     return {
         "resampling_max_ms": round(max(error.max_ms for error in errors.values()), 6),
         "resampling_mean_ms": round(float(np.mean([error.mean_ms for error in errors.values()])), 6),
-        "resampling": json.dumps(
-            {
-                name: {"max_ms": round(error.max_ms, 6), "mean_ms": round(error.mean_ms, 6)}
-                for name, error in errors.items()
-            },
-            sort_keys=True,
-        ),
+        "resampling": json.dumps(by_topic, sort_keys=True),
     }

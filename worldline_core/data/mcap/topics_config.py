@@ -9,7 +9,6 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange
-from worldline_core.data.mcap.timing import TimeSource
 
 Resampling = Literal["linear", "hold"]
 
@@ -155,7 +154,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     static_transforms: tuple[str, ...] = Field(default=("/tf_static",), description="topics of transforms that stay")
     episodes: Annotated[WholeFiles | TimeRanges | Markers, Field(discriminator="by")] = WholeFiles()
     instruction: str = ""
-    time: TimeSource = Field(
+    time: Literal["header", "log", "publish"] = Field(
         default="header", description="which time of a message counts; messages without a header: their log time"
     )
     time_offsets_ms: dict[str, float] = Field(
@@ -204,6 +203,10 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
                 if seen.setdefault(topic, role) != role:
                     raise ValueError(f"topic {topic} is declared both as {seen[topic]} and as {role}")
         return self
+
+    def offset_ns(self, topic: str) -> int:
+        """What is added to a topic's header times."""
+        return round(self.time_offsets_ms.get(topic, 0.0) * 1e6)
 
     @property
     def timing_view(self) -> str:

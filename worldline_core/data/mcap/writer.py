@@ -20,8 +20,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.guards.rejection import check_length
 from worldline_core.errors import DataError
-from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
 from worldline_core.store.atomic import atomic_path
 
@@ -29,47 +29,37 @@ ImageFormat = Literal["png", "jpeg"]
 EPISODE_METADATA = "worldline.episode"
 FORMAT_VERSION = 2
 _JPEG_QUALITY = 95
-_LENS_NAMES = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
 
 
 def write_episode_mcap(
     path: Path,
     episode: Episode,
     frames: Mapping[str, np.ndarray],
-    *,
-    image_format: ImageFormat = "png",
     robot_masks: Mapping[str, np.ndarray] | None = None,
-    distortions: Mapping[str, Distortion] | None = None,
 ) -> None:
-    """Write one episode.
+    """Write one episode; images are exact (png).
 
     Args:
         frames: by view, uint8 (episode.num_video_frames, H, W, 3) RGB.
-        image_format: png keeps pixels exactly; jpeg (quality 95) is smaller and keeps them on average within 4 of 255.
-        robot_masks: by view, bool (N, H, W), always exact.
-        distortions: lenses by view, where frames and K are those of a distorting lens.
+        robot_masks: by view, bool (N, H, W).
 
-    Raises: DataError when frames and states differ in number.
+    Raises: RejectedInputError (length_mismatch) when frames and states differ in number.
     """
     for view, images in frames.items():
-        if len(images) != episode.num_video_frames:
-            raise DataError(
-                "Images and states differ in number",
-                where=f"{path}, view {view}",
-                expected=episode.num_video_frames,
-                got=len(images),
-            )
+        check_length(
+            "Images", f"{path}, view {view}", states=episode.num_video_frames, unit="frames", found=len(images)
+        )
     names = list(episode.state_names or (f"state_{i}" for i in range(episode.state.shape[1])))
-    with _new_file(path, EPISODE_METADATA, _metadata(episode, list(frames), image_format)) as messages:
+    with _new_file(path, EPISODE_METADATA, _metadata(episode, list(frames))) as messages:
         for index, time in enumerate(episode.timestamps):
             messages.time_ns = round(float(time) * 1e9)
             for topic, values in (("/joint_states", episode.state), ("/joint_commands", episode.action)):
                 joints = [{"name": n, "position": v} for n, v in zip(names, values[index].tolist(), strict=True)]
                 messages.add(topic, "foxglove.JointStates", {"joints": joints})
-            messages.add_poses(index, episode.cameras, episode.T_base_ee, distortions or {})
+            messages.add_poses(index, episode.cameras, episode.T_base_ee)
             if index < episode.num_video_frames:
-                messages.add_images("image", index, frames, image_format)
-                messages.add_images("robot_mask", index, robot_masks or {}, image_format)
+                messages.add_images("image", index, frames, "png")
+                messages.add_images("robot_mask", index, robot_masks or {}, "png")
 
 
 def write_rollout_mcap(
@@ -80,9 +70,8 @@ def write_rollout_mcap(
     metadata: Mapping[str, str] | None = None,
     cameras: Mapping[str, CameraTrack] | None = None,
     T_base_ee: np.ndarray | None = None,
-    image_format: ImageFormat = "jpeg",
 ) -> None:
-    """Write predicted videos.
+    """Write predicted videos, as JPEG of quality 95 (on average within 4 of 255).
 
     Args:
         frames_by_view: uint8 (N, H, W, 3) RGB by view.
@@ -99,8 +88,8 @@ def write_rollout_mcap(
     with _new_file(path, "worldline.rollout", record) as messages:
         for index in range(next(iter(lengths.values()))):
             messages.time_ns = round(float(index / fps) * 1e9)
-            messages.add_poses(index, cameras or {}, T_base_ee, {})
-            messages.add_images("image", index, frames_by_view, image_format)
+            messages.add_poses(index, cameras or {}, T_base_ee)
+            messages.add_images("image", index, frames_by_view, "jpeg")
 
 
 @contextmanager
@@ -136,18 +125,11 @@ class _Messages:
         data = json.dumps({"timestamp": stamp, **message}, separators=(",", ":"), allow_nan=False).encode()
         self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence)
 
-    def add_poses(
-        self,
-        index: int,
-        cameras: Mapping[str, CameraTrack],
-        T_base_ee: np.ndarray | None,
-        distortions: Mapping[str, Distortion],
-    ) -> None:
+    def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
         for view, camera in cameras.items():
             if index == 0:
-                message = _calibration(camera, distortions.get(view))
-                self.add(f"/{view}/calibration", "foxglove.CameraCalibration", message)
+                self.add(f"/{view}/calibration", "foxglove.CameraCalibration", _calibration(camera))
             if index == 0 or camera.moving:
                 pose = camera.T_base_camera[index if camera.moving else 0]
                 self.add("/tf", "foxglove.FrameTransform", _transform(f"{view}_camera", pose))
@@ -160,7 +142,7 @@ class _Messages:
             self.add(f"/{view}/{kind}", "foxglove.CompressedImage", message)
 
 
-def _metadata(episode: Episode, views: list[str], image_format: str) -> dict[str, str]:
+def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
     values = {
         "format_version": FORMAT_VERSION,
         **episode.described(),
@@ -170,36 +152,28 @@ def _metadata(episode: Episode, views: list[str], image_format: str) -> dict[str
         "video_frames": episode.video_frames,
         "num_arms": 0 if episode.T_base_ee is None else int(episode.T_base_ee.shape[1]),
         "gripper": None if episode.gripper is None else np.asarray(episode.gripper, np.float64).tolist(),
-        "image_format": image_format,
+        "image_format": "png",
     }
     return {key: json.dumps(value, sort_keys=True) for key, value in values.items()}
 
 
 def _image(frame: np.ndarray, frame_id: str, image_format: ImageFormat) -> dict[str, Any]:
-    if frame.dtype == bool:
-        pixels, image_format = frame.astype(np.uint8) * 255, "png"
-    else:
-        pixels = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    pixels = frame.astype(np.uint8) * 255 if frame.dtype == bool else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    done, encoded = cv2.imencode(".jpg" if image_format == "jpeg" else ".png", pixels, settings)
+    done, encoded = cv2.imencode(f".{image_format}", pixels, settings)
     if not done:
         raise DataError("Image cannot be compressed", where=frame_id, expected=image_format, got=str(frame.shape))
     return {"frame_id": frame_id, "data": base64.b64encode(encoded.tobytes()).decode(), "format": image_format}
 
 
-def _calibration(camera: CameraTrack, distortion: Distortion | None) -> dict[str, Any]:
-    """Foxglove's CameraCalibration; a lens with more than five radtan coefficients is a rational_polynomial."""
-    model, coefficients = "plumb_bob", (0.0,) * 5
-    if distortion is not None:
-        coefficients = distortion.coefficients
-        model = "rational_polynomial" if len(coefficients) > 5 else _LENS_NAMES[distortion.model]
+def _calibration(camera: CameraTrack) -> dict[str, Any]:
     K = camera.K.reshape(-1).tolist()
     return {
         "frame_id": f"{camera.view}_camera",
         "width": camera.width,
         "height": camera.height,
-        "distortion_model": model,
-        "D": list(coefficients),
+        "distortion_model": "plumb_bob",
+        "D": [0.0] * 5,
         "K": K,
         "R": np.eye(3).reshape(-1).tolist(),
         "P": [*K[0:3], 0.0, *K[3:6], 0.0, *K[6:9], 0.0],

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Literal
 
@@ -43,8 +42,7 @@ def _checked(path: AnyPath, name: str, root: AnyPath) -> AnyPath:
 class McapSource:
     """Reads a folder of MCAP files; a damaged file is known by its name."""
 
-    def __init__(self, config: McapSourceConfig, root: AnyPath) -> None:
-        self._name = config.name
+    def __init__(self, _: McapSourceConfig, root: AnyPath) -> None:
         self._root = root
         self._episodes: dict[str, tuple[AnyPath, str]] = {}
         for name, path in _files(root).items():
@@ -64,14 +62,9 @@ class McapSource:
         loaded = read_exported_episode(McapFile(_checked(path, name, self._root)))
         if loaded.episode.episode_id != episode_id:
             raise RejectedInputError(
-                "duplicate_id",
-                "Two files hold an episode of this id",
-                where=path,
-                got=loaded.episode.episode_id,
+                "duplicate_id", "Two files hold an episode of this id", where=path, got=loaded.episode.episode_id
             )
-        if self._name is None:
-            return loaded
-        return replace(loaded, episode=replace(loaded.episode, source=self._name))
+        return loaded
 
 
 class McapTopicsSource:
@@ -160,9 +153,8 @@ def _unpaired(rule: Markers, file: McapFile, count: int, text: str) -> Segment:
     fault = RejectedInputError(
         "missing_marker",
         "Markers of an episode are not a start and a stop",
-        where=f"{file.shown}, topic {rule.topic}, episode {count}",
+        where=f"{file.path}, topic {rule.topic}, episode {count}",
         expected=f"{rule.start!r}, then {rule.stop!r}",
         got=repr(text),
-        evidence={"episode": count, "marker": text},
     )
     return Segment(f"{count:04d}", fault=fault)
