@@ -154,7 +154,8 @@ def test_videos_of_droid_as_plain_videos_are_for_evaluation_alone(tmp_path: Path
 
 def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> None:
     """The sample's own calibration, put into the layout of a calibration file: fingertips land in both pictures."""
-    from worldline_core.data.sources.calibration_file import CameraEntry, calibrated_view
+    from worldline_core.data.episodes.recorded_poses import RecordedCameras
+    from worldline_core.data.sources.calibration_file import CameraEntry, add_calibrated_view
 
     folder = shared_data / "droid_ctrl_world"
     recorded = json.loads((folder / "selfcal_droid_new_setup_0003.json").read_text())
@@ -167,7 +168,9 @@ def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> N
         entry = CameraEntry.model_validate(
             {"width": width, "height": height, "maps": "camera_to_base", "axes": "opencv", "K": camera["K"], "T": camera["c2w_opencv"]}
         )  # fmt: skip
-        found = calibrated_view(
+        cameras = RecordedCameras()
+        add_calibrated_view(
+            cameras,
             "head",
             entry,
             image_size=(height // 2, width // 2),
@@ -175,9 +178,9 @@ def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> N
             read_feature=lambda name: np.zeros(0),
             where="sample",
         )
-        assert found is not None
-        seen = tips @ np.linalg.inv(found.track.T_base_camera[0]).T
-        pixels = seen[:, :3] @ found.track.K.T
+        found = cameras.tracks["head"]
+        seen = tips @ np.linalg.inv(found.T_base_camera[0]).T
+        pixels = seen[:, :3] @ found.K.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = (seen[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < [width // 2, height // 2]).all(axis=1)
         assert inside.mean() > 0.9

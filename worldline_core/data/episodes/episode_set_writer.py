@@ -68,7 +68,6 @@ class EpisodeSetWriter:
         video_crf: int = 18,
         video_preset: str = "slow",
         pixel_format: PixelFormat = "yuv420p",
-        video_megabytes: int = 200,
         video_mode: VideoMode = "auto",
         key_frame_interval: int = KEY_FRAME_INTERVAL,
     ) -> None:
@@ -82,7 +81,6 @@ class EpisodeSetWriter:
         self.fps = fps
         self.image_size = image_size
         self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode, key_frame_interval)
-        self.video_megabytes = video_megabytes
         self._work = root / "run" / "episodes"
         self._parts = self._work / "parts"
         self._rejected = self._work / "rejected"
@@ -215,7 +213,7 @@ class EpisodeSetWriter:
             used[embodiment] = used.get(embodiment, 0) + 1
             name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
             dataset = self.root / "datasets" / name
-            write_dataset(dataset, [_dataset_episode(part) for part in members], video_megabytes=self.video_megabytes)
+            write_dataset(dataset, [_dataset_episode(part) for part in members])
             write_sidecar(dataset, members)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
         write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))

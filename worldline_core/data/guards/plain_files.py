@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.lib import format as npy
+from pydantic import BaseModel, ValidationError
 
 from worldline_core.data.guards.rejection import (
     MAX_ARRAY_BYTES,
@@ -105,6 +106,24 @@ def well_formed(where: object, layout: str) -> Iterator[None]:
             where=str(where),
             expected=layout,
             got=f"{type(error).__name__}: {error}",
+        ) from error
+
+
+def validated[M: BaseModel](model: type[M], content: Any, where: object, what: str) -> M:
+    """Parsed content as a model.
+
+    Raises: RejectedInputError (missing_column) at the first key that is missing, unknown or of another kind.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise RejectedInputError(
+            "missing_column",
+            f"{what} is not understood",
+            where=", ".join([str(where), ".".join(map(str, first["loc"]))]),
+            expected=first["msg"],
+            next_step="see the layout in docs/sources.md",
         ) from error
 
 

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import BaseModel
 
-from worldline_core.data.guards.plain_files import read_json_lines, read_table
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.plain_files import column_names, read_json_lines, read_table, validated
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file
 from worldline_core.data.lerobot.metadata import INDEX, EpisodeTable, read_info, whole_number
 from worldline_core.data.video.clip import VideoClip, video_size
@@ -46,35 +47,29 @@ class LeRobotDataset(ABC):
 
     def __init__(self, root: AnyPath) -> None:
         self.root = root
-        self.info: dict[str, Any] = read_info(root, self.version, self.needed_keys)
+        self.info = read_info(root, self.version, self.needed_keys)
 
     @property
     def fps(self) -> float:
-        return float(self.info["fps"])
+        return self.info.fps
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
-        return self.info["features"]
+        return self.info.features
 
     @property
     def video_keys(self) -> list[str]:
         return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     @cached_property
+    @abstractmethod
     def episodes(self) -> EpisodeTable:
         """The list of episodes, without statistics."""
-        return self._read_episodes()
 
     @cached_property
+    @abstractmethod
     def tasks(self) -> dict[int, str]:
         """Instruction by task_index."""
-        return self._read_tasks()
-
-    @abstractmethod
-    def _read_episodes(self) -> EpisodeTable: ...
-
-    @abstractmethod
-    def _read_tasks(self) -> dict[int, str]: ...
 
     @abstractmethod
     def column(self, episode_index: int, name: str) -> np.ndarray:
@@ -97,13 +92,9 @@ class LeRobotDataset(ABC):
         """
         return self.episodes.row(episode_index)
 
-    def video_rate(self, episode_index: int, key: str) -> float:
-        """Frames per second that the container states."""
-        return video_size(self.clip(episode_index, key).path)[2]
-
-    def image_size(self, episode_index: int, key: str) -> tuple[int, int]:
-        """(height, width) that the container states."""
-        return video_size(self.clip(episode_index, key).path)[:2]
+    def video_size(self, episode_index: int, key: str) -> tuple[int, int, float]:
+        """(height, width, frames per second) that the container states."""
+        return video_size(self.clip(episode_index, key).path)
 
     def _number(self, row: dict[str, Any], key: str) -> int:
         return whole_number(row, key, f"{self.root}, episode {row[INDEX]}")
@@ -121,36 +112,29 @@ class LeRobotV3Dataset(LeRobotDataset):
         super().__init__(root)
         self._data: dict[AnyPath, pa.Table] = {}
 
-    def _read_episodes(self) -> EpisodeTable:
+    @cached_property
+    def episodes(self) -> EpisodeTable:
         folder = self.root / "meta" / "episodes"
         files = find_files(folder, "*/*.parquet")
         if not files:
             raise DataError("Dataset lists no episodes", where=str(folder), expected="chunk-*/file-*.parquet")
         return EpisodeTable.from_parquet(files, folder)
 
-    def _read_tasks(self) -> dict[int, str]:
-        table = read_table(self.root / "meta" / "tasks.parquet")
-        label = "task" if "task" in table.column_names else "__index_level_0__"
-        missing = {"task_index", label} - set(table.column_names)
-        if missing:
-            raise DataError(
-                "meta/tasks.parquet lacks a column",
-                where=str(self.root),
-                expected="task_index, task",
-                got=", ".join(table.column_names),
-            )
+    @cached_property
+    def tasks(self) -> dict[int, str]:
+        path = self.root / "meta" / "tasks.parquet"
+        label = "task" if "task" in column_names(path) else "__index_level_0__"
+        table = read_table(path, ["task_index", label])
         try:
             texts = [str(text) for text in table[label].to_pylist()]
         except UnicodeDecodeError as error:  # Parquet declares UTF-8 and checks nothing
-            raise DataError(
-                "meta/tasks.parquet holds text that is no UTF-8", where=str(self.root), got=str(error)
-            ) from error
+            raise DataError("Task list holds text that is no UTF-8", where=str(path), got=str(error)) from error
         return dict(zip(table["task_index"].to_pylist(), texts, strict=True))
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
         row = self.row(episode_index)
         path = self._path(
-            str(self.info.get("data_path", DATA_PATH)),
+            self.info.data_path or DATA_PATH,
             chunk_index=self._number(row, "data/chunk_index"),
             file_index=self._number(row, "data/file_index"),
         )
@@ -186,7 +170,7 @@ class LeRobotV3Dataset(LeRobotDataset):
                 got=", ".join(self.video_keys),
             )
         path = self._path(
-            str(self.info.get("video_path", VIDEO_PATH)),
+            self.info.video_path or VIDEO_PATH,
             video_key=key,
             chunk_index=self._number(row, chunk),
             file_index=self._number(row, file),
@@ -207,8 +191,12 @@ class LeRobotV3Dataset(LeRobotDataset):
 
         Raises: DataError when the video is missing, truncated or too short.
         """
-        clip = self.clip(episode_index, key)
-        return decode_frames(clip, indices)
+        return decode_frames(self.clip(episode_index, key), indices)
+
+
+class _Task(BaseModel):
+    task_index: int
+    task: Any
 
 
 class LeRobotV21Dataset(LeRobotDataset):
@@ -217,35 +205,31 @@ class LeRobotV21Dataset(LeRobotDataset):
     version = "v2.1"
     needed_keys = ("data_path", "video_path", "chunks_size")
 
-    def _read_episodes(self) -> EpisodeTable:
+    @cached_property
+    def episodes(self) -> EpisodeTable:
         return EpisodeTable.from_json_lines(self.root / "meta" / "episodes.jsonl")
 
-    def _read_tasks(self) -> dict[int, str]:
+    @cached_property
+    def tasks(self) -> dict[int, str]:
         path = self.root / "meta" / "tasks.jsonl"
         tasks: dict[int, str] = {}
         for row in read_json_lines(path):
-            if not isinstance(row, dict) or not isinstance(row.get("task_index"), int) or "task" not in row:
-                raise DataError(
-                    "Row of the task list is not understood",
-                    where=str(path),
-                    expected='{"task_index": 0, "task": "..."}',
-                    got=str(row)[:200],
-                )
-            tasks[row["task_index"]] = str(row["task"])
+            task = validated(_Task, row, path, "Row of the task list")
+            tasks[task.task_index] = str(task.task)
         return tasks
 
-    def _episode_path(self, template: str, episode_index: int, **values: str) -> AnyPath:
-        chunk = episode_index // int(self.info["chunks_size"])
-        return self._path(str(self.info[template]), episode_chunk=chunk, episode_index=episode_index, **values)
+    def _episode_path(self, template: str | None, episode_index: int, **values: str) -> AnyPath:
+        chunk = episode_index // self.info.chunks_size
+        return self._path(template or "", episode_chunk=chunk, episode_index=episode_index, **values)
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
-        path = self._episode_path("data_path", episode_index)
+        path = self._episode_path(self.info.data_path, episode_index)
         return _numbers_of(
             read_table(path, [name])[name], self._number(self.row(episode_index), "length"), f"{path}, column {name}"
         )
 
     def clip(self, episode_index: int, key: str) -> VideoClip:
-        path = self._episode_path("video_path", episode_index, video_key=key)
+        path = self._episode_path(self.info.video_path, episode_index, video_key=key)
         return VideoClip.whole_file(path, self._number(self.row(episode_index), "length"), self.fps)
 
 
@@ -255,15 +239,7 @@ def _numbers_of(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
     Raises: RejectedInputError (length_mismatch, nan_state, unreadable) for another number of rows than listed, empty rows,
         rows of different length, or values that are no numbers.
     """
-    if len(column) != length:
-        raise RejectedInputError(
-            "length_mismatch",
-            "Data file has another length than listed",
-            where=where,
-            expected=f"{length} rows",
-            got=f"{len(column)} rows",
-            evidence={"listed": length, "rows": len(column)},
-        )
+    check_length("Data file", where, states=length, unit="rows", found=len(column))
     values = column.combine_chunks()
     if isinstance(values, pa.ChunkedArray):
         values = pa.concat_arrays(values.chunks)

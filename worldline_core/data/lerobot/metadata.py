@@ -5,47 +5,48 @@ The list is kept as columns: 10^6 episodes are 10^6 rows of Arrow, not of Python
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.json
+from pydantic import BaseModel, ConfigDict, Field
 
-from worldline_core.data.guards.plain_files import column_names, read_json, read_table
+from worldline_core.data.guards.plain_files import column_names, read_json, read_table, validated
 from worldline_core.data.guards.rejection import MAX_TEXT_BYTES, RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, note_file, regular_file
 from worldline_core.errors import DataError
 
 
-def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> dict[str, Any]:
-    """The mapping, of the wanted version, with `fps`, `features` and `keys`.
+class DatasetInfo(BaseModel):
+    """`meta/info.json`: the keys that are read here; there may be others."""
+
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    codebase_version: str
+    fps: float = Field(gt=0, le=10_000)
+    features: dict[str, dict[str, Any]]
+    data_path: str | None = None
+    video_path: str | None = None
+    chunks_size: int = Field(default=1000, ge=1)
+    robot_type: Any = None
+    repo_id: Any = None
+
+
+def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetInfo:
+    """What `info.json` says, of the wanted version and with these keys.
 
     Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
     """
     where = f"{root}, meta/info.json"
-    info = read_json(root / "meta" / "info.json")
-    if not isinstance(info, dict):
-        raise DataError("meta/info.json holds no mapping", where=str(root), got=type(info).__name__)
-    found = str(info.get("codebase_version"))
-    if found != version:
-        raise DataError("Dataset has another version", where=str(root), expected=version, got=found)
-    missing = [key for key in ("fps", "features", *keys) if key not in info]
+    content = read_json(root / "meta" / "info.json")
+    info = validated(DatasetInfo, content, where, "meta/info.json")
+    if info.codebase_version != version:
+        raise DataError("Dataset has another version", where=str(root), expected=version, got=info.codebase_version)
+    missing = sorted(set(keys) - info.model_fields_set)
     if missing:
-        raise DataError("meta/info.json lacks a key", where=str(root), expected=", ".join(missing), got=", ".join(info))
-    fps = info["fps"]
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not (math.isfinite(fps) and 0 < fps <= 10_000):
-        raise DataError("Frame rate is no rate", where=where, expected="a number of frames per second", got=repr(fps))
-    features = info["features"]
-    if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
-        raise DataError("Features are no mapping of mappings", where=where, got=str(features)[:200])
-    for key in ("data_path", "video_path"):
-        if key in info and not isinstance(info[key], str | None):
-            raise DataError("Path template is no text", where=f"{where}, {key}", got=repr(info[key])[:200])
-    size = info.get("chunks_size", 1000)
-    if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-        raise DataError("Chunk size is no count", where=where, expected="a whole number from 1 on", got=repr(size))
+        raise DataError("meta/info.json lacks a key", where=where, expected=", ".join(missing), got=", ".join(content))
     return info
 
 
@@ -155,7 +156,6 @@ class EpisodeTable:
                 where=self._where,
                 expected="one row per episode",
                 got=f"{last - first} rows of {INDEX} {episode_index}",
-                evidence={"rows": last - first, INDEX: int(episode_index)},
             )
         return self._table.slice(first, 1).to_pylist()[0]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,62 +65,63 @@ class DatasetEpisode:
     videos: Mapping[str, EpisodeVideo]
 
 
-def write_dataset(root: Path, episodes: Sequence[DatasetEpisode], *, video_megabytes: int = _VIDEO_MEGABYTES) -> None:
+def write_dataset(root: Path, episodes: Sequence[DatasetEpisode]) -> None:
     """Write the dataset of episodes that have the same features and rate.
 
     A rerun over a half-written folder overwrites each file with the same bytes.
     """
-    first = episodes[0]
-    fps = first.fps
     lengths = [episode.num_frames for episode in episodes]
-    starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int)
+    starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int).tolist()
     instructions = list(dict.fromkeys(episode.instruction for episode in episodes))
-    task_of = {text: index for index, text in enumerate(instructions)}
-
-    table = _data_table(episodes, starts, task_of)
-    data_files = _files_by_size([24 * length * max(table.num_columns, 1) for length in lengths], _DATA_MEGABYTES)
-    places = {view: _write_videos(root, view, episodes, video_megabytes) for view in first.videos}
-    rows = []
-    for file in sorted(set(data_files)):
-        members = [index for index, other in enumerate(data_files) if other == file]
-        begin, end = int(starts[members[0]]), int(starts[members[-1] + 1])
-        path = root / DATA_PATH.format(chunk_index=file // _CHUNK_SIZE, file_index=file % _CHUNK_SIZE)
-        write_table_atomic(path, table.slice(begin, end - begin), rows_per_group=[lengths[index] for index in members])
-    for index, episode in enumerate(episodes):
-        statistics = _statistics([episode], table.slice(int(starts[index]), lengths[index]))
-        row: dict[str, Any] = {
-            "episode_index": index,
-            "tasks": [episode.instruction],
-            "length": lengths[index],
-            "data/chunk_index": data_files[index] // _CHUNK_SIZE,
-            "data/file_index": data_files[index] % _CHUNK_SIZE,
-            "dataset_from_index": int(starts[index]),
-            "dataset_to_index": int(starts[index + 1]),
-        }
-        for view in first.videos:
-            row |= places[view][index]
-        for key, feature in statistics.items():
-            row |= {f"stats/{key}/{name}": value.tolist() for name, value in feature.items()}
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        rows.append(row)
+    table = _data_table(episodes, starts, {text: index for index, text in enumerate(instructions)})
+    videos = {view: _write_videos(root, view, episodes) for view in episodes[0].videos}
+    sizes = [24 * length * max(table.num_columns, 1) for length in lengths]
+    rows: list[dict[str, Any]] = []
+    for file, members in enumerate(_files_by_size(sizes, _DATA_MEGABYTES)):
+        begin, end = starts[members[0]], starts[members[-1] + 1]
+        place = _place(file)
+        groups = [lengths[index] for index in members]
+        write_table_atomic(root / DATA_PATH.format(**place), table.slice(begin, end - begin), rows_per_group=groups)
+        for index in members:
+            row: dict[str, Any] = {
+                "episode_index": index,
+                "tasks": [episodes[index].instruction],
+                "length": lengths[index],
+                **{f"data/{name}": number for name, number in place.items()},
+                "dataset_from_index": starts[index],
+                "dataset_to_index": starts[index + 1],
+            }
+            for columns in videos.values():
+                row |= columns[index]
+            statistics = _statistics([episodes[index]], table.slice(starts[index], lengths[index]))
+            for key, feature in statistics.items():
+                row |= {f"stats/{key}/{name}": value.tolist() for name, value in feature.items()}
+            rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
     write_table_atomic(root / _EPISODES_PATH, pa.Table.from_pylist(rows))
     write_table_atomic(root / "meta" / "tasks.parquet", _tasks_table(instructions))
     write_json_atomic(root / "meta" / "stats.json", as_json(_statistics(episodes, table)))
-    write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions), video_megabytes, fps))
+    write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions)))
 
 
-def _files_by_size(sizes: Sequence[float], megabytes: int) -> list[int]:
-    """File number of each item when a file is closed before it would exceed `megabytes`."""
-    files, current, filled = [], 0, 0.0
-    for size in sizes:
-        if filled and filled + size > megabytes * 2**20:
-            current, filled = current + 1, 0.0
-        files.append(current)
+def _place(file: int) -> dict[str, int]:
+    return {"chunk_index": file // _CHUNK_SIZE, "file_index": file % _CHUNK_SIZE}
+
+
+def _files_by_size(sizes: Sequence[int], megabytes: int, alone: Collection[int] = ()) -> list[list[int]]:
+    """Indices of the items of each file: a file is closed before it would exceed `megabytes`; some items have one alone."""
+    files: list[list[int]] = []
+    filled = 0
+    for index, size in enumerate(sizes):
+        apart = index in alone or index - 1 in alone
+        if not files or apart or filled + size > megabytes * 2**20:
+            files.append([])
+            filled = 0
+        files[-1].append(index)
         filled += size
     return files
 
 
-def _data_table(episodes: Sequence[DatasetEpisode], starts: np.ndarray, task_of: dict[str, int]) -> pa.Table:
+def _data_table(episodes: Sequence[DatasetEpisode], starts: Sequence[int], task_of: dict[str, int]) -> pa.Table:
     columns: dict[str, list[np.ndarray]] = {}
     for index, episode in enumerate(episodes):
         length, fps = episode.num_frames, episode.fps
@@ -131,7 +132,7 @@ def _data_table(episodes: Sequence[DatasetEpisode], starts: np.ndarray, task_of:
             "timestamp": (frame_index / fps).astype(np.float32),
             "frame_index": frame_index,
             "episode_index": np.full(length, index, dtype=np.int64),
-            "index": frame_index + int(starts[index]),
+            "index": frame_index + starts[index],
             "task_index": np.full(length, task_of[episode.instruction], dtype=np.int64),
         }
         for name, value in values.items():
@@ -145,55 +146,41 @@ def _data_table(episodes: Sequence[DatasetEpisode], starts: np.ndarray, task_of:
     return pa.table(arrays)
 
 
-def _video_files(episodes: Sequence[DatasetEpisode], view: str, megabytes: int) -> list[list[DatasetEpisode]]:
-    """Which episodes share a file: those encoded here up to a size; a video that was copied as it was recorded has its own.
+def _write_videos(root: Path, view: str, episodes: Sequence[DatasetEpisode]) -> list[dict[str, Any]]:
+    """Join the clips of one view; returns the videos/<key>/* columns of each episode.
 
-    Copied videos may differ in parameter sets, and have frames stored out of order: joined they could not be found again
-    exactly.
+    A video that was copied as it was recorded has a file of its own: copied videos may differ in parameter sets, and have
+    frames stored out of order, so that joined they could not be found again exactly.
     """
-    files: list[list[DatasetEpisode]] = []
-    filled, open_to_more = 0, False
-    for episode in episodes:
-        size = episode.videos[view].path.stat().st_size
-        joins = open_to_more and not episode.videos[view].copied and filled + size <= megabytes * 2**20
-        if joins:
-            files[-1].append(episode)
-        else:
-            files.append([episode])
-        filled = filled + size if joins else size
-        open_to_more = not episode.videos[view].copied
-    return files
-
-
-def _write_videos(root: Path, view: str, episodes: Sequence[DatasetEpisode], megabytes: int) -> list[dict[str, Any]]:
-    """Join the clips of one view; returns the videos/<key>/* columns of each episode."""
     key = IMAGE_PREFIX + view
     rows: list[dict[str, Any]] = []
-    for file, members in enumerate(_video_files(episodes, view, megabytes)):
-        chunk_index, file_index = file // _CHUNK_SIZE, file % _CHUNK_SIZE
-        target = root / VIDEO_PATH.format(video_key=key, chunk_index=chunk_index, file_index=file_index)
+    videos = [episode.videos[view] for episode in episodes]
+    copied = {index for index, video in enumerate(videos) if video.copied}
+    sizes = [video.path.stat().st_size for video in videos]
+    for file, members in enumerate(_files_by_size(sizes, _VIDEO_MEGABYTES, alone=copied)):
+        place, fps = _place(file), episodes[0].fps
+        target = root / VIDEO_PATH.format(video_key=key, **place)
+        first = videos[members[0]]
         with atomic_path(target) as temporary:
-            if members[0].videos[view].copied:
-                _link(members[0].videos[view].path, temporary)
+            if first.copied:
+                _link(first.path, temporary)
             else:
-                concatenate_videos(
-                    temporary, [(episode.videos[view].path, episode.num_frames) for episode in members], members[0].fps
-                )
-        if members[0].videos[view].copied:
+                concatenate_videos(temporary, [(videos[i].path, episodes[i].num_frames) for i in members], fps)
+        if first.copied:
             thumbnails = cache_path(root.parents[1], target)
             thumbnails.parent.mkdir(parents=True, exist_ok=True)
-            _link(members[0].videos[view].thumbnails, thumbnails)
+            _link(first.thumbnails, thumbnails)
         frame = 0
-        for episode in members:
+        for episode in (episodes[index] for index in members):
+            stop = frame + episode.num_frames
             rows.append(
                 {
-                    f"videos/{key}/chunk_index": chunk_index,
-                    f"videos/{key}/file_index": file_index,
-                    f"videos/{key}/from_timestamp": frame / episode.fps,
-                    f"videos/{key}/to_timestamp": (frame + episode.num_frames) / episode.fps,
+                    **{f"videos/{key}/{name}": number for name, number in place.items()},
+                    f"videos/{key}/from_timestamp": frame / fps,
+                    f"videos/{key}/to_timestamp": stop / fps,
                 }
             )
-            frame += episode.num_frames
+            frame = stop
     return rows
 
 
@@ -239,8 +226,9 @@ def _tasks_table(instructions: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(metadata)})
 
 
-def _info(episodes: Sequence[DatasetEpisode], total_tasks: int, video_megabytes: int, fps: float) -> dict[str, Any]:
+def _info(episodes: Sequence[DatasetEpisode], total_tasks: int) -> dict[str, Any]:
     first = episodes[0]
+    fps = int(first.fps) if first.fps == int(first.fps) else first.fps
     width = first.state.shape[1]
     names = first.state_names or [f"state_{index}" for index in range(width)]
     features: dict[str, Any] = {
@@ -257,7 +245,7 @@ def _info(episodes: Sequence[DatasetEpisode], total_tasks: int, video_megabytes:
                 "video.width": image_width,
                 "video.codec": video.codec,
                 "video.pix_fmt": video.pixel_format,
-                "video.fps": int(fps) if fps == int(fps) else fps,
+                "video.fps": fps,
                 "video.channels": 3,
                 "has_audio": False,
                 "is_depth_map": False,
@@ -274,8 +262,8 @@ def _info(episodes: Sequence[DatasetEpisode], total_tasks: int, video_megabytes:
         "total_tasks": total_tasks,
         "chunks_size": _CHUNK_SIZE,
         "data_files_size_in_mb": _DATA_MEGABYTES,
-        "video_files_size_in_mb": video_megabytes,
-        "fps": int(fps) if fps == int(fps) else fps,
+        "video_files_size_in_mb": _VIDEO_MEGABYTES,
+        "fps": fps,
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH,

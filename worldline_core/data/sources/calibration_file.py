@@ -17,22 +17,20 @@ xyz_rpy_fixed}` (x y z [m], roll pitch yaw [rad] about fixed axes) or `format: m
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel, read_yaml
-from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.data.episodes.recorded_poses import Extrinsics, camera_pose
+from worldline_core.data.episodes.recorded_poses import Extrinsics, RecordedCameras, camera_pose
 from worldline_core.data.episodes.source import LensConfig
-from worldline_core.data.guards.plain_files import read_json
+from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import ConfigError
-from worldline_core.geometry.cameras import CameraAxes, CameraPose
+from worldline_core.geometry.cameras import CameraAxes, ImageTransform
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 MAX_YAML_BYTES = 16 << 20
@@ -72,15 +70,6 @@ class CalibrationFile(StrictModel):
     views: dict[str, CameraEntry] = Field(min_length=1)
 
 
-@dataclass(frozen=True)
-class CalibratedView:
-    """A camera at the image size of the recording, its recorded poses, and its lens where images still show it."""
-
-    track: CameraTrack
-    pose: CameraPose
-    lens: LensConfig | None
-
-
 def read_calibration(path: AnyPath) -> CalibrationFile:
     """A calibration file.
 
@@ -97,19 +86,8 @@ def read_calibration(path: AnyPath) -> CalibrationFile:
             "Calibration file is missing",
             where=str(path),
             next_step="write the file, or leave `calibration` out: such episodes then serve action-free training",
-            evidence={"file": path.name},
         ) from error
-    try:
-        return CalibrationFile.model_validate(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        raise RejectedInputError(
-            "missing_column",
-            "Calibration file is not understood",
-            where=f"{path}, {'.'.join(map(str, first['loc']))}",
-            expected=first["msg"],
-            next_step="see the layout in docs/sources.md",
-        ) from error
+    return validated(CalibrationFile, content, path, "Calibration file")
 
 
 def _yaml(path: AnyPath) -> Any:
@@ -122,7 +100,8 @@ def _yaml(path: AnyPath) -> Any:
         ) from error
 
 
-def calibrated_view(
+def add_calibrated_view(
+    cameras: RecordedCameras,
     view: str,
     entry: CameraEntry,
     *,
@@ -130,8 +109,9 @@ def calibrated_view(
     num_frames: int,
     read_feature: Callable[[str], np.ndarray],
     where: str,
-) -> CalibratedView | None:
-    """The camera of a view; None where the dataset's own column holds no pose (all zeros: it was never measured).
+) -> None:
+    """Add the camera of a view, and its lens where images still show it; nothing where the dataset's own column holds no
+    pose (all zeros: it was never measured).
 
     Args:
         image_size: (height, width) of the recorded video. K follows where only the scale differs.
@@ -148,17 +128,16 @@ def calibrated_view(
             expected=f"the aspect of {width}x{height}",
             got=f"{entry.width}x{entry.height}",
             next_step="give K for the recorded image: what was cropped cannot be told from the sizes",
-            evidence={"view": view, "calibrated": [entry.width, entry.height], "recorded": [width, height]},
         )
     if entry.T_feature is not None:
         matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")
         if matrices is None:
-            return None
+            return
     else:
         matrices = _matrices(entry.T or [], num_frames, f"{where}, view {view}")
     pose = camera_pose(view, matrices, extrinsics=entry.maps, axes=entry.axes, where=where)
-    track = CameraTrack.from_pose(view, np.asarray(entry.K), pose, width=entry.width, height=entry.height)
-    return CalibratedView(track.resized(width, height), pose, entry.distortion)
+    K = ImageTransform.of((entry.height, entry.width)).resize(image_size).intrinsics(np.asarray(entry.K))
+    cameras.add(view, K, pose, image_size, None if entry.distortion is None else entry.distortion.distortion)
 
 
 def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
@@ -176,7 +155,6 @@ def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
             where=where,
             expected="(4, 4), or (N, 4, 4) with one per frame",
             got=values.shape,
-            evidence={"shape": list(values.shape)},
         )
     if len(values) not in (1, num_frames):
         raise RejectedInputError(
@@ -185,7 +163,6 @@ def _matrices(listed: list[Any], num_frames: int, where: str) -> np.ndarray:
             where=where,
             expected=f"1 or {num_frames} matrices",
             got=len(values),
-            evidence={"states": num_frames, "extrinsics": len(values)},
         )
     return values
 

@@ -8,23 +8,18 @@ one dataset per task, hundreds of them: a collection reads every dataset below a
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
-from worldline_core.data.episodes.recorded_poses import repair_notes
+from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import EVALUATION_ONLY, EpisodeSource, LoadedEpisode, says_droid
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset, LeRobotV21Dataset
-from worldline_core.data.sources.calibration_file import (
-    CalibratedView,
-    CalibrationFile,
-    calibrated_view,
-    read_calibration,
-)
-from worldline_core.data.sources.lerobot_columns import ArmVectors, LeRobotSourceConfig, WholeVectors, flat_names
+from worldline_core.data.lerobot.metadata import DatasetInfo
+from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
+from worldline_core.data.sources.lerobot_columns import LeRobotSourceConfig, flat_names, state_columns
 from worldline_core.errors import ConfigError, DataError
 
 _RATE_TOLERANCE = 1e-2
@@ -53,8 +48,8 @@ class LeRobotSource:
                 got=config.split,
                 next_step="set the source's split, or name datasets that are not DROID otherwise",
             )
-        self._names = flat_names(features.get("observation.state", {}))
-        known = {"video key": self._dataset.video_keys, "state column": self._names, "feature": list(features)}
+        names = flat_names(features.get("observation.state", {}))
+        known = {"video key": self._dataset.video_keys, "state column": names, "feature": list(features)}
         columns = [name for name in (config.task_column, config.success_column) if name is not None]
         for what, wanted in (("video key", config.views), ("state column", config.grippers), ("feature", columns)):
             unknown = sorted(set(wanted) - set(known[what]) - {"task_index"})
@@ -65,11 +60,8 @@ class LeRobotSource:
                     expected=", ".join(known[what]),
                     got=", ".join(unknown),
                 )
-        arms = config.arms
-        self._columns = (
-            WholeVectors(self._names, config.grippers) if arms is None else ArmVectors(arms, features, str(root))
-        )
-        self._calibration: tuple[str, CalibrationFile] | None = None
+        self._columns = state_columns(config, features, str(root))
+        self._calibration = lru_cache(maxsize=1)(lambda name: read_calibration(inside(root, name)))
 
     def episode_ids(self) -> list[str]:
         return [f"{self._label}-{int(index):06d}" for index in self._dataset.episodes.indices]
@@ -85,7 +77,7 @@ class LeRobotSource:
         key_of = {view: key for key, view in config.views.items()}
         clips = {view: dataset.clip(index, key) for view, key in key_of.items()}
         for view, key in key_of.items():
-            rate = dataset.video_rate(index, key)
+            rate = dataset.video_size(index, key)[2]
             check_rate(rate, dataset.fps, f"{episode_id}, view {view}", tolerance=_RATE_TOLERANCE * dataset.fps)
         cameras = self._cameras(index, key_of, len(times))
         episode = Episode(
@@ -98,25 +90,20 @@ class LeRobotSource:
             state=state,
             action=action,
             timestamps=times - times[0],
-            cameras={view: camera.track for view, camera in cameras.items()},
+            cameras=cameras.tracks,
             primary_view=config.primary_view or "head",
             state_names=self._columns.names,
             conventions={
-                "layout": f"lerobot {dataset.info['codebase_version']}",
+                "layout": f"lerobot {dataset.info.codebase_version}",
                 "declared_angle_unit": config.angle_unit,
                 "gripper_overshoot": overshoot,
                 **({EVALUATION_ONLY: "true"} if self._evaluation_only else {}),
-                **({"action": "repeats the state"} if self._columns.repeats_state else {}),
+                **({"action": "repeats the state"} if not self._columns.action else {}),
                 **({"tasks": tasks} if tasks > 1 else {}),
-                **repair_notes({view: camera.pose.repair for view, camera in cameras.items()}),
+                **cameras.notes(),
             },
         )
-        return LoadedEpisode(
-            episode,
-            tuple(key_of),
-            distortions={view: camera.lens.distortion for view, camera in cameras.items() if camera.lens is not None},
-            clips=clips,
-        )
+        return LoadedEpisode(episode, tuple(key_of), distortions=cameras.lenses, clips=clips)
 
     def _instruction(self, index: int) -> tuple[str, int]:
         """The first frame's task, and how many different ones the episode has."""
@@ -128,19 +115,18 @@ class LeRobotSource:
     def _outcome(self, index: int) -> str:
         if self._config.success_column is None:
             return self._config.outcome
-        return (
-            "success" if bool(self._dataset.column(index, self._config.success_column).reshape(-1)[-1]) else "failure"
-        )
+        succeeded = self._dataset.column(index, self._config.success_column).reshape(-1)
+        return "success" if bool(succeeded[-1]) else "failure"
 
-    def _cameras(self, index: int, key_of: dict[str, str], length: int) -> dict[str, CalibratedView]:
+    def _cameras(self, index: int, key_of: dict[str, str], length: int) -> RecordedCameras:
         """Calibrated views; one whose pose was never measured is left out."""
+        cameras = RecordedCameras()
         if self._config.calibration is None:
-            return {}
+            return cameras
         name = fill_template(self._config.calibration, episode_index=index)
-        if self._calibration is None or self._calibration[0] != name:
-            self._calibration = name, read_calibration(inside(self._root, name))
+        entries = self._calibration(name).views
         where = f"{self._root}, {name}"
-        unknown = sorted(set(self._calibration[1].views) - set(key_of))
+        unknown = sorted(set(entries) - set(key_of))
         if unknown:
             raise RejectedInputError(
                 "missing_view",
@@ -148,26 +134,24 @@ class LeRobotSource:
                 where=where,
                 expected=", ".join(key_of),
                 got=", ".join(unknown),
-                evidence={"missing": unknown, "found": sorted(key_of)},
             )
-        found = {
-            view: calibrated_view(
+        for view, entry in entries.items():
+            add_calibrated_view(
+                cameras,
                 view,
                 entry,
-                image_size=self._dataset.image_size(index, key_of[view]),
+                image_size=self._dataset.video_size(index, key_of[view])[:2],
                 num_frames=length,
                 read_feature=lambda feature: self._dataset.column(index, feature),
                 where=where,
             )
-            for view, entry in self._calibration[1].views.items()
-        }
-        return {view: camera for view, camera in found.items() if camera is not None}
+        return cameras
 
 
-def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: dict[str, Any]) -> bool:
+def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> bool:
     """Whether a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
-    said = (config.label, config.embodiment, root.name, str(info.get("robot_type")), str(info.get("repo_id")))
-    return says_droid(*said) or set(info["features"]) >= _DROID_VIDEOS
+    said = (config.label, config.embodiment, root.name, str(info.robot_type), str(info.repo_id))
+    return says_droid(*said) or set(info.features) >= _DROID_VIDEOS
 
 
 _OPEN_DATASETS = 8

@@ -22,7 +22,8 @@ from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRang
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError
 
-ReadColumn = Callable[[str], np.ndarray]
+ReadFeature = Callable[[str], np.ndarray]
+Features = Mapping[str, Mapping[str, Any]]
 
 
 class ColumnChoice(StrictModel):
@@ -65,170 +66,6 @@ class ArmColumns(StrictModel):
     name: Literal["left", "right"]
     state: ArmTrack
     action: ArmTrack | None = None
-
-
-def flat_names(feature: Mapping[str, Any]) -> list[str]:
-    """Column names of a feature: LeRobot writes them as a list, a list of one list, or a dict of a list; or not at all."""
-    names = feature.get("names") or []
-    if isinstance(names, dict):
-        names = next(iter(names.values()), [])
-    if names and isinstance(names, list) and isinstance(names[0], list):
-        names = names[0]
-    return [str(name) for name in names] if isinstance(names, list) else []
-
-
-def places(choice: ColumnChoice, features: Mapping[str, Mapping[str, Any]], where: str) -> list[int]:
-    """Indices of the chosen columns in their feature.
-
-    Raises: ConfigError for a feature, name, pattern or place that the dataset does not have, or a column chosen twice.
-    """
-    if choice.feature not in features:
-        known = ", ".join(name for name in features if not name.startswith("observation.images"))
-        raise ConfigError("The dataset has no such feature", where=where, expected=known, got=choice.feature)
-    feature = features[choice.feature]
-    names, shape = flat_names(feature), feature.get("shape") or [1]
-    width = int(shape[0]) if len(shape) == 1 else 0
-    if choice.columns is not None:
-        found = []
-        for pattern in choice.columns:
-            matching = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-            if not matching:
-                raise ConfigError(
-                    "The feature has no such column",
-                    where=f"{where}, {choice.feature}",
-                    expected=", ".join(names) or "a feature whose columns have names (else use indices)",
-                    got=pattern,
-                )
-            found += matching
-    else:
-        found = list(range(width)) if choice.indices is None else list(choice.indices)
-    if not found or len(set(found)) != len(found) or not all(0 <= i < width for i in found):
-        raise ConfigError(
-            "Columns cannot be chosen like this",
-            where=f"{where}, {choice.feature}",
-            expected=f"different columns of a vector, 0..{width - 1}",
-            got=found,
-        )
-    return found
-
-
-@dataclass(frozen=True)
-class Picked:
-    """One chosen column set: its feature, its places, and how it becomes the contract's numbers."""
-
-    feature: str
-    indices: tuple[int, ...]
-    gripper: GripperRange | None
-
-
-class ArmVectors:
-    """Picks state and action of the arms of one dataset.
-
-    Raises: ConfigError on creation for columns that the dataset does not have, an arm that is declared twice, or a
-        gripper of more than one column.
-    """
-
-    def __init__(self, arms: tuple[ArmColumns, ...], features: Mapping[str, Mapping[str, Any]], where: str) -> None:
-        order = [arm.name for arm in arms]
-        if order != sorted(set(order)):
-            raise ConfigError("Arms are declared in another order", where=where, expected="left, right", got=order)
-        self.names: tuple[str, ...] = ()
-        self._state: list[Picked] = []
-        self._action: list[Picked] = []
-        for arm in arms:
-            picked = _pick(arm.state, features, f"{where}, {arm.name} arm, state")
-            self._state += picked
-            width = [len(part.indices) for part in picked]
-            self.names += tuple(f"{arm.name}/joint_{i + 1}" for i in range(width[0]))
-            self.names += (f"{arm.name}/gripper",) * (len(picked) - 1)
-            if arm.action is not None:
-                action = _pick(arm.action, features, f"{where}, {arm.name} arm, action")
-                if [len(part.indices) for part in action] != width:
-                    raise ConfigError(
-                        "State and action of an arm differ in size",
-                        where=f"{where}, {arm.name} arm",
-                        expected=f"{width} columns (joints, gripper)",
-                        got=[len(part.indices) for part in action],
-                    )
-                self._action += action
-        if self._action and len(self._action) != len(self._state):
-            raise ConfigError("Either all arms have actions or none has", where=where)
-
-    @property
-    def repeats_state(self) -> bool:
-        return not self._action
-
-    def read(self, read: ReadColumn, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
-        """State and action (N, J) float32, and how many gripper readings were clipped.
-
-        Raises: RejectedInputError (length_mismatch) where a feature has another width than the dataset says.
-        """
-        column = cache(lambda feature: _matrix(read(feature)))
-        state, overshoot = _vector(self._state, column, degrees)
-        if self.repeats_state:
-            return state, state.copy(), overshoot
-        action, more = _vector(self._action, column, degrees)
-        return state, action, overshoot + more
-
-
-class WholeVectors:
-    """Takes state and action whole, with the named columns as grippers."""
-
-    repeats_state = False
-
-    def __init__(self, names: list[str], grippers: Mapping[str, GripperRange]) -> None:
-        self.names = tuple(names) or None
-        self._grippers = {names.index(name): span for name, span in grippers.items()}
-
-    def read(self, read: ReadColumn, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
-        """As `ArmVectors.read`."""
-        state, overshoot = self._track(_matrix(read("observation.state")), degrees)
-        action, more = self._track(_matrix(read("action")), degrees)
-        return state, action, overshoot + more
-
-    def _track(self, values: np.ndarray, degrees: bool) -> tuple[np.ndarray, int]:
-        parts = [Picked("", (column,), self._grippers.get(column)) for column in range(values.shape[1])]
-        return _vector(parts, lambda _: values, degrees)
-
-
-def _matrix(values: np.ndarray) -> np.ndarray:
-    """(N,) or (N, D) as (N, D) float64."""
-    values = values.astype(np.float64)
-    return values[:, None] if values.ndim == 1 else values
-
-
-def _pick(track: ArmTrack, features: Mapping[str, Mapping[str, Any]], where: str) -> list[Picked]:
-    parts = [Picked(track.joints.feature, tuple(places(track.joints, features, where)), None)]
-    if track.gripper is not None:
-        found = places(track.gripper, features, f"{where}, gripper")
-        if len(found) != 1:
-            raise ConfigError("A gripper is one column", where=f"{where}, gripper", expected=1, got=len(found))
-        parts.append(Picked(track.gripper.feature, tuple(found), track.gripper.range))
-    return parts
-
-
-def _vector(parts: list[Picked], column: ReadColumn, degrees: bool) -> tuple[np.ndarray, int]:
-    blocks, overshoot = [], 0
-    for part in parts:
-        values = column(part.feature)
-        if values.shape[1] <= max(part.indices):
-            raise RejectedInputError(
-                "length_mismatch",
-                "Feature has fewer columns than the dataset says",
-                where=part.feature,
-                expected=f"more than {max(part.indices)}",
-                got=values.shape[1],
-                evidence={"feature": part.feature, "columns": int(values.shape[1])},
-            )
-        chosen = values[:, list(part.indices)]
-        if part.gripper is not None:
-            chosen, outside = part.gripper.opening(chosen)
-            overshoot += outside
-        elif degrees:
-            chosen = np.deg2rad(chosen)
-        blocks.append(chosen)
-    with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
-        return np.concatenate(blocks, axis=1).astype(np.float32), overshoot
 
 
 class LeRobotSourceConfig(ForeignSourceConfig):
@@ -275,3 +112,161 @@ class LeRobotSourceConfig(ForeignSourceConfig):
         if len(set(self.views.values())) != len(self.views):
             raise ValueError("two video keys are given the same view")
         return self
+
+
+def flat_names(feature: Mapping[str, Any]) -> list[str]:
+    """Column names of a feature: LeRobot writes them as a list, a list of one list, or a dict of a list; or not at all."""
+    names = feature.get("names") or []
+    if isinstance(names, dict):
+        names = next(iter(names.values()), [])
+    if names and isinstance(names, list) and isinstance(names[0], list):
+        names = names[0]
+    return [str(name) for name in names] if isinstance(names, list) else []
+
+
+def places(choice: ColumnChoice, features: Features, where: str) -> list[int]:
+    """Indices of the chosen columns in their feature.
+
+    Raises: ConfigError for a feature, name, pattern or place that the dataset does not have, or a column chosen twice.
+    """
+    if choice.feature not in features:
+        known = ", ".join(name for name in features if not name.startswith("observation.images"))
+        raise ConfigError("The dataset has no such feature", where=where, expected=known, got=choice.feature)
+    feature = features[choice.feature]
+    names, shape = flat_names(feature), feature.get("shape") or [1]
+    width = int(shape[0]) if len(shape) == 1 else 0
+    if choice.columns is not None:
+        found = []
+        for pattern in choice.columns:
+            matching = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+            if not matching:
+                raise ConfigError(
+                    "The feature has no such column",
+                    where=f"{where}, {choice.feature}",
+                    expected=", ".join(names) or "a feature whose columns have names (else use indices)",
+                    got=pattern,
+                )
+            found += matching
+    else:
+        found = list(range(width)) if choice.indices is None else list(choice.indices)
+    if not found or len(set(found)) != len(found) or not all(0 <= i < width for i in found):
+        raise ConfigError(
+            "Columns cannot be chosen like this",
+            where=f"{where}, {choice.feature}",
+            expected=f"different columns of a vector, 0..{width - 1}",
+            got=found,
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Columns of one feature, in the order of the state.
+
+    Attributes:
+        indices: places in the feature; None: all of its columns.
+        grippers: place in the block -> readings, of the columns that are no joints.
+    """
+
+    feature: str
+    indices: tuple[int, ...] | None
+    grippers: Mapping[int, GripperRange]
+
+    def read(self, read_feature: ReadFeature, *, degrees: bool) -> tuple[np.ndarray, int]:
+        """(N, D) float64, and how many gripper readings were clipped."""
+        values = read_feature(self.feature).astype(np.float64)
+        values = values[:, None] if values.ndim == 1 else values
+        last = max(self.grippers if self.indices is None else self.indices, default=0)
+        if values.shape[1] <= last:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Feature has fewer columns than the dataset says",
+                where=self.feature,
+                expected=f"more than {last}",
+                got=values.shape[1],
+            )
+        chosen = values if self.indices is None else values[:, list(self.indices)]
+        block, overshoot = np.deg2rad(chosen) if degrees else chosen.copy(), 0
+        for place, span in self.grippers.items():
+            block[:, place], outside = span.opening(chosen[:, place])
+            overshoot += outside
+        return block, overshoot
+
+
+@dataclass(frozen=True)
+class StateColumns:
+    """Where a dataset keeps what the contract calls state and action.
+
+    Attributes:
+        names: of the state's columns, where they have names.
+        action: empty: the action repeats the state.
+    """
+
+    names: tuple[str, ...] | None
+    state: tuple[_Block, ...]
+    action: tuple[_Block, ...]
+
+    def read(self, read_feature: ReadFeature, *, degrees: bool) -> tuple[np.ndarray, np.ndarray, int]:
+        """State and action (N, J) float32, and how many gripper readings were clipped.
+
+        Raises: RejectedInputError (length_mismatch) where a feature has another width than the dataset says.
+        """
+        read_feature = cache(read_feature)
+        state, overshoot = _joined(self.state, read_feature, degrees)
+        if not self.action:
+            return state, state.copy(), overshoot
+        action, more = _joined(self.action, read_feature, degrees)
+        return state, action, overshoot + more
+
+
+def _joined(blocks: tuple[_Block, ...], read_feature: ReadFeature, degrees: bool) -> tuple[np.ndarray, int]:
+    found = [block.read(read_feature, degrees=degrees) for block in blocks]
+    with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
+        return np.concatenate([values for values, _ in found], axis=1).astype(np.float32), sum(n for _, n in found)
+
+
+def state_columns(config: LeRobotSourceConfig, features: Features, where: str) -> StateColumns:
+    """The columns that the configuration names, in a dataset with these features.
+
+    Raises: ConfigError for columns that the dataset does not have, an arm that is declared twice, or a gripper of more
+        than one column.
+    """
+    if config.arms is None:
+        names = flat_names(features.get("observation.state", {}))
+        grippers = {names.index(name): span for name, span in config.grippers.items()}
+        state, action = (_Block(feature, None, grippers) for feature in ("observation.state", "action"))
+        return StateColumns(tuple(names) or None, (state,), (action,))
+    order = [arm.name for arm in config.arms]
+    if order != sorted(set(order)):
+        raise ConfigError("Arms are declared in another order", where=where, expected="left, right", got=order)
+    if len({arm.action is None for arm in config.arms}) > 1:
+        raise ConfigError("Either all arms have actions or none has", where=where)
+    names, states, actions = [], [], []
+    for arm in config.arms:
+        at = f"{where}, {arm.name} arm"
+        state, width = _arm_blocks(arm.state, features, f"{at}, state")
+        states += state
+        names += [f"{arm.name}/joint_{i + 1}" for i in range(width[0])] + [f"{arm.name}/gripper"] * (len(width) - 1)
+        if arm.action is not None:
+            action, commanded = _arm_blocks(arm.action, features, f"{at}, action")
+            actions += action
+            if commanded != width:
+                raise ConfigError(
+                    "State and action of an arm differ in size",
+                    where=at,
+                    expected=f"{width} columns (joints, gripper)",
+                    got=commanded,
+                )
+    return StateColumns(tuple(names), tuple(states), tuple(actions))
+
+
+def _arm_blocks(track: ArmTrack, features: Features, where: str) -> tuple[list[_Block], list[int]]:
+    """Joints and, where there is one, gripper; and how many columns each has."""
+    joints = places(track.joints, features, where)
+    blocks = [_Block(track.joints.feature, tuple(joints), {})]
+    if track.gripper is None:
+        return blocks, [len(joints)]
+    gripper = places(track.gripper, features, f"{where}, gripper")
+    if len(gripper) != 1:
+        raise ConfigError("A gripper is one column", where=f"{where}, gripper", expected=1, got=len(gripper))
+    return [*blocks, _Block(track.gripper.feature, tuple(gripper), {0: track.gripper.range})], [len(joints), 1]
