@@ -33,8 +33,7 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.hdf5 import open_hdf5
-from worldline_core.data.sources.robomind import LayoutName, RobomindSource, RobomindSourceConfig
-from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS
+from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS, LayoutName, RobomindSource, RobomindSourceConfig
 from worldline_core.errors import DataError
 
 

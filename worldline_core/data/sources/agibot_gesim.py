@@ -31,7 +31,6 @@ from worldline_core.data.guards.images import read_image
 from worldline_core.data.guards.plain_files import read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
-from worldline_core.geometry.distortion import Distortion
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
 AGIBOT_CAMERAS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
@@ -61,10 +60,6 @@ class AgibotGesimSourceConfig(ForeignSourceConfig):
     tool_offset_v1_m: float = TOOL_OFFSET_RAW_M
     tool_offset_v2_m: float = 0.15
     distortions: dict[str, LensConfig] = Field(default={}, description="view -> lens, where images are distorted")
-
-    @property
-    def lenses(self) -> dict[str, Distortion]:
-        return {view: lens.distortion for view, lens in self.distortions.items()}
 
 
 class AgibotGesimSource:
@@ -96,7 +91,7 @@ class AgibotGesimSource:
         counts = {view: len(files) for view, files in images.items()}
         if len(set(counts.values())) != 1:
             raise RejectedInputError(
-                "length_mismatch", "Views differ in the number of images", where=folder, got=counts, evidence=counts
+                "length_mismatch", "Views differ in the number of images", where=folder, got=counts
             )
         K = {view: _array(folder / f"intrinsic_{name}.npy", (3, 3)) for view, name in AGIBOT_CAMERAS.items()}
         poses = {
@@ -112,13 +107,12 @@ class AgibotGesimSource:
     def _read_v2(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         joints = _array(folder / "state_joints_0.npy", (None, 20))
         num_frames = len(joints)
-        commands = _array(folder / "actions_0.npy", (num_frames, 16))
+        action = _array(folder / "actions_0.npy", (num_frames, 16))
         recorded = _array(folder / "state_eef_poses_0.npy", (num_frames, 14))
         ends = [pose_from_euler_fixed_xyz(recorded[:, a : a + 3], recorded[:, a + 3 : a + 6]) for a in (0, 7)]
         opening, overshoot = self._config.gripper_v2.opening(joints[:, 14:16])
-        commanded, more = GRIPPER_COMMAND_RAW.opening(commands[:, [7, 15]])
+        action[:, [7, 15]], more = GRIPPER_COMMAND_RAW.opening(action[:, [7, 15]])
         state = np.hstack([joints[:, :7], opening[:, :1], joints[:, 7:14], opening[:, 1:]])
-        action = np.hstack([commands[:, :7], commanded[:, :1], commands[:, 8:15], commanded[:, 1:]])
         notes = {
             "layout": "agibot_gesim v2",
             "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
@@ -187,7 +181,6 @@ class AgibotGesimSource:
                 where=folder,
                 expected=f"at most {episode.num_frames} images",
                 got=num_images,
-                evidence={"images": num_images, "states": episode.num_frames},
             )
         cameras = RecordedCameras()
         for view in VIEWS:
@@ -199,9 +192,8 @@ class AgibotGesimSource:
             video_frames=None if num_images == episode.num_frames else num_images,
             conventions={**episode.conventions, **cameras.notes()},
         )
-        return LoadedEpisode(
-            episode, VIEWS, lambda view: map(read_image, images[view]), distortions=self._config.lenses
-        )
+        lenses = {view: lens.distortion for view, lens in self._config.distortions.items()}
+        return LoadedEpisode(episode, VIEWS, lambda view: map(read_image, images[view]), distortions=lenses)
 
 
 def _array(path: AnyPath, shape: tuple[int | None, ...]) -> np.ndarray:

@@ -14,17 +14,18 @@ state is not the two-gripper layout of this embodiment.
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LensConfig, LoadedEpisode
 from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
-from worldline_core.data.guards.plain_files import read_json
+from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, find_folders, inside
 from worldline_core.data.sources.agibot_gesim import (
@@ -40,7 +41,25 @@ from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 View = Literal["head", "left_wrist", "right_wrist"]
 _POSTURE = {"head": ("head_yaw_rad", "head_pitch_rad"), "waist": ("waist_pitch_rad", "waist_lift_m")}
 _MAX_NUMBER = 1e12
-_DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+
+
+class _Intrinsic(BaseModel):
+    """[pixels], and the coefficients of radtan."""
+
+    model_config = ConfigDict(strict=True)
+    fx: float
+    fy: float
+    ppx: float
+    ppy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+class _IntrinsicFile(BaseModel):
+    intrinsic: _Intrinsic
 
 
 class AgibotWorldSourceConfig(ForeignSourceConfig):
@@ -82,7 +101,7 @@ class AgibotWorldSource:
             for folder in find_folders(root / part, 2)
         }
         self._episodes = {f"{config.label}-{task}-{episode}": (task, episode) for task, episode in found}
-        self._task_info: tuple[str, dict[str, Any]] | None = None
+        self._episodes_of = lru_cache(maxsize=1)(self._read_task)  # episodes are read in order of tasks
 
     def episode_ids(self) -> list[str]:
         return sorted(self._episodes)
@@ -162,7 +181,6 @@ class AgibotWorldSource:
                 where=f"{path}, {track}/effector/position",
                 expected="2 values per frame, left and right gripper",
                 got=f"{effector.shape[1]} (12: dexterous hands)",
-                evidence={"values": int(effector.shape[1])},
             )
         opening, overshoot = gripper.opening(effector)
         vector = np.concatenate([joints[:, :7], opening[:, :1], joints[:, 7:], opening[:, 1:]], axis=1)
@@ -181,40 +199,43 @@ class AgibotWorldSource:
         name = AGIBOT_CAMERAS[view]
         intrinsic_path = inside(self._root, f"{folder}/{name}_intrinsic_params.json")
         extrinsic_path = inside(self._root, f"{folder}/{name}_extrinsic_params_aligned.json")
-        record = read_json(intrinsic_path)
-        intrinsic = record.get("intrinsic") if isinstance(record, dict) else None
-        fx, fy, cx, cy = (_number(intrinsic, key, intrinsic_path) for key in ("fx", "fy", "ppx", "ppy"))
+        read = validated(_IntrinsicFile, read_json(intrinsic_path), intrinsic_path, "Camera parameters").intrinsic
+        if not all(abs(value) <= _MAX_NUMBER for _, value in read):  # NaN is not either
+            raise RejectedInputError(
+                "singular_intrinsics", "Intrinsics are not finite", where=intrinsic_path, expected="numbers", got=read
+            )
         height, width = size
-        if not (0 < cx < width and 0 < cy < height):
+        if not (0 < read.ppx < width and 0 < read.ppy < height):
             raise RejectedInputError(
                 "missing_calibration",
                 "Principal point lies outside of the image: the calibration is of another image size",
                 where=intrinsic_path,
                 expected=f"inside of {width}x{height}",
-                got=(cx, cy),
-                evidence={"view": view, "ppx": cx, "ppy": cy, "width": width, "height": height},
+                got=(read.ppx, read.ppy),
             )
-        coefficients = [abs(_number(intrinsic, key, intrinsic_path)) for key in _DISTORTION if key in (intrinsic or {})]
         matrices = _extrinsics(extrinsic_path, length)
         pose = camera_pose(view, matrices, extrinsics="camera_to_base", axes="opencv", where=extrinsic_path)
-        cameras.add(view, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), pose, size)
-        return max(coefficients, default=0.0)
+        K = np.array([[read.fx, 0.0, read.ppx], [0.0, read.fy, read.ppy], [0.0, 0.0, 1.0]])
+        cameras.add(view, K, pose, size)
+        return max(map(abs, (read.k1, read.k2, read.k3, read.p1, read.p2)))
+
+    def _read_task(self, task: str) -> dict[str, Any]:
+        """What `task_info` says about the episodes of a task, by episode."""
+        listed = read_json(inside(self._root, f"task_info/task_{task}.json"))
+        rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
+        return {str(row.get("episode_id")): row for row in rows}
 
     def _info(self, task: str, number: str) -> dict[str, Any]:
-        """What `task_info` says about an episode; the last task's file is kept, episodes are read in order of tasks."""
-        path = inside(self._root, f"task_info/task_{task}.json")
-        if self._task_info is None or self._task_info[0] != task:
-            listed = read_json(path)
-            rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
-            self._task_info = task, {str(row.get("episode_id")): row for row in rows}
-        info = self._task_info[1].get(number)
+        """What `task_info` says about an episode."""
+        known = self._episodes_of(task)
+        info = known.get(number)
         if info is None:
             raise RejectedInputError(
                 "missing_column",
                 "Task information does not name the episode",
-                where=path,
+                where=f"{self._root}, task_info/task_{task}.json",
                 expected=f"an entry with episode_id {number}",
-                got=f"{len(self._task_info[1])} entries",
+                got=f"{len(known)} entries",
             )
         return info
 
@@ -223,53 +244,27 @@ def _extrinsics(path: AnyPath, length: int) -> np.ndarray:
     """(N or 1, 4, 4) camera-to-base."""
     listed = read_json(path)
     if not isinstance(listed, list) or len(listed) not in (1, length):
-        got = len(listed) if isinstance(listed, list) else type(listed).__name__
         raise RejectedInputError(
             "length_mismatch",
             "Extrinsics and states differ in length",
             where=path,
             expected=f"a list of {length} (or 1)",
-            got=got,
-            evidence={"states": length, "extrinsics": got},
+            got=len(listed) if isinstance(listed, list) else type(listed).__name__,
         )
     matrices = np.tile(np.eye(4), (len(listed), 1, 1))
+    expected = "extrinsic.rotation_matrix (3, 3) and extrinsic.translation_vector (3,) in each entry"
     try:
         matrices[:, :3, :3] = [item["extrinsic"]["rotation_matrix"] for item in listed]
         matrices[:, :3, 3] = [item["extrinsic"]["translation_vector"] for item in listed]
     except (KeyError, TypeError) as error:
         raise RejectedInputError(
-            "missing_column",
-            "Extrinsics lack a field",
-            where=path,
-            expected="extrinsic.rotation_matrix and extrinsic.translation_vector in each entry",
-            got=repr(error),
+            "missing_column", "Extrinsics lack a field", where=path, expected=expected, got=repr(error)
         ) from error
     except ValueError as error:
         raise RejectedInputError(
-            "invalid_extrinsics",
-            "Extrinsics have a wrong shape",
-            where=path,
-            expected="(3, 3) and (3,)",
-            got=str(error),
+            "invalid_extrinsics", "Extrinsics have a wrong shape", where=path, expected=expected, got=str(error)
         ) from error
     return matrices
-
-
-def _number(record: Any, key: str, path: AnyPath) -> float:
-    value = record.get(key) if isinstance(record, dict) else None
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise RejectedInputError(
-            "missing_column", "Intrinsics lack a number", where=path, expected=f"intrinsic.{key}", got=repr(value)
-        )
-    if not abs(value) <= _MAX_NUMBER:  # NaN is not either
-        raise RejectedInputError(
-            "singular_intrinsics",
-            "Intrinsics are not finite",
-            where=path,
-            expected="a number",
-            got=f"{key}: {str(value)[:40]}",
-        )
-    return float(value)
 
 
 def _steps(info: dict[str, Any]) -> str:

@@ -23,7 +23,7 @@ from worldline_core.data.episodes.source import (
 )
 from worldline_core.data.guards.plain_files import read_json, well_formed
 from worldline_core.data.guards.rejection import RejectedInputError, check_length, check_rate, check_shape
-from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
 from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
@@ -49,16 +49,16 @@ class DroidAnnotationSource:
     def __init__(self, config: DroidAnnotationSourceConfig, root: AnyPath) -> None:
         self._config = config
         self._root = root
-        found = [relative_name(file, root) for file in find_files(root, "annotation/*/*.json")]
+        found = find_files(root, "annotation/*/*.json")
         self._files = file_ids(
-            config.label, {str(file): (*file.parts[:-3], file.parent.name, file.stem) for file in found}
+            config.label, root, found, lambda file: (*file.parts[:-3], *file.parts[-2:-1], file.stem)
         )
 
     def episode_ids(self) -> list[str]:
         return sorted(self._files, key=by_number)
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        file = inside(self._root, self._files[episode_id])
+        file = inside(self._root, str(self._files[episode_id]))
         record = read_json(file)
         with well_formed(file, "an annotation: a mapping with states, joints, videos and texts"):
             return self._read(episode_id, file.parents[2], file, record)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from typing import Literal
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -25,8 +24,7 @@ class EpisodeSetSource:
     Raises: DataError when the set has no readable index.
     """
 
-    def __init__(self, config: EpisodeSetSourceConfig, root: AnyPath) -> None:
-        self._name = config.name
+    def __init__(self, _: EpisodeSetSourceConfig, root: AnyPath) -> None:
         self._set = EpisodeSet.open(root, allow_linked=False)
         self._listed = Counter(row.episode_id for row in self._set.rows)
 
@@ -41,12 +39,9 @@ class EpisodeSetSource:
                 where=str(self._set.root),
                 expected="one row per episode",
                 got=f"{self._listed[episode_id]} rows of {episode_id}",
-                evidence={"rows": self._listed[episode_id]},
             )
         position = self._set.position(episode_id)
         episode = with_rigid_poses(self._set.episode(position))
-        if self._name is not None:
-            episode = replace(episode, source=self._name)
         views = self._set.rows[position].views
         return LoadedEpisode(
             episode,

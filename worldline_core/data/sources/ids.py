@@ -5,24 +5,29 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import PurePosixPath
 
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.source_paths import AnyPath, relative_name
 
 MAX_LENGTH = 512
 _DIGITS = re.compile(r"(\d+)")
 
 
-def file_ids(label: str, files: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Id -> file, from file -> the parts of its path that name the episode.
+def file_ids(
+    label: str, root: AnyPath, files: Iterable[AnyPath], parts_of: Callable[[PurePosixPath], Sequence[str]]
+) -> dict[str, PurePosixPath]:
+    """Id -> path below the root, of files found there.
 
-    An id is the label and the parts, joined by "-". Files that would share one (a-b/c and a/b-c both give a-b-c) get a
-    digest of their path behind it.
+    An id is the label and the parts of the path that name the episode, joined by "-". Files that would share one (a-b/c and
+    a/b-c both give a-b-c) get a digest of their path behind it.
     """
-    wanted = {file: "-".join([label, *map(printable, parts)]) for file, parts in files.items()}
+    found = [relative_name(file, root) for file in files]
+    wanted = {file: "-".join([label, *map(printable, parts_of(file))]) for file in found}
     count = Counter(wanted.values())
     return {
-        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(file).encode()).hexdigest()[:8]}": file
+        name if count[name] == 1 else f"{name}-{hashlib.sha256(printable(str(file)).encode()).hexdigest()[:8]}": file
         for file, name in wanted.items()
     }
 
@@ -67,5 +72,4 @@ def check_id(episode_id: str, source: str) -> None:
             expected=f"1 to {MAX_LENGTH} printable characters of valid UTF-8",
             got=ascii(episode_id[:200]),
             next_step="rename the file or folder, or correct the metadata",
-            evidence={"characters": len(episode_id)},
         )

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
-from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, SourceConfigBase
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
@@ -66,19 +66,21 @@ def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """
     if not exists(root):
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
-    return _RepairedSource(_READERS[type(config)](config, root), config.conventions)
+    return _RepairedSource(_READERS[type(config)](config, root), config)
 
 
 class _RepairedSource:
-    def __init__(self, source: EpisodeSource, conventions: RecordedConventions) -> None:
+    def __init__(self, source: EpisodeSource, config: SourceConfigBase) -> None:
         self._source = source
-        self._conventions = conventions
+        self._config = config
 
     def episode_ids(self) -> list[str]:
         return self._source.episode_ids()
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        return undistorted(repair(self._source.load(episode_id), self._conventions))
+        loaded = undistorted(repair(self._source.load(episode_id), self._config.conventions))
+        source = self._config.name or loaded.episode.source
+        return replace(loaded, episode=replace(loaded.episode, source=source))
 
 
 def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpisode:
@@ -145,7 +147,6 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
                 where=f"{where}, view {view}",
                 expected=", ".join(cameras) or "a calibrated view",
                 got=view,
-                evidence={"view": view},
             )
         camera = cameras[view]
         check_intrinsics(camera, f"{where}, view {view}")
@@ -164,7 +165,6 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
                 where=f"{where}, view {view}",
                 expected=f"{size[0]}x{size[1]}",
                 got=f"{values.shape[1]}x{values.shape[2]}",
-                evidence={"view": view, "calibrated": list(size), "images": list(values.shape[1:3])},
             )
         return lenses[view].masks(values) if values.ndim == 3 else lenses[view].frames(values)
 

@@ -7,10 +7,18 @@
 Joints are radians. No extrinsics are published: Stage I only. Episodes of one task share a scene, whatever the release's
 own train and val folders say: they split by trajectory. The simulated robots of version 1 (states at about four times the
 rate of the images, in tracks of different lengths) and robots with dexterous hands in version 2 are not read.
+
+Where each robot's arms and cameras are: for version 1 the publisher's `all_robot_h5_info_v1.2.md` (columns) and
+`robomind.yaml` (which track is the command, and which robots' images have exchanged channels) say it; for version 2 it is
+what independent readers of the files agree on. What is stated nowhere, or stated differently, is left out here and must be
+declared: rates, gripper readings, orders of channels, and the poses of end effectors (readers disagree on version 2's
+quaternions).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
 
@@ -21,9 +29,8 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import ForeignSourceConfig, GripperRange, LoadedEpisode, joint_names
 from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
 from worldline_core.data.sources.ids import file_ids, printable
-from worldline_core.data.sources.robomind_layouts import ROBOMIND_LAYOUTS, RobomindLayout, Track
 from worldline_core.data.sources.video_folder import caption_table
 
 LayoutName = Literal[
@@ -39,6 +46,110 @@ LayoutName = Literal[
     "v2_ur",
     "v2_agilex",
 ]
+Track = Literal["puppet", "master"]
+
+
+@dataclass(frozen=True)
+class ArmPlace:
+    """One arm: joints are the first `num_joints` columns from `start` of a dataset; `{track}` is puppet or master.
+
+    Attributes:
+        widths: how many columns the dataset of joints may have.
+        gripper: dataset and column of the gripper, None where the robot has a hand of several joints.
+    """
+
+    name: Literal["left", "right"]
+    joints: str
+    start: int
+    num_joints: int
+    widths: tuple[int, ...]
+    gripper: tuple[str, int] | None
+
+
+@dataclass(frozen=True)
+class RobomindLayout:
+    """One folder of the release.
+
+    Attributes:
+        views: view -> camera, of the views whose place is known.
+        command: track that is the command; "puppet" means that the action repeats the state.
+        channels: None where it is stated nowhere.
+    """
+
+    version: Literal[1, 2]
+    embodiment: str
+    arms: tuple[ArmPlace, ...]
+    views: Mapping[str, str]
+    command: Track
+    channels: Channels | None = None
+
+    @property
+    def images(self) -> str:
+        """Group of the cameras."""
+        return "observations/rgb_images" if self.version == 1 else "camera_observations/color_images"
+
+
+def _one_vector(*blocks: tuple[Literal["left", "right"], int], gripper: bool = True) -> tuple[ArmPlace, ...]:
+    """Arms that lie one after the other in `joint_position`, each with its gripper behind it."""
+    width = sum(joints + gripper for _, joints in blocks)
+    arms: list[ArmPlace] = []
+    start = 0
+    for name, joints in blocks:
+        key = "{track}/joint_position"
+        arms.append(ArmPlace(name, key, start, joints, (width,), (key, start + joints) if gripper else None))
+        start += joints + gripper
+    return tuple(arms)
+
+
+def _one_per_side(
+    num_joints: int, joints: str, gripper: tuple[str, int], widths: tuple[int, ...]
+) -> tuple[ArmPlace, ...]:
+    """Arms with datasets of their own, whose names have the side for `SIDE`."""
+    key, column = gripper
+    return tuple(
+        ArmPlace(side, joints.replace("SIDE", side), 0, num_joints, widths, (key.replace("SIDE", side), column))
+        for side in ("left", "right")
+    )
+
+
+def _aligned(num_joints: int) -> tuple[ArmPlace, ...]:
+    """Version 2: some datasets have one more column than joints."""
+    gripper = "{track}/end_effector_SIDE_position_align/data", 0
+    return _one_per_side(
+        num_joints, "{track}/arm_SIDE_position_align/data", gripper, widths=(num_joints, num_joints + 1)
+    )
+
+
+_ARM_7, _ARM_6 = _one_vector(("right", 7)), _one_vector(("right", 6))
+_ARMS_7 = _one_vector(("left", 7), ("right", 7))
+_HANDS = _one_vector(("left", 7), ("right", 7), gripper=False)
+_AGILEX = _one_per_side(6, "{track}/joint_position_SIDE", ("{track}/joint_position_SIDE", 6), widths=(7,))
+
+
+def _three(head: str, left: str, right: str) -> dict[str, str]:
+    return {"head": head, "left_wrist": left, "right_wrist": right}
+
+
+_TOP = {"head": "camera_top"}
+_WRISTS = _three("camera_front", "camera_wrist_left", "camera_wrist_right")
+_AGILEX_1 = _three("camera_front", "camera_left_wrist", "camera_right_wrist")
+_AGILEX_2 = _three("camera_front", "camera_left", "camera_right")
+
+ROBOMIND_LAYOUTS: dict[LayoutName, RobomindLayout] = {
+    "h5_franka_1rgb": RobomindLayout(1, "franka_panda", _ARM_7, _TOP, "puppet"),
+    "h5_franka_3rgb": RobomindLayout(1, "franka_panda", _ARM_7, _TOP, "puppet", "standard"),
+    "h5_franka_fr3_dual": RobomindLayout(1, "franka_fr3_pair", _ARMS_7, {"head": "camera_front"}, "master"),
+    "h5_ur_1rgb": RobomindLayout(1, "ur5e", _ARM_6, _TOP, "puppet", "standard"),
+    "h5_agilex_3rgb": RobomindLayout(1, "agilex_cobot_magic", _AGILEX, _AGILEX_1, "master", "as_written"),
+    "h5_tienkung_gello_1rgb": RobomindLayout(1, "tienkung", _ARMS_7, _TOP, "master", "as_written"),
+    "h5_tienkung_prod1_gello_1rgb": RobomindLayout(1, "tienkung", _ARMS_7, _TOP, "master"),
+    "h5_tienkung_xsens_1rgb": RobomindLayout(1, "tienkung", _HANDS, _TOP, "puppet", "as_written"),
+    "v2_franka": RobomindLayout(2, "franka_pair", _aligned(7), _WRISTS, "master"),
+    "v2_ur": RobomindLayout(2, "ur5e_station", _aligned(6), _WRISTS, "master"),
+    "v2_agilex": RobomindLayout(2, "agilex_cobot_magic", _aligned(6), _AGILEX_2, "master"),
+}
+
+
 _FILE = "trajectory.hdf5"
 _SUCCESS, _FAILURE = "success_episodes", "fail"
 
@@ -91,10 +202,9 @@ class RobomindSource:
     def __init__(self, config: RobomindSourceConfig, root: AnyPath) -> None:
         require_h5py()
         self._config = config
-        self._layout: RobomindLayout = ROBOMIND_LAYOUTS[config.layout]
+        self._layout = ROBOMIND_LAYOUTS[config.layout]
         self._root = root
-        found = [relative_name(path, root) for path in find_files(root, _FILE)]
-        self._files = file_ids(config.label, {str(file): _episode_parts(file) for file in found})
+        self._files = file_ids(config.label, root, find_files(root, _FILE), _episode_parts)
         table = config.instructions
         self._instructions = None if table is None else caption_table(inside(root, table), "task", "instruction")
 
@@ -104,7 +214,7 @@ class RobomindSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         config, layout = self._config, self._layout
         relative = self._files[episode_id]
-        path = inside(self._root, relative)
+        path = inside(self._root, str(relative))
         views = dict(config.views or layout.views)
         with open_hdf5(path) as file:
             state, overshoot = self._vector(file, path, "puppet")
@@ -114,13 +224,9 @@ class RobomindSource:
             # Who collected it: some stations recorded the arms exchanged.
             collector = file.attribute("metadata", "collector") if layout.version == 2 else None
             text = self._text(file, relative, path)
-        names = tuple(
-            name
-            for arm in layout.arms
-            for name in joint_names({arm.name: arm.num_joints}, gripper=arm.gripper is not None)
-        )
+        grippers = any(arm.gripper is not None for arm in layout.arms)
         episode = Episode(
-            **config.declared("-".join([config.label, *_task_parts(PurePosixPath(relative))])),
+            **config.declared("-".join([config.label, *_task_parts(relative)])),
             episode_id=episode_id,
             embodiment=config.embodiment or layout.embodiment,
             instruction=text,
@@ -130,7 +236,7 @@ class RobomindSource:
             action=action,
             timestamps=np.arange(len(state)) / config.fps,
             primary_view=next(iter(views)),
-            state_names=names,
+            state_names=joint_names({arm.name: arm.num_joints for arm in layout.arms}, gripper=grippers),
             conventions={
                 "layout": f"robomind {layout.version}",
                 "gripper_overshoot": overshoot + more,
@@ -139,7 +245,6 @@ class RobomindSource:
             },
         )
         channels: Channels = config.channels or layout.channels or "standard"
-
         return LoadedEpisode(
             episode,
             tuple(views),
@@ -162,31 +267,26 @@ class RobomindSource:
                     expected=" or ".join(map(str, arm.widths)),
                     got=values.shape[1],
                     next_step="check curate.sources[].layout: each robot has a folder and a layout of its own",
-                    evidence={"expected": list(arm.widths), "found": values.shape[1]},
                 )
             length = len(values)
             blocks.append(values[:, arm.start : arm.start + arm.num_joints])
-            if arm.gripper is not None and span is not None:
-                opening, outside = span.opening(self._gripper(file, path, arm.gripper, track, length))
-                overshoot += outside
-                blocks.append(opening)
+            if arm.gripper is None or span is None:
+                continue
+            key, column = arm.gripper[0].format(track=track), arm.gripper[1]
+            values = file.columns(key, length)
+            if self._layout.version == 2 and values.shape[1] != 1:
+                raise RejectedInputError(
+                    "invalid_gripper",
+                    "End effector is no gripper of one value",
+                    where=f"{path}, {key}",
+                    expected="1 value per frame",
+                    got=f"{values.shape[1]} (a dexterous hand?)",
+                )
+            opening, outside = span.opening(values[:, column : column + 1])
+            overshoot += outside
+            blocks.append(opening)
         with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
             return np.concatenate(blocks, axis=1).astype(np.float32), overshoot
-
-    def _gripper(self, file: Hdf5File, path: AnyPath, place: tuple[str, int], track: Track, length: int) -> np.ndarray:
-        """(N, 1) raw readings."""
-        key, column = place[0].format(track=track), place[1]
-        values = file.columns(key, length)
-        if self._layout.version == 2 and values.shape[1] != 1:
-            raise RejectedInputError(
-                "invalid_gripper",
-                "End effector is no gripper of one value",
-                where=f"{path}, {key}",
-                expected="1 value per frame",
-                got=f"{values.shape[1]} (a dexterous hand?)",
-                evidence={"values": values.shape[1]},
-            )
-        return values[:, column : column + 1]
 
     def _check_compression(self, file: Hdf5File, path: AnyPath) -> None:
         compressed = file.attribute("/", "compress") if self._layout.version == 1 else None
@@ -199,9 +299,9 @@ class RobomindSource:
                 got=compressed,
             )
 
-    def _text(self, file: Hdf5File, relative: str, path: AnyPath) -> str:
+    def _text(self, file: Hdf5File, relative: PurePosixPath, path: AnyPath) -> str:
         if self._instructions is not None:
-            task = (_task_parts(PurePosixPath(relative)) or ("",))[-1]
+            task = (_task_parts(relative) or ("",))[-1]
             if task not in self._instructions:
                 raise RejectedInputError(
                     "missing_column",
@@ -229,10 +329,9 @@ def _task_parts(file: PurePosixPath) -> tuple[str, ...]:
     return tuple(map(printable, named))
 
 
-def _outcome(relative: str, declared: str) -> str:
+def _outcome(file: PurePosixPath, declared: str) -> str:
     if declared != "unknown":
         return declared
-    parts = PurePosixPath(relative).parts
-    if _SUCCESS in parts:
+    if _SUCCESS in file.parts:
         return "success"
-    return "failure" if any(part.lower().startswith(_FAILURE) for part in parts[:-2]) else "unknown"
+    return "failure" if any(part.lower().startswith(_FAILURE) for part in file.parts[:-2]) else "unknown"

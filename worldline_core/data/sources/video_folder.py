@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -23,23 +23,13 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode
 from worldline_core.data.guards.plain_files import read_json, read_json_lines, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file
 from worldline_core.data.sources.ids import file_ids, printable
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
 
 MAX_CAPTION_BYTES = 1 << 16
 TABLE_SUFFIXES = (".json", ".jsonl", ".csv")
-
-
-def caption_of(path: AnyPath) -> str | None:
-    """The text of a file that holds one caption, or None where there is no such file.
-
-    Raises: RejectedInputError: unreadable (no UTF-8 text), too_large.
-    """
-    return (
-        " ".join(read_text(path, max_bytes=MAX_CAPTION_BYTES, encoding="utf-8-sig").split()) if is_file(path) else None
-    )
 
 
 def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, str]:
@@ -61,35 +51,31 @@ def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, 
             "Table of captions is missing", where=str(path), next_step="check the file's name in the source"
         )
     table: dict[str, str] = {}
-    for video, caption in _rows(path, suffix, video_key, caption_key):
+    for number, row in enumerate(_rows(path, suffix, video_key, caption_key), start=1):
+        video, caption = (_field(row, key, number, path) for key in (video_key, caption_key))
         name, said = video.removeprefix("./"), " ".join(caption.split())
         if table.setdefault(name, said) != said:
             raise DataError("Table has two captions for one video", where=str(path), got=name)
     return table
 
 
-def _rows(path: AnyPath, suffix: str, video_key: str, caption_key: str) -> Iterable[tuple[str, str]]:
+def _rows(path: AnyPath, suffix: str, video_key: str, caption_key: str) -> list[Any]:
     if suffix == ".csv":
+        text = io.StringIO(read_text(path, encoding="utf-8-sig"), newline="")
         try:
-            listed: Any = list(
-                csv.DictReader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline=""), strict=True)
-            )
+            return list(csv.DictReader(text, strict=True))
         except csv.Error as error:
             raise DataError("Table of captions is no CSV", where=str(path), got=str(error)) from error
-    elif suffix == ".jsonl":
-        listed = list(read_json_lines(path))
-    else:
-        listed = read_json(path)
-        if isinstance(listed, dict):
-            listed = [{video_key: video, caption_key: caption} for video, caption in listed.items()]
+    if suffix == ".jsonl":
+        return list(read_json_lines(path))
+    listed = read_json(path)
+    if isinstance(listed, dict):
+        return [{video_key: video, caption_key: caption} for video, caption in listed.items()]
     if not isinstance(listed, list):
         raise DataError(
             "Table of captions has a wrong shape", where=str(path), expected="rows", got=type(listed).__name__
         )
-    return [
-        (_field(row, video_key, number, path), _field(row, caption_key, number, path))
-        for number, row in enumerate(listed, start=1)
-    ]
+    return listed
 
 
 def _field(row: Any, key: str, number: int, path: AnyPath) -> str:
@@ -136,8 +122,8 @@ class VideoFolderSource:
         self._config = config
         self._root = root
         suffixes = {suffix.lower() for suffix in config.suffixes}
-        found = [str(relative_name(p, root)) for p in find_files(root, "*") if p.suffix.lower() in suffixes]
-        self._files = file_ids(config.label, {file: PurePosixPath(file).with_suffix("").parts for file in found})
+        found = [path for path in find_files(root, "*") if path.suffix.lower() in suffixes]
+        self._files = file_ids(config.label, root, found, lambda file: file.with_suffix("").parts)
         table = config.captions
         self._captions = None if table is None else caption_table(inside(root, table.file), table.video, table.caption)
 
@@ -147,15 +133,14 @@ class VideoFolderSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         config = self._config
         relative = self._files[episode_id]
-        path = inside(self._root, relative)
+        path = inside(self._root, str(relative))
         rate = video_size(path)[2]
         times = frame_times(path)
         if not rate > 0:
             raise RejectedInputError("wrong_fps", "Video states no frame rate", where=str(path), got=rate)
-        folder = PurePosixPath(relative).parent.parts
         nothing = np.zeros((len(times), 0), dtype=np.float32)
         episode = Episode(
-            **config.declared("-".join([config.label, *folder])),
+            **config.declared("-".join([config.label, *relative.parent.parts])),
             episode_id=episode_id,
             embodiment=config.embodiment,
             instruction=self._caption(relative, path),
@@ -166,15 +151,17 @@ class VideoFolderSource:
             timestamps=times,
             primary_view=config.view,
             state_kind="none",
-            conventions={"layout": "video_folder", "file": printable(relative)},
+            conventions={"layout": "video_folder", "file": printable(str(relative))},
         )
         return LoadedEpisode(episode, (config.view,), clips={config.view: VideoClip.whole_file(path, len(times), rate)})
 
-    def _caption(self, relative: str, path: AnyPath) -> str:
+    def _caption(self, relative: PurePosixPath, path: AnyPath) -> str:
         if self._captions is None:
-            caption = caption_of(inside(self._root, str(PurePosixPath(relative).with_suffix(".txt"))))
+            text = inside(self._root, str(relative.with_suffix(".txt")))
+            found = read_text(text, max_bytes=MAX_CAPTION_BYTES, encoding="utf-8-sig") if is_file(text) else None
+            caption = None if found is None else " ".join(found.split())
         else:
-            caption = self._captions.get(relative)
+            caption = self._captions.get(str(relative))
         if not caption and self._config.require_caption:
             raise RejectedInputError(
                 "missing_column",
@@ -182,6 +169,5 @@ class VideoFolderSource:
                 where=str(path),
                 expected="a text file of the video's name" if self._captions is None else "a row in the table",
                 got="none" if caption is None else "an empty one",
-                evidence={"missing": "caption"},
             )
         return caption or ""
