@@ -35,7 +35,7 @@ TABLE_SUFFIXES = (".json", ".jsonl", ".csv")
 def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, str]:
     """Captions by the video's path in the folder, from a table.
 
-    JSON: an object {video: caption}, or a list of objects with the two keys; JSONL: one such object a line; CSV: a header
+    JSON: an object {video: caption}, or a list of objects with the two keys; JSONL: one such object per line; CSV: a header
     with the two names.
 
     Raises: DataError when the file is missing, damaged or says two things of one video; ConfigError for another suffix
