@@ -31,7 +31,6 @@ class _Edge:
     """
 
     parent: str
-    child: str
     where: str
     max_disorder_s: float
     static: bool = True
@@ -74,10 +73,9 @@ def unit_poses(poses: Sequence[tuple[float, ...]], reason: Reason, where: str) -
 class TransformTree:
     """Frames below their parents, as transforms are added."""
 
-    def __init__(self, where: object, max_gap_s: float, max_disorder_s: float) -> None:
+    def __init__(self, where: object, config: McapTopicsSourceConfig) -> None:
         self._where = where
-        self._max_gap_s = max_gap_s
-        self._max_disorder_s = max_disorder_s
+        self._config = config
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transforms: Sequence[Transform], times_ns: Sequence[int], *, static: bool) -> None:
@@ -87,16 +85,11 @@ class TransformTree:
         """
         for transform, time_ns in zip(transforms, times_ns, strict=True):
             parent, child = transform.parent, transform.child
-            if child not in self._edges:
-                self._edges[child] = _Edge(parent, child, f"{self._where}, {parent} -> {child}", self._max_disorder_s)
-            edge = self._edges[child]
+            where = f"{self._where}, transform {parent} -> {child}"
+            edge = self._edges.setdefault(child, _Edge(parent, where, self._config.max_disorder_s))
             if edge.parent != parent:
                 raise RejectedInputError(
-                    "invalid_extrinsics",
-                    "A frame has two parents",
-                    where=f"{self._where}, frame {child}",
-                    expected=edge.parent,
-                    got=parent,
+                    "invalid_extrinsics", "A frame has two parents", where=where, expected=edge.parent, got=parent
                 )
             edge.static = edge.static and static
             edge.times_ns.append(time_ns)
@@ -165,13 +158,12 @@ class TransformTree:
 
     def _product(self, frames: list[str], grid_ns: np.ndarray) -> np.ndarray:
         """Pose of the first of these frames, each the child of the next, in the parent of the last."""
-        pose = np.tile(np.eye(4), (len(grid_ns), 1, 1))
+        pose, max_gap_s = np.tile(np.eye(4), (len(grid_ns), 1, 1)), self._config.max_gap_s
         for child in frames:
             edge = self._edges[child]
             times_ns = edge.arrivals.times_ns
             if not edge.fixed:
-                where = f"{self._where}, transform {edge.parent} -> {child}"
-                check_gaps(times_ns, int(grid_ns[0]), int(grid_ns[-1]), self._max_gap_s, self._max_gap_s, where)
+                check_gaps(times_ns, int(grid_ns[0]), int(grid_ns[-1]), max_gap_s, max_gap_s, edge.where)
             values = interpolated_poses(times_ns, edge.poses, grid_ns)
             pose = pose_from_quaternion_xyzw(values[:, :3], values[:, 3:]) @ pose
         return pose
@@ -199,7 +191,7 @@ def read_tree(
     """
 
     def read_static(topics: Iterable[str], stop_ns: int | None) -> TransformTree:
-        tree = TransformTree(file.path, config.max_gap_s, config.max_disorder_s)
+        tree = TransformTree(file.path, config)
         present = [topic for topic in topics if topic in file.topics]
         for received in file.messages(present, None, stop_ns) if present else ():
             tree.add(received.value, [received.log_ns] * len(received.value), static=True)

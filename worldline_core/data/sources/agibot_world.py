@@ -199,7 +199,9 @@ class AgibotWorldSource:
         name = AGIBOT_CAMERAS[view]
         intrinsic_path = inside(self._root, f"{folder}/{name}_intrinsic_params.json")
         extrinsic_path = inside(self._root, f"{folder}/{name}_extrinsic_params_aligned.json")
-        read = validated(_IntrinsicFile, read_json(intrinsic_path), intrinsic_path, "Camera parameters").intrinsic
+        read = validated(
+            _IntrinsicFile, read_json(intrinsic_path), intrinsic_path, "File of camera parameters"
+        ).intrinsic
         if not all(abs(value) <= _MAX_NUMBER for _, value in read):  # NaN is not either
             raise RejectedInputError(
                 "singular_intrinsics", "Intrinsics are not finite", where=intrinsic_path, expected="numbers", got=read
