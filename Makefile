@@ -13,9 +13,9 @@ compile_new = $(if $(wildcard .venv/lib/*/site-packages/$(1)),,--compile-bytecod
 demo: install
 	$(RUN) worldline pipeline --preset demo
 
-# One process a core, one thread each.
+# One process per core, one thread each; neighbours stay together, so that what a file sets up is set up once.
 test: install-scale
-	OMP_NUM_THREADS=1 $(RUN) pytest -n auto
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -n auto --dist worksteal
 
 # Deployment against a real server and worker, and the largest model classes: minutes.
 test-slow: install-scale

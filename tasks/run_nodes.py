@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from prefect.task_runners import ProcessPoolTaskRunner
 from tasks.artifact_task import ArtifactReference, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
+from worldline_core.report.progress import share
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 
 POLL_SECONDS = 0.1
@@ -38,12 +40,12 @@ def run_nodes(
     """Run every node, or find its artifact; returns the artifacts by the nodes' names.
 
     With ``runner.nodes_at_once`` of 1 everything happens in this process. Otherwise nodes that wait for nothing run side
-    by side in processes that share the cores. When a node fails, nothing more is started, what runs is let finish, and
+    by side in processes that share the cores, first those that the longest work waits for. When a node fails, nothing more is started, what runs is let finish, and
     its error is raised.
     """
     with ExitStack() as stack:
         run = _Run(store_root, runner, watcher, _pool(runner, stack))
-        waiting = list(nodes)
+        waiting = list(nodes) if runner.nodes_at_once == 1 else by_urgency(nodes)
         while waiting or run.running:
             for node in [node for node in waiting if run.has_inputs(node)]:
                 if len(run.running) < runner.nodes_at_once:
@@ -51,6 +53,17 @@ def run_nodes(
                     run.start(node)
             run.take_finished()
         return run.done
+
+
+def by_urgency(nodes: Sequence[Node]) -> list[Node]:
+    """The nodes in the order of the time, in shares of the demo, from their start to the end of all that needs them."""
+
+    @functools.cache
+    def left(name: str) -> float:
+        after = (left(other.name) for other in nodes if name in other.inputs.values())
+        return share(name) + max(after, default=0.0)
+
+    return sorted(nodes, key=lambda node: -left(node.name))
 
 
 class _Run:

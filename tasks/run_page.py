@@ -21,9 +21,10 @@ class RunPage:
     A context: when it is left, the page leads to the finished report, or shows the error that ended the run.
     """
 
-    def __init__(self, artifacts: Path, nodes: Sequence[str]) -> None:
+    def __init__(self, artifacts: Path, nodes: Sequence[str], at_once: int = 1) -> None:
         self.artifacts = artifacts
         self.folder = artifacts / "report" / "latest"
+        self._at_once = at_once
         self._to_come = list(nodes)
         self._running: dict[str, float] = {}
         self._done: list[DoneNode] = []
@@ -73,7 +74,7 @@ class RunPage:
             now = time.monotonic()
             left = estimate_left(
                 self.artifacts, self._done, list(self._running), self._to_come,
-                sum(now - began for began in self._running.values()),
+                sum(now - began for began in self._running.values()), self._at_once,
             )  # fmt: skip
             write_progress_page(
                 self.folder, self._done, list(self._running), self._to_come, now - self._began, left, failed

@@ -85,5 +85,19 @@ def test_without_a_record_the_estimate_is_the_steps_share_at_this_machines_pace(
     assert "this machine's pace" in later.basis
 
 
+def test_nodes_side_by_side_need_less_time_and_each_has_its_own_share(tmp_path: Path) -> None:
+    names = ["rollout.stage2", "rollout.banks_shipped_causal"]
+    alone = estimate_left(tmp_path, [], names, [])
+    assert alone.seconds == SHARES["rollout"] + SHARES["rollout.banks_shipped_causal"]
+    assert estimate_left(tmp_path, [], names, [], at_once=2).seconds == alone.seconds / 2
+
+
+def test_another_node_of_the_step_does_not_stand_for_the_rest_of_a_run(tmp_path: Path) -> None:
+    artifact(tmp_path, "rollout", "short", SHARES["rollout"])
+    done = [DoneNode("rollout.stage2", tmp_path, SHARES["rollout"])]
+    found = estimate_left(tmp_path, done, ["rollout.banks_shipped_stage2", "rollout.banks_shipped_causal"], [])
+    assert found.seconds == SHARES["rollout.banks_shipped_stage2"] + SHARES["rollout.banks_shipped_causal"]
+
+
 def test_durations_are_words() -> None:
     assert [duration(s) for s in (3.21, 61, 150, 8000)] == ["3.2 s", "61 s", "2.5 min", "2.2 h"]

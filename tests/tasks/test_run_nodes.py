@@ -21,7 +21,7 @@ from prefect.testing.utilities import prefect_test_harness
 
 from tasks.artifact_task import ArtifactReference
 from tasks.prefect_artifacts import show_in_prefect
-from tasks.run_nodes import run_nodes
+from tasks.run_nodes import by_urgency, run_nodes
 from tasks.run_page import RunPage
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import DataError
@@ -84,6 +84,15 @@ def nodes(second: str = "b") -> list[Node]:
         Node("write_next.second", "write_next", WriteConfig(text=second), {"before": "write_first"}),
         Node("write_first", "write_first", WriteConfig(text="a"), {}),
     ]
+
+
+def test_what_the_longest_work_waits_for_starts_first(project_root: Path) -> None:
+    planned = plan(load_config(PipelineConfig, preset="demo"), project_root)
+    order = [node.name for node in by_urgency(planned[::-1])]
+    assert sorted(order) == sorted(node.name for node in planned)
+    assert order.index("rollout.banks_shipped_causal") < order.index("rollout.shipped_stage2")
+    assert order.index("distill") < order.index("rollout.copy_first_frame")
+    assert order[-1] == "report"
 
 
 def run(store: Path, second: str = "b", watcher: Any = None) -> dict[str, ArtifactReference]:

@@ -6,6 +6,7 @@ It is written anew after every node and reloads itself; the finished report take
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,19 @@ RELOAD_SECONDS = 5
 MOST_FACTS = 6
 PICTURES = ("previews/*.png", "previews/*.jpg", "media/*.jpg")
 SHARES: Mapping[str, float] = {
-    "curate": 28, "filter": 20, "render_actions": 8, "encode_latents": 5, "train_stage1": 136, "train_stage2": 147,
-    "distill": 269, "rollout": 37, "evaluate_video": 85, "evaluate_policy": 24, "evaluate_planning": 56, "report": 36,
+    "curate": 22, "curate.banks": 40, "filter": 30, "render_actions": 9, "encode_latents": 6, "train_stage1": 4,
+    "train_stage2": 14, "distill": 24, "rollout": 4, "rollout.shipped_causal": 9, "rollout.shipped_stage2_35_steps": 41,
+    "rollout.banks_shipped_stage2": 77, "rollout.banks_shipped_causal": 133, "evaluate_video": 68, "evaluate_policy": 8,
+    "evaluate_planning": 55, "report": 18,
 }  # fmt: skip
-"""Seconds per node of each step in the demo on two cores: only their ratios are used, until something was measured."""
+"""Seconds of each step's nodes in the demo on one of two busy cores, and of those that take longer than the others of
+their step: only their ratios are used, until something was measured."""
+_UNKNOWN_SHARE = 30.0
+
+
+def share(node: str) -> float:
+    """The share of a node, `step` or `step.variant`, in the demo's time."""
+    return SHARES.get(node, SHARES.get(node.partition(".")[0], _UNKNOWN_SHARE))
 
 
 @dataclass(frozen=True)
@@ -57,31 +67,39 @@ def estimate_left(
     running: Sequence[str],
     to_come: Sequence[str],
     seconds_of_running: float = 0.0,
+    at_once: int = 1,
 ) -> Estimate:
     """Time left: what each step took the last time in this store, else its share of the demo at this machine's pace.
+
+    Of a step with several nodes it is not known which one was recorded: as soon as this run has a pace, shares count.
 
     Args:
         artifacts: the root of the store.
         running, to_come: names of nodes, `step` or `step.variant`.
         seconds_of_running: how long the running nodes have been at it.
+        at_once: nodes that run side by side.
     """
-    steps = [name.partition(".")[0] for name in (*running, *to_come)]
-    recorded = {step: recorded_seconds(artifacts, step) for step in set(steps)}
-    worked = [node for node in done if not node.cached and node.name.partition(".")[0] in SHARES]
-    expected = sum(SHARES[node.name.partition(".")[0]] for node in worked)
+    names = (*running, *to_come)
+    nodes_of = Counter(name.partition(".")[0] for name in names)
+    worked = [node for node in done if not node.cached]
+    expected = sum(share(node.name) for node in worked)
     pace = sum(node.seconds for node in worked) / expected if expected else 1.0
-    seconds = 0.0
-    for step in steps:
-        known = recorded[step]
-        seconds += known if known is not None else pace * SHARES.get(step, 30.0)
-    without = sum(recorded[step] is None for step in steps)
+    recorded = {
+        step: recorded_seconds(artifacts, step) if count == 1 or not worked else None
+        for step, count in nodes_of.items()
+    }
+    seconds, without = 0.0, 0
+    for name in names:
+        known = recorded[name.partition(".")[0]]
+        without += known is None
+        seconds += known if known is not None else pace * share(name)
     if not without:
         basis = "from the time that the same steps took before in this store"
     elif worked:
-        basis = f"rough: {without} of {len(steps)} steps never ran in this store; taken from the demo's shares at this machine's pace"
+        basis = f"rough: {without} of {len(names)} steps have no record of their own in this store; taken from the demo's shares at this machine's pace"
     else:
-        basis = f"rough: {without} of {len(steps)} steps never ran in this store; taken from the demo on two cores"
-    return Estimate(max(0.0, seconds - seconds_of_running), basis)
+        basis = f"rough: {without} of {len(names)} steps never ran in this store; taken from the demo on two cores"
+    return Estimate(max(0.0, seconds - seconds_of_running) / at_once, basis)
 
 
 def write_progress_page(

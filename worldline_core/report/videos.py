@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -55,9 +57,14 @@ def videos_section(context: ReportContext) -> Section:
 def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> dict[str, Any]:
     """One episode: what it is, its videos by view, and the recordings beside it."""
     row = episodes.rows[episodes.position(item.episode_id)]
+    views = [view for view in VIEWS if view in row.views]
+    wanted = [(view, group) for view in views for group in GROUPS]
+    # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        videos = list(pool.map(lambda place: video(context, item, place[0], place[1], number), wanted))
     panels = []
-    for view in [v for v in VIEWS if v in row.views]:
-        made = [found for group in GROUPS if (found := video(context, item, view, group, number)) is not None]
+    for view in views:
+        made = [found for (of, _), found in zip(wanted, videos, strict=True) if of == view and found is not None]
         if made:
             widest = max(found["video"].width for found in made)
             panels.append((view, [{**found, "share": found["video"].width / widest} for found in made]))
