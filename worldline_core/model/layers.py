@@ -8,6 +8,7 @@ names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state di
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -216,6 +217,26 @@ class TimeEmbedder(nn.Module):
             return self.linear_2(F.silu(self.linear_1(features)))
 
 
+def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
+    """Refuse latents that are not those of ``views``, and action maps that do not lie on their grid.
+
+    Raises:
+        DataError: a shape does not fit.
+    """
+    if (
+        latents.ndim != 6
+        or latents.shape[1:3] != (len(views), config.latent_channels)
+        or latents.shape[-1] % config.patch_size
+        or latents.shape[-2] % config.patch_size
+    ):
+        expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
+        raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
+    if action_maps is not None:
+        wanted = (*latents.shape[:2], config.action_channels, *latents.shape[3:])
+        if action_maps.shape != wanted:
+            raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
+
+
 class ActionEncoder(nn.Module):
     """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
 
@@ -224,7 +245,6 @@ class ActionEncoder(nn.Module):
 
     def __init__(self, channels: int, patch_size: int, hidden_size: int) -> None:
         super().__init__()
-        self.channels = channels
         self.patch_size = patch_size
         self.conv = nn.Conv3d(channels, channels, kernel_size=(1, 3, 3), padding=(0, 1, 1))
         self.proj = nn.Linear(channels * patch_size**2, hidden_size)
@@ -232,15 +252,7 @@ class ActionEncoder(nn.Module):
         nn.init.zeros_(self.proj.bias)
 
     def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
-        """Residuals for the video tokens, in order ``(t v h w)``.
-
-        Raises:
-            DataError: the maps have another number of channels.
-        """
-        if maps.ndim != 6 or maps.shape[2] != self.channels:
-            raise DataError(
-                "Action maps have the wrong shape", expected=f"(b, v, {self.channels}, t, h, w)", got=tuple(maps.shape)
-            )
+        """Residuals for the video tokens, in order ``(t v h w)``."""
         flat = rearrange(maps, "b v c t h w -> (b v) c t h w")
         flat = flat + self.conv(flat)
         patches = rearrange(

@@ -35,6 +35,7 @@ from worldline_core.model.layers import (
     MixtureLayer,
     RMSNorm,
     TimeEmbedder,
+    check_shapes,
     is_text_parameter,
     velocity_of,
 )
@@ -156,7 +157,7 @@ class WorldModel(nn.Module):
             DataError: a shape does not fit.
             ConfigError: a view is unknown, or there is no such layer.
         """
-        self._check(latents, views, action_maps)
+        check_shapes(self.config, latents, views, action_maps)
         frames, (rows, columns) = latents.shape[3], self._patch_grid(latents)
         offset = 0.0 if text is None else text.size + self.config.temporal_margin
         by = self._rotation(torch.arange(frames, device=latents.device), latents, views, offset)
@@ -235,7 +236,7 @@ class WorldModel(nn.Module):
         Raises:
             DataError: a shape does not fit, or the clip does not divide into blocks.
         """
-        self._check(noisy, views, action_maps)
+        check_shapes(self.config, noisy, views, action_maps)
         batch, _, _, frames, _, _ = noisy.shape
         bounds = block_bounds(frames, block_size)
         if clean.shape != noisy.shape or sigma.shape != (batch, len(bounds) - 1):
@@ -265,22 +266,6 @@ class WorldModel(nn.Module):
     def _mixture(self) -> Sequence[MixtureLayer]:
         return cast("Sequence[MixtureLayer]", self.layers)
 
-    def _check(self, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
-        config = self.config
-        expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
-        if (
-            latents.ndim != 6
-            or latents.shape[1] != len(views)
-            or latents.shape[2] != config.latent_channels
-            or latents.shape[-1] % config.patch_size
-            or latents.shape[-2] % config.patch_size
-        ):
-            raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
-        if action_maps is not None:
-            wanted = (*latents.shape[:2], config.action_channels, *latents.shape[3:])
-            if action_maps.shape != wanted:
-                raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
-
     def _patch_grid(self, latents: Tensor) -> tuple[int, int]:
         """Patch rows and columns of one view."""
         return latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size
@@ -300,7 +285,7 @@ class WorldModel(nn.Module):
         written: dict[int, tuple[Tensor, Tensor]] | None = None,
     ) -> Tensor:
         """Tokens of one block that attends to itself and to the cache's window, which it follows in time."""
-        self._check(latents, views, action_maps)
+        check_shapes(self.config, latents, views, action_maps)
         own, window = (torch.arange(count, device=latents.device) for count in (latents.shape[3], cache.frames))
         by = self._rotation(own + cache.frames, latents, views)
         attend = CachedAttention(by, cache, self._rotation(window, latents, views), written)

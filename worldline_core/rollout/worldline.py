@@ -200,7 +200,7 @@ class WorldLine:
         """
         first, maps = self.encode(images, tracks, frames, without_actions=without_actions)
         latents = self._sample(first, maps, seeds)
-        clips = []
+        clips: list[dict[str, np.ndarray]] = []
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=self.bfloat16):
             # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
             for clip, observed in zip(latents, images.to(self.device), strict=True):
@@ -292,9 +292,8 @@ class WorldLine:
         if any(shape != (height, width, 3) for shape in shapes.values()):
             raise DataError("First images are RGB and of one size", expected="(H, W, 3) in every view", got=shapes)
         kinematics = None if controls is None or embodiment is None else ArmKinematics(load_embodiment(embodiment))
-        known = (
-            set() if kinematics is None else {arm.camera_view for arm in kinematics.embodiment.arms if arm.wrist_camera}
-        )
+        arms = () if kinematics is None else kinematics.embodiment.arms
+        known = {arm.camera_view for arm in arms if arm.wrist_camera}
         poses, follow = _poses(cameras, known, frames)
         joints = driven if controls is not None else driven.reshape(frames, -1)
         episode = Episode(

@@ -89,16 +89,15 @@ class LatentStore(ClipSource):
         Raises:
             ArtifactError: if the folder is not a Latents artifact.
         """
-        root = Path(root)
-        for name in (_DESCRIPTION, _INDEX):
-            if not (root / name).is_file():
-                raise ArtifactError(
-                    "This folder is not a Latents artifact.",
-                    where=root / name,
-                    expected=f"{_DESCRIPTION} and {_INDEX}",
-                    got="no such file",
-                    next_step="run the encode_latents step first",
-                )
+        missing = [name for name in (_DESCRIPTION, _INDEX) if not (root / name).is_file()]
+        if missing:
+            raise ArtifactError(
+                "This folder is not a Latents artifact.",
+                where=root,
+                expected=f"{_DESCRIPTION} and {_INDEX}",
+                got=f"no {' and no '.join(missing)}",
+                next_step="run the encode_latents step first",
+            )
         table = pq.read_table(root / _INDEX).to_pylist()
         rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in table]
         return cls(root, json.loads((root / _DESCRIPTION).read_text()), rows)
