@@ -177,8 +177,8 @@ def auxiliary_losses(
 ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """Weighted sum of all auxiliaries of `predicted` against `target`, and the plain value of each for the metrics.
 
-    Both clips hold the observed frame. `mask` may be None only where no robot term is wanted (both robot weights 0); `perceptual` None leaves LPIPS
-    out, which the caller reports.
+    Both clips hold the observed frame. `mask` may be None only where no robot term is wanted (both robot weights 0);
+    `perceptual` None leaves LPIPS out, which the caller reports.
     """
     terms: dict[str, tuple[float, Tensor]] = {}
     if weights.anchor:
