@@ -69,8 +69,8 @@ def said(context: ReportContext) -> str:
 def test_it_says_what_is_reached_and_what_is_not(tmp_path: Path) -> None:
     assert said(context_of(tmp_path, success=0.76, own=0.45)) == (
         "The shipped simulator follows the controls (robot IoU 0.80 against 0.50 for copying the first frame) but does not"
-        " yet choose clearly better than a blind choice (76\u202f% against 64\u202f%); the model that this run trained for"
-        " minutes does not yet beat copying the first frame (0.45 against 0.50)."
+        " yet choose clearly better than a blind choice (76\u202f% against 64\u202f%); the model that this run trained"
+        " briefly does not yet beat copying the first frame (0.45 against 0.50)."
     )
 
 
@@ -86,7 +86,7 @@ def test_it_says_what_is_reached_and_what_is_not(tmp_path: Path) -> None:
         ({"over_copy": (-0.1, 0.4)}, "does not yet predict better than a copy of the first frame"),
         ({"iou": 0.4, "over_copy": (-0.2, -0.1)}, "does not yet predict better than a copy of the first frame"),
         ({"over_shuffled": (-0.1, 0.1)}, "predicts no better with the right controls than with shuffled ones"),
-        ({"own": 0.6}, "; the model that this run trained for minutes already beats copying the first frame"),
+        ({"own": 0.6}, "; the model that this run trained briefly already beats copying the first frame"),
         ({"iou": 0.4, "over_copy": (-0.2, -0.1), "success": 0.6}, " and does not choose better than a blind choice"),
     ],
 )

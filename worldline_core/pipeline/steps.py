@@ -247,7 +247,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        6,
+        7,
         "worldline_core.report.report",
         "report",
         "ReportConfig",

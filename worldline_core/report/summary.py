@@ -155,7 +155,7 @@ def own_model(view: HeadView) -> Figure | None:
     own = view.method(view.primary.kind, "run")
     if own is None or own.name == view.primary.name:
         return None
-    return view.beside_copy(own, f"the same for this run's own {own.label}, trained for minutes", "")
+    return view.beside_copy(own, f"the same for this run's own {own.label}, trained briefly", "")
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
@@ -223,7 +223,7 @@ def sentence(context: ReportContext, view: HeadView | None, figures: dict[str, F
     if own is not None:
         beside = f"({own.value} against {number(own.reference)})"
         beats = "already beats" if own.verdict == "better" and own.certain else "does not yet beat"
-        text += f"; the model that this run trained for minutes {beats} copying the first frame {beside}"
+        text += f"; the model that this run trained briefly {beats} copying the first frame {beside}"
     return text + "."
 
 

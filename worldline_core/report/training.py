@@ -69,7 +69,7 @@ def training_section(context: ReportContext) -> Section:
             "training", TITLE, missing="no training stage was given (inputs train_stage1, train_stage2, distill)."
         )
     lead = (
-        "What this run's own minutes of training did, starting from the base model. Pale: every logged mean; strong: running mean."
+        "What this run's own short training did, starting from the base model. Pale: every logged mean; strong: running mean."
         " Held-out losses always use the same clips, noise and noise levels, with the averaged weights."
     )
     table = Table(("Stage", "Steps", "First loss", "Last loss", "Last held-out loss"), rows, range(1, 5))

@@ -21,7 +21,7 @@ from worldline_core.report.video_scores import ChosenEpisode, choose_episodes
 TITLE = "Predicted videos"
 GROUPS = {
     "shipped": "Long-trained: the checkpoints that ship with the project",
-    "run": "This run: what its own minutes of training reached",
+    "run": "This run: what its own short training reached",
 }
 
 
