@@ -34,8 +34,8 @@ from tools.corrupted.labels import Label
 from worldline_core.data.curation.curate import curate
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
+from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.atomic import remove_unfinished
-from worldline_core.store.digest import digest_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "artifacts" / "shipped" / "recordings"

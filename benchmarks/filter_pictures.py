@@ -14,11 +14,11 @@ import numpy as np
 
 from tools.corrupted.conventions import corrupt
 from tools.labelled_clips import FAULTS, Clip
+from tools.thumbnails import view_thumbnails
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.overlays import draw_overlay
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure

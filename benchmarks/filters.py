@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 
 from tools.labelled_clips import FAULTS, HARMLESS, Clip
+from tools.thumbnails import view_thumbnails
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
-from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure

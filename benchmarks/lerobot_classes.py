@@ -279,7 +279,7 @@ def measured(job: str, folder: Path, episodes: int, *flags: str, timeout: int = 
 
 def digests(root: Path) -> dict[str, str]:
     """File -> digest."""
-    from worldline_core.store.digest import digest_file
+    from worldline_core.store.artifact_files import digest_file
 
     return {str(path.relative_to(root)): digest_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
 

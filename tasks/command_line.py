@@ -104,8 +104,7 @@ def run_task_command(step_name: str) -> None:
 def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
     """One line that says where the artifact is, its digest, and whether it was there already; JSON has its metrics too."""
     if as_json:
-        from worldline_core.store.artifact_files import read_json
-        from worldline_core.store.digest import MANIFEST_NAME
+        from worldline_core.store.artifact_files import MANIFEST_NAME, read_json
 
         metrics = read_json(artifact.path / MANIFEST_NAME)["metrics"]
         print(json.dumps({**asdict(artifact), "metrics": metrics}, default=str, indent=1))

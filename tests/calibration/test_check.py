@@ -24,7 +24,7 @@ from worldline_core.calibration.diagnosis import (
 )
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions
 from worldline_core.data.episodes.episode import Episode
-from worldline_core.data.episodes.source import LoadedEpisode, no_masks
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
 
@@ -35,9 +35,7 @@ HOSTILE = "<script>alert('x')</script>"
 
 def listed(episode: Episode, images: dict[str, np.ndarray], name: str = "synthetic/0") -> ListedEpisode:
     named = replace(episode, episode_id=name)
-    return ListedEpisode(
-        name, "synthetic", lambda: LoadedEpisode(named, tuple(images), lambda view: images[view], no_masks)
-    )
+    return ListedEpisode(name, "synthetic", lambda: LoadedEpisode(named, tuple(images), lambda view: images[view]))
 
 
 def explained(conventions: RecordedConventions) -> Explanation:

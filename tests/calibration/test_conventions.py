@@ -20,7 +20,7 @@ from worldline_core.data.episodes.conventions import (
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.episodes.source import LoadedEpisode, no_masks
+from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.sources.open import repair
 
@@ -204,7 +204,7 @@ def test_repair_of_a_loaded_episode_takes_images_and_masks_along() -> None:
     assert np.array_equal(kept, masks[2:])
     assert found.episode.conventions["declared_image_lag_frames"] == "2"
     assert repair(loaded, RecordedConventions()) is loaded
-    short = LoadedEpisode(two_arms(), ("head",), lambda _: images[:-1], no_masks)
+    short = LoadedEpisode(two_arms(), ("head",), lambda _: images[:-1])
     with pytest.raises(RejectedInputError, match="Video and states differ in length") as caught:
         repair(short, RecordedConventions(image_lag_frames=2)).frames("head")
     assert caught.value.reason == "length_mismatch"

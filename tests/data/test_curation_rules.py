@@ -12,22 +12,20 @@ import cv2
 import numpy as np
 import pytest
 
+from tools.thumbnails import view_thumbnails
 from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.curation.curate_config import CurateConfig, SourceSampling
 from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON, described, with_primary_view
 from worldline_core.data.curation.rules import curation_findings
-from worldline_core.data.curation.source_table import read_source_table
-from worldline_core.data.curation.source_weights import (
-    SourceSampling,
-    read_source_weights,
+from worldline_core.data.curation.source_table import (
+    read_source_table,
     source_weights,
     write_source_weights,
 )
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.errors import ConfigError, DataError
 
 Make = Callable[..., tuple]
@@ -124,13 +122,13 @@ def test_a_scene_that_leaks_under_another_name(tmp_path: Path, action: str) -> N
 
 
 def test_an_interrupted_decision_is_carried_on_by_the_same_rows(tmp_path: Path) -> None:
-    from worldline_core.data.curation.rules import decided_findings
+    from worldline_core.data.curation.rules import decided_rows
 
     parts = described_parts([room(0, "a"), room(0, "b"), room(1, "c")])
-    first = decided_findings(config(tmp_path), parts, tmp_path)
-    assert [row.episode_id for row in first.rows] == ["b"]
+    first = decided_rows(config(tmp_path), parts, tmp_path)
+    assert [row.episode_id for row in first] == ["b"]
     # After the kill the duplicate is gone already: the decision must not change with it.
-    assert decided_findings(config(tmp_path), parts[:1] + parts[2:], tmp_path) == first
+    assert decided_rows(config(tmp_path), parts[:1] + parts[2:], tmp_path) == first
     assert json.loads((tmp_path / "curation.json").read_text())["reasons"] == {"duplicate": 1}
 
 
@@ -249,12 +247,11 @@ def test_weights_give_each_source_its_share() -> None:
 def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
     rows = [row("large", 900), row("large", 800), row("small", 100)]
     write_source_weights(tmp_path, rows, SourceSampling(alpha=0.5))
-    assert read_source_weights(tmp_path) == pytest.approx(source_weights(rows, SourceSampling(alpha=0.5)))
-    (tmp_path / "source_weights.json").write_text('{"large": 3}')
-    with pytest.raises(DataError, match="Table of sampling weights is damaged"):
-        read_source_weights(tmp_path)
-    with pytest.raises(DataError, match="Set has no sampling weights"):
-        read_source_weights(tmp_path / "elsewhere")
+    table = json.loads((tmp_path / "source_weights.json").read_text())
+    found = {source: entry["weight"] for source, entry in table.items()}
+    assert found == pytest.approx(source_weights(rows, SourceSampling(alpha=0.5)))
+    assert sum(entry["share"] for entry in table.values()) == pytest.approx(1)
+    assert {source: entry["episodes"] for source, entry in table.items()} == {"large": 2, "small": 1}
 
 
 def test_the_clip_sampler_follows_these_weights() -> None:

@@ -163,7 +163,7 @@ def test_different_robots_get_datasets_of_their_own(tmp_path: Path, sample: Make
 def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) -> None:
     writer = EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(32, 48))
     episode, frames, masks = sample(0)
-    with pytest.raises(DataError, match=r"(?s)Images and states differ.*expected: 9.*got: 8"):
+    with pytest.raises(DataError, match=r"(?s)Images and states differ in length.*expected: 9.*got: 8"):
         writer.add(episode, {**frames, "head": frames["head"][:8]})
     with pytest.raises(DataError, match="another frame rate"):
         writer.add(replace(episode, fps=5.0), frames)

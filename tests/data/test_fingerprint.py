@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from tools.thumbnails import view_thumbnails
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.fingerprint import MINHASHES, Fingerprint, fingerprint, motion_hashes
-from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]

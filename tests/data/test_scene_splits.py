@@ -85,7 +85,7 @@ def test_one_scene_under_two_names_is_found() -> None:
     rng = np.random.default_rng(0)
     rooms = rng.integers(0, 2**63, (40, 4), dtype=np.uint64)
     views = [seen(f"train-{i}-{k}", "train", f"room {i}", rooms[i]) for i in range(40) for k in range(3)]
-    # Up to 31 flipped bits leave one of 32 bands whole: found for certain.
+    # Up to 52 flipped bits are one scene.
     views += [seen(f"test-{i}", "test", f"lab {i}", flipped(rooms[i], 31, rng)) for i in range(10)]
     views.append(seen("same name", "validation", "lab 3", rooms[39]))
     leaks = find_scene_leaks(views, LeakageConfig())

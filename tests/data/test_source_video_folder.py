@@ -132,7 +132,7 @@ def test_captions_may_be_in_one_table(tmp_path: Path, suffix: str) -> None:
         ("captions.json", "{", "not valid JSON"),
         ("captions.json", "3", "wrong shape"),
         ("captions.jsonl", '{"video": "a.mp4", "caption": "x"}\n{"video": "a.mp4", "caption": "y"}', "two captions"),
-        ("captions.json", "[" * 100_000, "nested too deeply"),
+        ("captions.json", "[" * 100_000, "recursion"),
         ("captions.csv", "video,caption\na.mp4", "lacks a text"),
         ("captions.xlsx", "", "unknown kind"),
     ],

@@ -13,7 +13,7 @@ from published_lerobot import HEIGHT, WIDTH, write_galaxea, write_robocoin, writ
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 POSE = [[1.0, 0, 0, 0.1], [0, 0, 1.0, -0.4], [0, -1.0, 0, 1.3], [0, 0, 0, 1.0]]
 CAMERA = {"width": WIDTH, "height": HEIGHT, "K": [[60.0, 0, 63.5], [0, 60.0, 35.5], [0, 0, 1]], "T": POSE}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from worldline_core.data.video.clip import VideoClip, video_size
-from worldline_core.data.video.encoder import X264_PARAMETERS, VideoEncoder, concatenate_videos, encode_video
+from worldline_core.data.video.encoder import X264_PARAMETERS, Encoding, VideoEncoder, concatenate_videos, encode_video
 from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 from worldline_core.errors import DataError
 
@@ -54,7 +54,7 @@ def test_bytes_do_not_depend_on_the_processor(
 
 
 def test_key_frames_are_where_they_are_wanted(tmp_path: Path) -> None:
-    with VideoEncoder(tmp_path / "k.mp4", (32, 48), 30, key_frame_interval=32) as encoder:
+    with VideoEncoder(tmp_path / "k.mp4", (32, 48), 30, Encoding(key_frame_interval=32)) as encoder:
         for frame in np.tile(picture(0, 1), (70, 1, 1, 1)):
             encoder.add(frame)
     with av.open(str(tmp_path / "k.mp4")) as container:

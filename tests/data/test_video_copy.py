@@ -9,10 +9,9 @@ import av
 import numpy as np
 import pytest
 
-from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view
+from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, copy_clip, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, open_video, read_clip
-from worldline_core.data.video.copy import clip_copy
 from worldline_core.data.video.encoder import concatenate_videos, encode_video
 from worldline_core.data.video.frame_decoder import decode_frames, decode_video
 
@@ -69,8 +68,8 @@ def own_decode(path: Path) -> np.ndarray:
 def copied(clip: VideoClip, target: Path) -> np.ndarray | None:
     """The frames that are seen while copying, or None where the clip cannot be copied."""
     with open_video(clip.path) as (container, stream):
-        copy = clip_copy(clip, container, stream)
-        return None if copy is None else np.stack([picture.rgb for picture in copy.pictures(target)])
+        pictures = copy_clip(clip, container, stream, target)
+        return None if pictures is None else np.stack([picture.rgb for picture in pictures])
 
 
 def packets(path: Path) -> list[bytes]:

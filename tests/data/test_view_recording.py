@@ -12,6 +12,7 @@ import av
 import numpy as np
 import pytest
 
+from tools.thumbnails import view_thumbnails
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
@@ -20,7 +21,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import VideoClip, read_clip
-from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk, view_thumbnails
+from worldline_core.data.video.thumbnails import ThumbnailMaker, shrunk
 from worldline_core.filters.filter import examine
 from worldline_core.filters.filter_config import FilterConfig
 
@@ -222,8 +223,9 @@ def test_images_come_one_at_a_time(sample: Make, tmp_path: Path) -> None:
             Counted.most = max(Counted.most, alive)
             yield image.copy().view(Counted)
 
-    stored = store_view(RecordedView(images, 30), tmp_path / "v.mp4", episode.fps, VideoSettings(preset="ultrafast"))
-    assert len(stored.thumbnails) == 30
+    settings = VideoSettings(preset="ultrafast")
+    _, thumbnails = store_view(RecordedView(images, 30), tmp_path / "v.mp4", episode.fps, settings)
+    assert len(thumbnails) == 30
     assert Counted.most <= 8  # a few views into the same picture; never a whole view
 
 

@@ -26,7 +26,7 @@ from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_inf
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
-from worldline_core.store.digest import digest_file, folder_files
+from worldline_core.store.artifact_files import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.latent_store import LatentStore

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 
 def trainer(steps: int) -> dict[str, object]:

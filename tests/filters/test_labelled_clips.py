@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tools.labelled_clips import FAULTS, HARMLESS, Clip, at_frames
+from tools.thumbnails import view_thumbnails
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.thumbnails import view_thumbnails
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure

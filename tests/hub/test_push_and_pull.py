@@ -14,7 +14,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.publishing.content import FILE_LIST
 from worldline_core.publishing.publish import pull, push
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 PLACE = "hf://datasets/lab/toy"
 

@@ -130,7 +130,7 @@ def test_recorded_text_cannot_break_the_card(curated: Path, tmp_path: Path) -> N
 
 
 def test_equal_sets_give_equal_bytes_and_the_set_stays_as_it_is(curated: Path, tmp_path: Path) -> None:
-    from worldline_core.store.digest import digest_folder
+    from worldline_core.store.artifact_files import digest_folder
 
     before = digest_folder(curated)
     write_card(curated, tmp_path / "one", "T")

@@ -21,7 +21,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import note_file, unchanged_files
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 Make = Callable[[int], tuple[Path, CurateConfig]]
 

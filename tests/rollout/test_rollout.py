@@ -25,7 +25,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import RolloutConfig, rollout, shuffled_partners
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 SIZE = (32, 48)
 SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)

@@ -22,7 +22,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
 from worldline_core.store.store import ArtifactStore
 

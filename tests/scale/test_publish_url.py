@@ -15,7 +15,7 @@ from worldline_core.data.guards.source_paths import parse_location
 from worldline_core.errors import ArtifactError
 from worldline_core.publishing.content import FILE_LIST
 from worldline_core.publishing.publish import pull, push
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import UnreachableInputError
 
 pytestmark = pytest.mark.usefixtures("short_pauses")

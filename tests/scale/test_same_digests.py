@@ -26,7 +26,7 @@ from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
 COUNT = 12

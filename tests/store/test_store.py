@@ -15,8 +15,8 @@ import pytest
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.store.artifact_files import digest_folder, digest_value
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
-from worldline_core.store.digest import digest_folder, digest_value
 from worldline_core.store.store import ArtifactStore
 
 

@@ -17,8 +17,7 @@ from safetensors.torch import load_file
 
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
-from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.store.digest import digest_folder
+from worldline_core.store.artifact_files import digest_folder, read_json_lines
 
 
 def free_port() -> int:

@@ -26,9 +26,8 @@ from tqdm import tqdm
 
 from worldline_core.distillation.causal_objective import with_observed_frame
 from worldline_core.errors import ArtifactError
-from worldline_core.store.artifact_files import read_json
+from worldline_core.store.artifact_files import digest_file, read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.store.digest import digest_file
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_source import Clip, ClipBatch
 from worldline_core.training.trainer import processes

@@ -14,8 +14,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.artifact_files import MANIFEST_NAME, VOLATILE_FOLDER, digest_file, folder_files
 from worldline_core.store.atomic import atomic_path
-from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_file, folder_files
 
 FILE_LIST = "worldline_files.json"
 """Written last wherever a set is published: a copy without it is not complete."""

@@ -31,7 +31,7 @@ from worldline_core.publishing.content import (
     listed,
     set_files,
 )
-from worldline_core.store.digest import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder
+from worldline_core.store.artifact_files import MANIFEST_NAME, VOLATILE_FOLDER, digest_folder
 from worldline_core.store.remote import AnyPath, file_system, list_files, parse_location, with_retries
 
 HUB_SCHEME = "hf://"

@@ -28,8 +28,8 @@ from worldline_core.recorder.simulate import EpisodeRecorder, WorldRecorder
 from worldline_core.recorder.small_bodies import BODIES
 from worldline_core.recorder.small_things import TASKS
 from worldline_core.recorder.small_world import SmallWorldRecorder
+from worldline_core.store.artifact_files import MANIFEST_NAME, digest_folder
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
-from worldline_core.store.digest import MANIFEST_NAME, digest_folder
 from worldline_core.store.store import describe_environment
 
 Embodiment = Literal[

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON
 from worldline_core.data.curation.rules import CURATION_FILE
-from worldline_core.data.curation.source_table import SourceFacts, read_source_table
-from worldline_core.data.curation.source_weights import WEIGHTS_FILE
+from worldline_core.data.curation.source_table import WEIGHTS_FILE, SourceFacts, read_source_table
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
     EpisodeRow,

@@ -17,9 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.errors import DataError
-from worldline_core.store.artifact_files import row_schema
+from worldline_core.store.artifact_files import digest_value, row_schema
 from worldline_core.store.atomic import write_table_atomic
-from worldline_core.store.digest import digest_value
 
 SHARDS_FOLDER = "run/inputs"
 MERGED_FILE = "run/inputs.parquet"
@@ -86,7 +85,7 @@ def check_account(output: Path, found: int, kept: set[str], quarantined: set[str
         return
     raise DataError(
         "Inputs were lost between the sources and the result",
-        where=str(output),
+        where=output,
         expected=f"kept + quarantined = {found}, in the account and in the result",
         got=f"{len(by_status['kept'])} + {len(by_status['quarantined'])} in the account, "
         f"{len(kept)} + {len(quarantined)} in the result",

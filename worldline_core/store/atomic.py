@@ -45,10 +45,7 @@ def write_table_atomic(path: Path, table: pa.Table, *, rows_per_group: Sequence[
     """Write a Parquet file; rows_per_group cuts it into row groups of these sizes."""
     import pyarrow.parquet as pq
 
-    with (
-        atomic_path(path) as temporary,
-        pq.ParquetWriter(temporary, table.schema, compression="snappy") as writer,
-    ):
+    with atomic_path(path) as temporary, pq.ParquetWriter(temporary, table.schema, compression="snappy") as writer:
         start = 0
         for size in rows_per_group or [len(table)]:
             writer.write_table(table.slice(start, size), row_group_size=max(size, 1))

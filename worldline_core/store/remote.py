@@ -26,7 +26,7 @@ from upath import UPath
 from upath.implementations.local import FilePath
 
 from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
-from worldline_core.store.digest import digest_value
+from worldline_core.store.artifact_files import digest_value
 
 logger = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ def parse_location(text: str | Path | UPath) -> AnyPath:
         location = UPath(text) if isinstance(text, str) else text
     except ValueError as error:
         raise ConfigError(
-            "Unknown kind of location", expected="a folder, or a URL of a protocol that fsspec knows", got=str(text)
+            "Unknown kind of location", expected="a folder, or a URL of a protocol that fsspec knows", got=text
         ) from error
     if isinstance(location, Path):
         return Path(str(location))
@@ -164,7 +164,7 @@ def file_system(path: AnyPath) -> Any:
     except ImportError as error:
         raise UnavailableError(
             f"Locations of the form {cast('UPath', path).protocol}:// need a library that is not installed",
-            where=str(path),
+            where=path,
             got=str(error),
             next_step="uv sync --extra s3 (for s3://), or install the fsspec library of that store",
         ) from error
@@ -239,7 +239,7 @@ def remote_digest(root: AnyPath) -> str:
         mark = next((str(about[key]) for key in _CHANGE_MARKS if about.get(key) is not None), "")
         entries.append([name, about.get("size"), mark])
     if not entries:
-        raise ArtifactError("There is nothing at an input's location", where=str(root), next_step="check the URL")
+        raise ArtifactError("There is nothing at an input's location", where=root, next_step="check the URL")
     return digest_value(entries)
 
 

@@ -27,12 +27,17 @@ from typing import Any
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
-from worldline_core.store.artifact_files import read_json
+from worldline_core.store.artifact_files import MANIFEST_NAME, digest_folder, digest_value, read_json
 from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic, write_json_atomic
-from worldline_core.store.digest import MANIFEST_NAME, digest_folder, digest_value
 from worldline_core.store.remote import is_remote, remote_digest
 
 logger = logging.getLogger(__name__)
+
+KEY_LENGTH = 16
+_VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")
+_POLL_SECONDS = 0.1
+
+StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
 @contextmanager
@@ -49,9 +54,6 @@ def exclusive_lock(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-_POLL_SECONDS = 0.1
 
 
 def is_helper() -> bool:
@@ -78,16 +80,9 @@ def announced(path: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-def wait_for_announcement[T](path: Path, finished: Callable[[], T | None]) -> T | None:
-    """Return None once the first process has begun, or what ``finished`` finds if there is nothing left to do.
-
-    If the first process fails instead, torchrun ends this one.
-    """
-    while (found := finished()) is None:
-        if path.is_file() and path.read_bytes() == _launch():
-            return None
-        time.sleep(_POLL_SECONDS)
-    return found
+def is_announced(path: Path) -> bool:
+    """Whether the first process of this launch has begun. If it fails instead, torchrun ends this one."""
+    return path.is_file() and path.read_bytes() == _launch()
 
 
 def wait_until[T](finished: Callable[[], T | None]) -> T:
@@ -95,12 +90,6 @@ def wait_until[T](finished: Callable[[], T | None]) -> T:
     while (found := finished()) is None:
         time.sleep(_POLL_SECONDS)
     return found
-
-
-KEY_LENGTH = 16
-_VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")
-
-StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -187,10 +176,10 @@ class ArtifactStore:
         sources = {name: path if is_remote(path) else path.resolve() for name, path in inputs.items()}
         announcement = self.root / step / f".{key}.workers"
         if is_helper():
-            done = wait_for_announcement(announcement, lambda: self.find(step, key))
-            if done is None and distributed:
+            wait_until(lambda: self.find(step, key) or is_announced(announcement) or None)
+            if distributed and self.find(step, key) is None:
                 function(config, sources, partial)
-            return done or wait_until(lambda: self.find(step, key))
+            return wait_until(lambda: self.find(step, key))
         with exclusive_lock(self.root / step / f".{key}.lock"):
             if (found := self.find(step, key)) is not None:
                 return found

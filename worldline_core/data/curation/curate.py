@@ -12,9 +12,8 @@ from typing import Any, ClassVar
 
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.recorded_episode import check_episode, prepare_episode
-from worldline_core.data.curation.rules import decided_findings
-from worldline_core.data.curation.source_table import write_source_table
-from worldline_core.data.curation.source_weights import write_source_weights
+from worldline_core.data.curation.rules import decided_rows
+from worldline_core.data.curation.source_table import write_source_table, write_source_weights
 from worldline_core.data.episodes.episode_index import QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
 from worldline_core.data.episodes.source import EpisodeSource
@@ -80,8 +79,7 @@ def _take_out(work: CurateWork, listed: Sequence[Sequence[ListedEpisode]]) -> No
     """
     labels = {e.identity: work.label(e.source) for episodes in listed for e in episodes}
     kept = {part["episode_id"]: part for part in work.writer.kept()}
-    findings = decided_findings(work.config, [kept[identity] for identity in labels if identity in kept], work.output)
-    for row in findings.rows:
+    for row in decided_rows(work.config, [kept[identity] for identity in labels if identity in kept], work.output):
         work.writer.quarantine(row.episode_id, labels[row.episode_id], row.reason, row.detail, row.numbers)
         work.writer.discard(row.episode_id)
 
@@ -193,14 +191,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         with unchanged_files(episode.identity):
             loaded = self._source(episode.source).load(episode.listed_id)
             check_episode(own, loaded)
-            prepared = prepare_episode(own, loaded)
-            self.writer.add(
-                prepared.episode,
-                prepared.frames,
-                prepared.masks or None,
-                prepared.described,
-                thing_labels=prepared.things,
-            )
+            self.writer.add(*prepare_episode(own, loaded))
 
     def quarantine_crashed(self, episode: ListedEpisode, detail: str, evidence: Mapping[str, Any]) -> InputRow:
         return self._quarantine(episode, "crashed", detail, evidence)
@@ -218,7 +209,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         """
         found = self.writer.recorded(identity)
         if found is None:
-            raise DataError("An episode was neither kept nor quarantined", where=str(self.output), got=identity)
+            raise DataError("An episode was neither kept nor quarantined", where=self.output, got=identity)
         if isinstance(found, QuarantineRow):
             return InputRow(episode_id=identity, source=found.source, status="quarantined", reason=found.reason)
         return InputRow(

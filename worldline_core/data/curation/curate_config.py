@@ -7,12 +7,20 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.curation.near_duplicates import NearDuplicateConfig
 from worldline_core.data.curation.scenes import LeakageConfig, Splits
-from worldline_core.data.curation.source_weights import SourceSampling
 from worldline_core.data.episodes.instructions import InstructionConfig
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
+
+
+class SourceSampling(StrictModel):
+    """Shares of the sources in training."""
+
+    alpha: float = Field(default=1.0, ge=0, le=1, description="share ~ hours ** alpha: 1 by hours, 0 all equal")
+    shares: dict[str, float] | None = Field(
+        default=None, description="source -> share, given instead; every source that trains must be named"
+    )
 
 
 class CurateConfig(StrictModel):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.near_duplicates import NearDuplicate, find_near_duplicates
+from worldline_core.data.curation.near_duplicates import find_near_duplicates
 from worldline_core.data.curation.scenes import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.data.episodes.fingerprint import Fingerprint
@@ -26,31 +26,35 @@ class Described(Protocol):
     def __getitem__(self, key: str) -> Any: ...
 
 
-@dataclass(frozen=True)
-class CurationFindings:
-    """What the rules found.
+def decided_rows(config: CurateConfig, parts: Sequence[Described], output: Path) -> list[QuarantineRow]:
+    """`curation_findings`, decided once: a run that is killed while episodes are taken out goes on by the same decision.
 
-    Attributes:
-        rows: episodes to take out, in listed order. leaks: pairs of scenes that look like one across the split.
+    Also writes curation.json: counts by reason, and the scenes that look like one.
     """
-
-    rows: tuple[QuarantineRow, ...]
-    leaks: tuple[SceneLeak, ...]
-    leakage_action: str
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "reasons": dict(Counter(row.reason for row in self.rows)),
-            "scene_leaks": [leak.as_json() for leak in self.leaks],
-            "leakage_action": self.leakage_action,
+    decision = output / "run" / "selection.json"
+    if not decision.is_file():
+        rows, leaks = curation_findings(config, parts)
+        found = {
+            "rows": [asdict(row) for row in rows],
+            "reasons": dict(Counter(row.reason for row in rows)),
+            "scene_leaks": [asdict(leak) for leak in leaks],
+            "leakage_action": config.leakage.action,
         }
+        write_json_atomic(decision, found)
+    found = json.loads(decision.read_text())
+    rows = [QuarantineRow(**row) for row in found.pop("rows")]
+    write_json_atomic(output / CURATION_FILE, found)
+    return rows
 
 
-def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> CurationFindings:
+def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple[list[QuarantineRow], list[SceneLeak]]:
     """Decide over all episodes at once.
 
     Args:
         parts: descriptions in the order in which the sources list them: of equal episodes the first is kept.
+
+    Returns:
+        Episodes to take out, in listed order, and the pairs of scenes that look like one across the split.
 
     Raises: DataError when an episode has no fingerprint, a scene is both learnt from and tested on, or scenes leak and
         the configuration refuses that.
@@ -61,40 +65,34 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> Curat
     for position, seen in enumerate(prints):
         original = first.setdefault(seen.digest, position)
         if original != position:
-            rows[position] = _duplicate(parts, position, original)
+            rows[position] = _repetition(
+                parts[position], parts[original], "duplicate", "Same frames, states and actions as episode {}"
+            )
     left = [position for position in range(len(parts)) if position not in rows]
     for found in find_near_duplicates([prints[position] for position in left], config.near_duplicates):
-        rows[left[found.position]] = _near_duplicate(parts, left, found)
+        rows[left[found.position]] = _repetition(
+            parts[left[found.position]],
+            parts[left[found.original]],
+            "near_duplicate",
+            "The same recording as episode {}, encoded or cut another way",
+            compared_with=parts[left[found.compared_with]]["episode_id"],
+            motion_overlap=None if found.motion_overlap is None else round(found.motion_overlap, 4),
+            frame_distance_bits=round(found.frame_distance, 4),
+            moving_distance=round(found.moving_distance, 4),
+        )
     kept = [position for position in range(len(parts)) if position not in rows]
     check_scenes_disjoint([parts[position] for position in kept])
-    leaks = find_scene_leaks(
-        [_scene_view(parts[i], prints[i]) for i in kept if _has_primary(parts[i], prints[i])], config.leakage
-    )
+    views = [
+        SceneView(part["episode_id"], part["scene"], part["split"], prints[position].views[part["primary_view"]].first)
+        for position in kept
+        if (part := parts[position])["primary_view"] in prints[position].views
+    ]
+    leaks = find_scene_leaks(views, config.leakage)
     if leaks and config.leakage.action == "refuse":
         raise _refusal(leaks)
     if config.leakage.action == "quarantine":
         rows.update(_leaking(parts, kept, leaks))
-    return CurationFindings(tuple(rows[position] for position in sorted(rows)), tuple(leaks), config.leakage.action)
-
-
-def decided_findings(config: CurateConfig, parts: Sequence[Described], output: Path) -> CurationFindings:
-    """`curation_findings`, decided once: a run that is killed while episodes are taken out goes on by the same decision.
-
-    Also writes curation.json: counts by reason, and the scenes that look like one.
-    """
-    decision = output / "run" / "selection.json"
-    if decision.is_file():
-        stored = json.loads(decision.read_text())
-        findings = CurationFindings(
-            tuple(QuarantineRow(**row) for row in stored["rows"]),
-            tuple(SceneLeak(**leak) for leak in stored["scene_leaks"]),
-            stored["leakage_action"],
-        )
-    else:
-        findings = curation_findings(config, parts)
-        write_json_atomic(decision, findings.as_json() | {"rows": [asdict(row) for row in findings.rows]})
-    write_json_atomic(output / CURATION_FILE, findings.as_json())
-    return findings
+    return [rows[position] for position in sorted(rows)], leaks
 
 
 def check_scenes_disjoint(parts: Sequence[Described]) -> None:
@@ -135,38 +133,12 @@ def _row(part: Described, reason: str, detail: str, evidence: Mapping[str, Any])
     return QuarantineRow(part["episode_id"], part["source"], reason, detail, json.dumps(dict(evidence), sort_keys=True))
 
 
-def _duplicate(parts: Sequence[Described], position: int, original: int) -> QuarantineRow:
-    name = parts[original]["episode_id"]
-    evidence = {"duplicate_of": name} | _crossing(parts[position], parts[original])
-    return _row(parts[position], "duplicate", f"Same frames, states and actions as episode {name}", evidence)
-
-
-def _near_duplicate(parts: Sequence[Described], left: Sequence[int], found: NearDuplicate) -> QuarantineRow:
-    part, original = parts[left[found.position]], parts[left[found.original]]
-    evidence = {
-        "duplicate_of": original["episode_id"],
-        "compared_with": parts[left[found.compared_with]]["episode_id"],
-        "motion_overlap": None if found.motion_overlap is None else round(found.motion_overlap, 4),
-        "frame_distance_bits": round(found.frame_distance, 4),
-        "moving_distance": round(found.moving_distance, 4),
-    }
-    detail = f"The same recording as episode {original['episode_id']}, encoded or cut another way"
-    return _row(part, "near_duplicate", detail, evidence | _crossing(part, original))
-
-
-def _crossing(part: Described, original: Described) -> dict[str, Any]:
-    """Both splits, where a copy is in another split than its original."""
-    if part["split"] == original["split"]:
-        return {}
-    return {"split": part["split"], "split_of_original": original["split"]}
-
-
-def _has_primary(part: Described, seen: Fingerprint) -> bool:
-    return part["primary_view"] in seen.views
-
-
-def _scene_view(part: Described, seen: Fingerprint) -> SceneView:
-    return SceneView(part["episode_id"], part["scene"], part["split"], seen.views[part["primary_view"]].first)
+def _repetition(part: Described, original: Described, reason: str, detail: str, **evidence: Any) -> QuarantineRow:
+    """Names both splits where a copy is in another split than its original."""
+    name = original["episode_id"]
+    crossing = {"split": part["split"], "split_of_original": original["split"]}
+    evidence |= {"duplicate_of": name} | (crossing if part["split"] != original["split"] else {})
+    return _row(part, reason, detail.format(name), evidence)
 
 
 def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[SceneLeak]) -> dict[int, QuarantineRow]:
@@ -180,7 +152,7 @@ def _leaking(parts: Sequence[Described], kept: Sequence[int], leaks: Sequence[Sc
         leak = by_scene.get(part["scene"])
         if leak is not None and part["split"] in LEARNING:
             detail = f"Scene {leak.learning_scene} looks like scene {leak.testing_scene}, which is tested on"
-            rows[position] = _row(part, "scene_leak", detail, leak.as_json())
+            rows[position] = _row(part, "scene_leak", detail, asdict(leak))
     return rows
 
 

@@ -1,19 +1,26 @@
-"""What a set was made from: its sources with their licences, and how much of each came through (sources.json)."""
+"""What a set was made from (sources.json), and how often each source is drawn in training (source_weights.json).
+
+A weight per episode by source, as `ClipSampling.source_weights` takes it: sampling by hours alone lets the largest source
+drown the others; equal shares repeat the smallest ones too often. A power between them, share ~ hours ** alpha, is what
+multilingual and multi-robot training use (Conneau et al. 2020).
+"""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from worldline_core.data.curation.curate_config import CurateConfig
+from pydantic import TypeAdapter
+
+from worldline_core.data.curation.curate_config import CurateConfig, SourceSampling
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.atomic import write_json_atomic
 
 SOURCES_FILE = "sources.json"
+WEIGHTS_FILE = "source_weights.json"
 
 
 @dataclass(frozen=True)
@@ -88,13 +95,58 @@ def read_source_table(root: Path) -> list[SourceFacts]:
     if not path.is_file():
         return []
     try:
-        return [
-            SourceFacts(**(row | {"names": tuple(row["names"]), "image_size": _size(row["image_size"])}))
-            for row in json.loads(path.read_text())
-        ]
-    except (ValueError, TypeError, KeyError) as error:
-        raise DataError("Table of sources is damaged", where=str(path), got=str(error)) from error
+        return TypeAdapter(list[SourceFacts]).validate_json(path.read_bytes())
+    except ValueError as error:
+        raise DataError("Table of sources is damaged", where=path, got=str(error)) from error
 
 
-def _size(value: Sequence[int] | None) -> tuple[int, int] | None:
-    return None if value is None else (value[0], value[1])
+def source_weights(rows: Sequence[EpisodeRow], sampling: SourceSampling) -> dict[str, float]:
+    """Weight of one episode of each source that trains; the mean over episodes is 1.
+
+    A sampler that draws episodes by these weights draws source s with probability share_s / sum of shares.
+
+    Raises: ConfigError when given shares leave a source out, name an unknown one, or are not positive.
+    """
+    hours, counts = _hours_and_counts(rows)
+    if not counts:
+        return {}
+    if sampling.shares is None:
+        shares = {source: hours[source] ** sampling.alpha for source in hours}
+    else:
+        shares = sampling.shares
+        if set(shares) != set(counts) or min(shares.values()) < 0 or sum(shares.values()) <= 0:
+            raise ConfigError(
+                "Shares do not fit the sources that train",
+                where="curate.sampling.shares",
+                expected=", ".join(f"{source}: a share of at least 0" for source in sorted(counts)),
+                got=", ".join(f"{source}: {share}" for source, share in sorted(shares.items())),
+            )
+    total, episodes = sum(shares.values()), sum(counts.values())
+    return {source: shares[source] / total * episodes / counts[source] for source in sorted(counts)}
+
+
+def write_source_weights(output: Path, rows: Sequence[EpisodeRow], sampling: SourceSampling) -> None:
+    """Write source_weights.json: hours, episodes, weight and share of each source that trains."""
+    weights, (hours, counts) = source_weights(rows, sampling), _hours_and_counts(rows)
+    total = sum(counts.values())
+    table = {
+        source: {
+            "episodes": counts[source],
+            "hours": round(hours[source], 6),
+            "share": round(weight * counts[source] / total, 9),
+            "weight": round(weight, 9),
+        }
+        for source, weight in weights.items()
+    }
+    write_json_atomic(output / WEIGHTS_FILE, table)
+
+
+def _hours_and_counts(rows: Sequence[EpisodeRow]) -> tuple[dict[str, float], dict[str, int]]:
+    """Hours of video and number of episodes by source, of the episodes that train."""
+    hours: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    for row in rows:
+        if row.split == "train" and row.stage1_ok:
+            hours[row.source] = hours.get(row.source, 0.0) + row.video_frames / row.fps / 3600
+            counts[row.source] = counts.get(row.source, 0) + 1
+    return hours, counts

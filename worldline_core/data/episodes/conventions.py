@@ -26,16 +26,6 @@ from worldline_core.geometry.rotations import (
 from worldline_core.geometry.transforms import rigid_inverse
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-# What an episode must have for a convention to apply to it.
-_NEEDS = {
-    **dict.fromkeys(("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size"), "a calibrated camera"),
-    "camera_lag_frames": "a calibrated camera that moves",
-    **dict.fromkeys(("pose_unit", "quaternion", "euler", "tool_offset_z_m"), "recorded tool poses"),
-    "angle_unit": "joint positions in the state",
-    "arms": "two arms with equal state blocks, each ending with its gripper",
-    "image_lag_frames": "anything",
-    "gripper": "state columns whose names end with gripper",
-}
 
 
 def arm_blocks(episode: Episode) -> tuple[tuple[int, ...], ...]:
@@ -47,6 +37,34 @@ def arm_blocks(episode: Episode) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(range(start, end)) for start, end in zip([0, *ends[:-1]], ends, strict=True))
 
 
+def _two_equal_arms(episode: Episode) -> bool:
+    blocks = arm_blocks(episode)
+    equal = len(blocks) == 2 and len(blocks[0]) == len(blocks[1])
+    return equal and (episode.T_base_ee is None or episode.T_base_ee.shape[1] == 2)
+
+
+_CAMERA = ("a calibrated camera", lambda episode: bool(episode.cameras))
+_POSES = ("recorded tool poses", lambda episode: episode.T_base_ee is not None)
+_NEEDS: dict[str, tuple[str, Callable[[Episode], bool]]] = {
+    **dict.fromkeys(("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size"), _CAMERA),
+    **dict.fromkeys(("pose_unit", "quaternion", "euler", "tool_offset_z_m"), _POSES),
+    "camera_lag_frames": (
+        "a calibrated camera that moves",
+        lambda episode: any(camera.moving for camera in episode.cameras.values()),
+    ),
+    "angle_unit": ("joint positions in the state", lambda episode: episode.state_kind == "joints"),
+    "arms": ("two arms with equal state blocks, each ending with its gripper", _two_equal_arms),
+    "image_lag_frames": ("anything", lambda _: True),
+    "gripper": ("state columns whose names end with gripper", lambda episode: bool(arm_blocks(episode))),
+}
+"""What an episode must have for a field of `RecordedConventions` to apply to it, in words and as a test."""
+
+
+def applicable(episode: Episode, field: str) -> bool:
+    """Whether a field of `RecordedConventions` applies to the episode."""
+    return _NEEDS[field][1](episode)
+
+
 def check_applicable(episode: Episode, fields: Iterable[str]) -> None:
     """Raises: RejectedInputError (convention_not_applicable) for the first field that does not apply to the episode."""
     for field in fields:
@@ -55,30 +73,12 @@ def check_applicable(episode: Episode, fields: Iterable[str]) -> None:
                 "convention_not_applicable",
                 "The episode has nothing that a declared convention applies to",
                 where=f"episode {episode.episode_id}, conventions.{field}",
-                expected=_NEEDS[field],
+                expected=_NEEDS[field][0],
                 got=f"state {episode.state_kind}, {len(episode.cameras)} cameras, "
                 + ("tool poses" if episode.T_base_ee is not None else "no tool poses"),
                 next_step="remove the line, or give these episodes a source of their own",
                 evidence={"field": field},
             )
-
-
-def applicable(episode: Episode, field: str) -> bool:
-    """Whether a field of `RecordedConventions` applies to the episode."""
-    need = _NEEDS[field]
-    if need == "a calibrated camera":
-        return bool(episode.cameras)
-    if need == "a calibrated camera that moves":
-        return any(camera.moving for camera in episode.cameras.values())
-    if need == "recorded tool poses":
-        return episode.T_base_ee is not None
-    if field == "angle_unit":
-        return episode.state_kind == "joints"
-    blocks = arm_blocks(episode)
-    if field == "arms":
-        equal = len(blocks) == 2 and len(blocks[0]) == len(blocks[1])
-        return equal and (episode.T_base_ee is None or episode.T_base_ee.shape[1] == 2)
-    return field == "image_lag_frames" or bool(blocks)
 
 
 class RecordedConventions(StrictModel):

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import CameraPose, ImageTransform
 
@@ -44,14 +44,10 @@ class CameraTrack:
 
     def __post_init__(self) -> None:
         if self.K.shape != (3, 3):
-            raise DataError(
-                "Camera matrix has a wrong shape", where=self.view, expected="(3, 3)", got=str(self.K.shape)
-            )
+            raise DataError("Camera matrix has a wrong shape", where=self.view, expected="(3, 3)", got=self.K.shape)
         shape = self.T_base_camera.shape
         if len(shape) != 3 or shape[1:] != (4, 4) or shape[0] < 1:
-            raise DataError(
-                "Camera poses have a wrong shape", where=self.view, expected="(N or 1, 4, 4)", got=str(shape)
-            )
+            raise DataError("Camera poses have a wrong shape", where=self.view, expected="(N or 1, 4, 4)", got=shape)
 
     @classmethod
     def from_pose(cls, view: str, K: np.ndarray, pose: CameraPose, *, width: int, height: int) -> CameraTrack:
@@ -62,17 +58,11 @@ class CameraTrack:
     def moving(self) -> bool:
         return self.T_base_camera.shape[0] > 1
 
-    def poses(self, frames: Sequence[int] | np.ndarray | slice) -> np.ndarray:
+    def poses(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
         """T_base_camera (len, 4, 4) at frame numbers; a fixed camera repeats its pose.
 
         Raises: DataError for a frame past the end of a moving camera's track.
         """
-        if isinstance(frames, slice):
-            if not self.moving:
-                raise DataError(
-                    "A slice of frames needs a moving camera", where=self.view, next_step="pass frame numbers"
-                )
-            return self.T_base_camera[frames]
         index = np.asarray(frames, dtype=np.int64)
         if not self.moving:
             return np.repeat(self.T_base_camera, len(index), axis=0)
@@ -116,9 +106,13 @@ class Stored:
         )
 
 
-_Columns = Annotated[np.ndarray, Stored(np.float32, ("N", "J"))]
-_Poses = Annotated[np.ndarray, Stored(np.float64, ("N", "A", 4, 4))]
-_Openings = Annotated[np.ndarray, Stored(np.float64, ("N", "A"))]
+ARRAYS = {
+    "state": Stored(np.float32, ("N", "J")),
+    "action": Stored(np.float32, ("N", "J")),
+    "T_base_ee": Stored(np.float64, ("N", "A", 4, 4)),
+    "gripper": Stored(np.float64, ("N", "A")),
+}
+"""Arrays of an `Episode` that are stored, and how."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,82 +176,60 @@ class Episode(EpisodeDescription):
         video_frames: number of leading frames with images (None: all N). Some samples publish more states than images.
     """
 
-    state: _Columns
-    action: _Columns
+    state: np.ndarray
+    action: np.ndarray
     timestamps: np.ndarray
     cameras: dict[str, CameraTrack] = field(default_factory=dict)
-    T_base_ee: _Poses | None = None
-    gripper: _Openings | None = None
+    T_base_ee: np.ndarray | None = None
+    gripper: np.ndarray | None = None
     video_frames: int | None = None
 
     def __post_init__(self) -> None:
-        where = f"episode {self.episode_id}"
-        num_frames = len(self.timestamps)
+        where, shape = f"episode {self.episode_id}", self.state.shape
+        frames = len(self.timestamps)
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise RejectedInputError(
-                "wrong_fps", "Frame rate is not positive", where=where, expected="frames per second", got=repr(self.fps)
+                "wrong_fps", "Frame rate is not positive", where=where, expected="frames per second", got=self.fps
             )
-        if self.state.ndim != 2 or len(self.state) != num_frames or num_frames == 0:
-            raise DataError(
-                "State has a wrong shape",
-                where=where,
-                expected=f"({num_frames} > 0, J)",
-                got=str(self.state.shape),
-            )
-        if self.action.shape != self.state.shape:
+        if len(shape) != 2 or shape[0] != frames or frames == 0:
+            raise DataError("State has a wrong shape", where=where, expected=f"({frames} > 0, J)", got=shape)
+        if self.action.shape != shape:
             raise RejectedInputError(
                 "length_mismatch",
                 "Action and state differ in shape",
                 where=where,
-                expected=str(self.state.shape),
-                got=str(self.action.shape),
+                expected=shape,
+                got=self.action.shape,
             )
-        if self.state_names is not None and len(self.state_names) != self.state.shape[1]:
+        if self.state_names is not None and len(self.state_names) != shape[1]:
             raise DataError(
-                "State names do not match the state",
-                where=where,
-                expected=str(self.state.shape[1]),
-                got=str(len(self.state_names)),
+                "State names do not match the state", where=where, expected=shape[1], got=len(self.state_names)
             )
         for view, camera in self.cameras.items():
-            if camera.moving and len(camera.T_base_camera) != num_frames:
-                raise RejectedInputError(
-                    "length_mismatch",
-                    "Camera track and states differ in length",
-                    where=f"{where}, view {view}",
-                    expected=f"{num_frames} (or 1) poses",
-                    got=f"{len(camera.T_base_camera)} poses",
-                )
-        if self.video_frames is not None and not 0 <= self.video_frames <= num_frames:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Images and states differ in number",
-                where=where,
-                expected=f"0..{num_frames} images",
-                got=self.video_frames,
-            )
-        if self.T_base_ee is not None and (self.T_base_ee.ndim != 4 or self.T_base_ee.shape[0] != num_frames):
+            if camera.moving:
+                found = len(camera.T_base_camera)
+                check_length("Camera track", f"{where}, view {view}", states=frames, unit="poses", found=found)
+        if self.video_frames is not None and not 0 <= self.video_frames <= frames:
+            check_length("Images", where, states=frames, unit="images", found=self.video_frames)
+        if self.T_base_ee is not None and (self.T_base_ee.ndim != 4 or len(self.T_base_ee) != frames):
             raise DataError(
-                "Tool poses have a wrong shape",
-                where=where,
-                expected=f"({num_frames}, A, 4, 4)",
-                got=str(self.T_base_ee.shape),
+                "Tool poses have a wrong shape", where=where, expected=f"({frames}, A, 4, 4)", got=self.T_base_ee.shape
             )
-        for name, value, allowed in (
-            ("task_family", self.task_family, get_args(TaskFamily)),
-            ("outcome", self.outcome, get_args(Outcome)),
-            ("split", self.split, get_args(Split)),
-            ("state_kind", self.state_kind, get_args(StateKind)),
+        for name, kind in (
+            ("task_family", TaskFamily),
+            ("outcome", Outcome),
+            ("split", Split),
+            ("state_kind", StateKind),
         ):
+            value, allowed = getattr(self, name), get_args(kind)
             if value not in allowed:
                 raise DataError(f"Unknown {name}", where=where, expected=" | ".join(allowed), got=repr(value))
-
-        if (self.state_kind == "none") != (self.state.shape[1] == 0):
+        if (self.state_kind == "none") != (shape[1] == 0):
             raise DataError(
-                "State has no columns" if self.state.shape[1] == 0 else "State has columns, but is said to be none",
+                "State has no columns" if shape[1] == 0 else "State has columns, but is said to be none",
                 where=where,
                 expected="state_kind none for an episode without states, and only for one",
-                got=f"state_kind {self.state_kind}, state {self.state.shape}",
+                got=f"state_kind {self.state_kind}, state {shape}",
             )
 
     def __len__(self) -> int:
@@ -290,19 +262,6 @@ class Episode(EpisodeDescription):
         return {name: values for name, values in found.items() if values is not None}
 
 
-def _stored_arrays() -> dict[str, Stored]:
-    """By name, of the fields whose annotation says how they are stored, be they optional or not."""
-    found: dict[str, Stored] = {}
-    for name, hint in get_type_hints(Episode, include_extras=True).items():
-        for part in (hint, *get_args(hint)):
-            for note in getattr(part, "__metadata__", ()):
-                if isinstance(note, Stored):
-                    found[name] = note
-    return found
-
-
 LABELS = tuple(each.name for each in fields(EpisodeLabels))
 _DESCRIPTION = tuple(each.name for each in fields(EpisodeDescription))
 _ADAPTER = TypeAdapter(EpisodeDescription)
-ARRAYS = _stored_arrays()
-"""Arrays of an episode that are stored, and how."""

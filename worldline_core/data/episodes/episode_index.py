@@ -6,15 +6,15 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pyarrow as pa
 
 from worldline_core.data.episodes.episode import EpisodeLabels
 from worldline_core.data.guards.plain_files import read_table
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, unreadable
 from worldline_core.data.guards.source_paths import is_file
+from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_table_atomic
 
 INDEX_FILE = "index.parquet"
@@ -53,24 +53,10 @@ _ORDER = (
     "fps", "source", "embodiment", "scene", "task_family", "instruction", "outcome", "split",
     "views", "bank", "candidate", "primary_view", "stage1_ok", "stage2_ok", "stage2_reason", "conventions",
 )  # fmt: skip
-_HINTS = get_type_hints(EpisodeRow)
-_ARROW = {
-    str: pa.string(),
-    int: pa.int64(),
-    float: pa.float64(),
-    bool: pa.bool_(),
-    tuple[str, ...]: pa.list_(pa.string()),
-}
-_INDEX = pa.schema(
-    [
-        (name, next(_ARROW[hint] for hint in (_HINTS[name], *get_args(_HINTS[name])) if hint in _ARROW))
-        for name in sorted(_HINTS, key=_ORDER.index)
-    ]
-)
-_NULLABLE = tuple(name for name, hint in _HINTS.items() if NoneType in get_args(hint))
+_INDEX = pa.schema([row_schema(EpisodeRow).field(name) for name in _ORDER])
+_NULLABLE = ("bank", "candidate", "stage2_reason")
 # Sets of earlier versions lack these.
 _OPTIONAL = ("stage1_ok", "stage2_ok", "stage2_reason", "conventions")
-_QUARANTINE = pa.schema([(name, pa.string()) for name in ("episode_id", "source", "reason", "detail", "evidence")])
 
 
 @dataclass(frozen=True)
@@ -86,6 +72,9 @@ class QuarantineRow:
     @property
     def numbers(self) -> dict[str, Any]:
         return json.loads(self.evidence)
+
+
+_QUARANTINE = row_schema(QuarantineRow)
 
 
 def write_index(root: Path, rows: Iterable[EpisodeRow]) -> None:
@@ -106,21 +95,17 @@ def read_index(root: Path) -> list[EpisodeRow]:
         raise RejectedInputError(
             "missing_column",
             "Index lacks a column",
-            where=str(path),
+            where=path,
             expected=", ".join(missing),
             got=", ".join(table.column_names),
         )
     names = [name for name in _INDEX.names if name in table.column_names]
-    try:
+    with unreadable("Index holds values of another kind", path, (pa.ArrowException, ValueError)):
         table = table.select(names).cast(pa.schema([_INDEX.field(name) for name in names]))
-    except (pa.ArrowException, ValueError) as error:
-        raise RejectedInputError(
-            "unreadable", "Index holds values of another kind", where=str(path), got=str(error)
-        ) from error
     empty = [name for name in names if name not in _NULLABLE and table[name].null_count]
     if empty:
         raise RejectedInputError(
-            "unreadable", "Index has empty fields", where=str(path), expected="a value", got=", ".join(empty)
+            "unreadable", "Index has empty fields", where=path, expected="a value", got=", ".join(empty)
         )
     columns = {name: _shared_values(table[name]) for name in names}
     return [EpisodeRow(**dict(zip(names, values, strict=True))) for values in zip(*columns.values(), strict=True)]

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -16,10 +16,10 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import ARRAYS, VIEWS, CameraTrack, Episode, EpisodeDescription
 from worldline_core.data.episodes.fingerprint import fingerprint
-from worldline_core.data.episodes.view_recording import RecordedView, StoredView, VideoSettings, store_view
+from worldline_core.data.episodes.view_recording import RecordedView, VideoSettings, store_view, thumbnails_beside
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.lerobot.v3_writer import EpisodeVideo
-from worldline_core.data.video.thumbnails import ViewThumbnails, write_thumbnails
+from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
 
 
@@ -28,20 +28,14 @@ def part_name(episode_id: str) -> str:
     return sha256(episode_id.encode()).hexdigest()[:32]
 
 
-def ordered_views(views: Iterable[str]) -> list[str]:
-    """The project's fixed order, then any others by name."""
-    given = set(views)
-    return [view for view in VIEWS if view in given] + sorted(given - set(VIEWS))
-
-
 def write_part(
     folder: Path,
     episode: Episode,
     views: Mapping[str, RecordedView],
-    robot_masks: Mapping[str, np.ndarray] | None,
+    robot_masks: Mapping[str, np.ndarray],
     video: VideoSettings,
-    described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
-    thing_labels: Mapping[str, np.ndarray] | None = None,
+    described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None,
+    thing_labels: Mapping[str, np.ndarray],
 ) -> None:
     """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
 
@@ -56,68 +50,42 @@ def write_part(
     shutil.rmtree(working, ignore_errors=True)
     working.mkdir(parents=True)
     try:
-        stored = {
-            view: store_view(recorded, working / f"{view}.mp4", episode.fps, video) for view, recorded in views.items()
-        }
-        _check_sizes(episode, stored, robot_masks, "Robot masks")
-        _check_sizes(episode, stored, thing_labels, "Labels of things")
+        stored: dict[str, EpisodeVideo] = {}
+        thumbnails: dict[str, ViewThumbnails] = {}
+        for view, recorded in views.items():
+            stored[view], thumbnails[view] = store_view(recorded, working / f"{view}.mp4", episode.fps, video)
+        _check_sizes(episode, stored, robot_masks, thing_labels)
         if described is not None:
-            episode = described({view: kept.thumbnails for view, kept in stored.items()})
-        for view in stored:
-            if stored[view].copied:
-                write_thumbnails(working / f"{view}.arrow", stored[view].path, stored[view].thumbnails)
+            episode = described(thumbnails)
+        arrays = {name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()}
+        for view, camera in episode.cameras.items():
+            arrays[f"K.{view}"] = camera.K.astype(np.float64)
+            arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
+        arrays |= {f"mask.{view}": np.packbits(mask.astype(bool)) for view, mask in robot_masks.items()}
+        for view, labels in thing_labels.items():
+            arrays[f"things.{view}"] = np.frombuffer(zlib.compress(labels.astype(np.uint8).tobytes(), 6), np.uint8)
+        arrays |= {f"histogram.{view}": kept.histogram for view, kept in stored.items()}
         with (working / "arrays.npz").open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **_arrays(episode, stored, robot_masks, thing_labels))
-        description = json.dumps(_description(episode, stored, robot_masks, thing_labels), sort_keys=True)
-        (working / "part.json").write_text(description)
+            np.savez(stream, allow_pickle=False, **arrays)
+        description = {
+            **episode.described(),
+            "fps": float(episode.fps),
+            "num_frames": episode.num_frames,
+            "video_frames": episode.num_video_frames,
+            "videos": {
+                view: {"size": kept.size, "codec": kept.codec, "pixel_format": kept.pixel_format, "copied": kept.copied}
+                for view, kept in stored.items()
+            },
+            "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
+            "masks": {view: list(mask.shape) for view, mask in robot_masks.items()},
+            "things": {view: list(labels.shape) for view, labels in thing_labels.items()},
+            "fingerprint": fingerprint(episode, thumbnails),
+        }
+        (working / "part.json").write_text(json.dumps(description, sort_keys=True))
         shutil.rmtree(final, ignore_errors=True)
         working.rename(final)
     finally:
         shutil.rmtree(working, ignore_errors=True)
-
-
-def _arrays(
-    episode: Episode,
-    stored: Mapping[str, StoredView],
-    robot_masks: Mapping[str, np.ndarray] | None,
-    thing_labels: Mapping[str, np.ndarray] | None,
-) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {
-        name: values.astype(ARRAYS[name].dtype) for name, values in episode.arrays().items()
-    }
-    for view, camera in episode.cameras.items():
-        arrays[f"K.{view}"] = camera.K.astype(np.float64)
-        arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
-    for view, mask in (robot_masks or {}).items():
-        arrays[f"mask.{view}"] = np.packbits(mask.astype(bool))
-    for view, labels in (thing_labels or {}).items():
-        arrays[f"things.{view}"] = np.frombuffer(zlib.compress(labels.astype(np.uint8).tobytes(), 6), np.uint8)
-    for view, kept in stored.items():
-        arrays[f"histogram.{view}"] = kept.histogram
-    return arrays
-
-
-def _description(
-    episode: Episode,
-    stored: Mapping[str, StoredView],
-    robot_masks: Mapping[str, np.ndarray] | None,
-    thing_labels: Mapping[str, np.ndarray] | None,
-) -> dict[str, Any]:
-    return {
-        **episode.described(),
-        "fps": float(episode.fps),
-        "num_frames": episode.num_frames,
-        "video_frames": episode.num_video_frames,
-        "views": [[view, *stored[view].size] for view in ordered_views(stored)],
-        "videos": {
-            view: {"codec": kept.codec, "pixel_format": kept.pixel_format, "copied": kept.copied}
-            for view, kept in stored.items()
-        },
-        "cameras": {view: [camera.width, camera.height] for view, camera in episode.cameras.items()},
-        "masks": {view: list(mask.shape) for view, mask in (robot_masks or {}).items()},
-        "things": {view: list(labels.shape) for view, labels in (thing_labels or {}).items()},
-        "fingerprint": fingerprint(episode, {view: kept.thumbnails for view, kept in stored.items()}),
-    }
 
 
 class Part:
@@ -153,16 +121,16 @@ class Part:
 
     @cached_property
     def videos(self) -> dict[str, EpisodeVideo]:
-        """By view, in the set's order."""
+        """By view: first the project's own in their order, then any others by name."""
+        found = self["videos"]
         return {
             view: EpisodeVideo(
                 path=self.folder / f"{view}.mp4",
-                size=(height, width),
                 histogram=self._arrays[f"histogram.{view}"],
-                thumbnails=self.folder / f"{view}.arrow",
-                **self["videos"][view],
+                thumbnails=thumbnails_beside(self.folder / f"{view}.mp4"),
+                **found[view] | {"size": tuple(found[view]["size"])},
             )
-            for view, height, width in self["views"]
+            for view in sorted(found, key=lambda view: (VIEWS.index(view) if view in VIEWS else len(VIEWS), view))
         }
 
     def masks(self) -> dict[str, np.ndarray]:
@@ -193,29 +161,11 @@ def read_parts(folder: Path) -> list[Part]:
     return sorted(found, key=lambda part: part["episode_id"])
 
 
-def check_images(episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
-    """Raises: DataError when images in memory are none; RejectedInputError when they and the states differ in number."""
-    where = f"episode {episode.episode_id}"
-    for view, images in frames.items():
-        if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-            raise DataError(
-                "Images have a wrong type",
-                where=f"{where}, view {view}",
-                expected="uint8 (N, H, W, 3)",
-                got=f"{images.dtype} {images.shape}",
-            )
-        if len(images) != episode.num_video_frames:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Images and states differ in number",
-                where=f"{where}, view {view}",
-                expected=f"{episode.num_video_frames} frames",
-                got=f"{len(images)} frames",
-            )
-
-
 def _check_sizes(
-    episode: Episode, stored: Mapping[str, StoredView], masks: Mapping[str, np.ndarray] | None, what: str
+    episode: Episode,
+    stored: Mapping[str, EpisodeVideo],
+    robot_masks: Mapping[str, np.ndarray],
+    thing_labels: Mapping[str, np.ndarray],
 ) -> None:
     where = f"episode {episode.episode_id}"
     for view, kept in stored.items():
@@ -230,12 +180,13 @@ def _check_sizes(
                 next_step="use CameraTrack.resized so that K follows the resize",
                 evidence={"view": view, "images": list(kept.size), "calibrated": [camera.height, camera.width]},
             )
-    for view, mask in (masks or {}).items():
-        expected = (episode.num_video_frames, *stored[view].size) if view in stored else None
-        if mask.shape != expected:
-            raise DataError(
-                f"{what} do not match the images",
-                where=f"{where}, view {view}",
-                expected=expected or "a view with images",
-                got=mask.shape,
-            )
+    for what, images in (("Robot masks", robot_masks), ("Labels of things", thing_labels)):
+        for view, values in images.items():
+            expected = (episode.num_video_frames, *stored[view].size) if view in stored else "a view with images"
+            if values.shape != expected:
+                raise DataError(
+                    f"{what} do not match the images",
+                    where=f"{where}, view {view}",
+                    expected=expected,
+                    got=values.shape,
+                )

@@ -55,10 +55,7 @@ class EpisodeSet:
         """
         if episode_id not in self._position:
             raise DataError(
-                "No such episode in the set",
-                where=str(self.root),
-                got=episode_id,
-                expected=f"one of {len(self)} ids",
+                "No such episode in the set", where=self.root, got=episode_id, expected=f"one of {len(self)} ids"
             )
         return self._position[episode_id]
 
@@ -70,10 +67,7 @@ class EpisodeSet:
         self,
         *,
         split: str | Sequence[str] | None = None,
-        source: str | None = None,
         embodiment: str | None = None,
-        bank: str | None = None,
-        stage1_ok: bool | None = None,
         stage2_ok: bool | None = None,
     ) -> list[int]:
         """Positions of the rows that match every given value."""
@@ -82,10 +76,7 @@ class EpisodeSet:
             position
             for position, row in enumerate(self.rows)
             if (splits is None or row.split in splits)
-            and (source is None or row.source == source)
             and (embodiment is None or row.embodiment == embodiment)
-            and (bank is None or row.bank == bank)
-            and (stage1_ok is None or row.stage1_ok == stage1_ok)
             and (stage2_ok is None or row.stage2_ok == stage2_ok)
         ]
 
@@ -96,12 +87,7 @@ class EpisodeSet:
         """
         relative = self.rows[i].dataset
         if Path(relative).is_absolute():
-            raise DataError(
-                "Index row has an absolute path",
-                where=str(self.root),
-                expected="a relative path",
-                got=relative,
-            )
+            raise DataError("Index row has an absolute path", where=self.root, expected="a relative path", got=relative)
         if not self._allow_linked or is_remote(self.root):  # a published set holds its datasets
             return inside(self.root, relative)
         return Path(os.path.normpath(self.root / relative))
@@ -122,19 +108,19 @@ class EpisodeSet:
         dataset, sidecar = self._open(i)
         length = int(dataset.row(row.episode_index)["length"])
         arrays = sidecar.trajectory(row.episode_index)
-        if sidecar.contract["state_kind"] == "none":
+        if sidecar.contract.state_kind == "none":
             arrays |= dict.fromkeys(("state", "action"), np.zeros((length, 0), dtype=np.float32))
         elif "state" not in arrays:
             for name, column in (("state", "observation.state"), ("action", "action")):
                 arrays[name] = dataset.column(row.episode_index, column).astype(ARRAYS[name].dtype, copy=False)
-        names = sidecar.contract.get("state_names")
+        names = sidecar.contract.state_names
         whole = Episode(
             **{name: getattr(row, name) for name in LABELS},
             **arrays,
             timestamps=np.arange(len(arrays["state"]), dtype=np.float64) / row.fps,
             cameras=sidecar.cameras(row.episode_index),
             state_names=None if names is None else tuple(names),
-            state_kind=sidecar.contract["state_kind"],
+            state_kind=sidecar.contract.state_kind,
             video_frames=None if length == len(arrays["state"]) else length,
             conventions=_conventions(row),
         )
@@ -151,10 +137,7 @@ class EpisodeSet:
         row = self.rows[i]
         if view not in row.views:
             raise DataError(
-                "Episode has no such view",
-                where=f"episode {row.episode_id}",
-                expected=", ".join(row.views),
-                got=view,
+                "Episode has no such view", where=f"episode {row.episode_id}", expected=", ".join(row.views), got=view
             )
         return row
 

@@ -26,18 +26,13 @@ from worldline_core.data.episodes.episode_index import (
     write_index,
     write_quarantine,
 )
-from worldline_core.data.episodes.episode_parts import (
-    Part,
-    check_images,
-    part_name,
-    read_parts,
-    write_part,
-)
+from worldline_core.data.episodes.episode_parts import Part, part_name, read_parts, write_part
 from worldline_core.data.episodes.sidecar import write_sidecar
 from worldline_core.data.episodes.view_recording import RecordedView, VideoMode, VideoSettings
+from worldline_core.data.guards.rejection import check_length
 from worldline_core.data.guards.source_paths import safe_name
 from worldline_core.data.lerobot.v3_writer import DatasetEpisode, write_dataset
-from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat
+from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
@@ -69,18 +64,14 @@ class EpisodeSetWriter:
         video_preset: str = "slow",
         pixel_format: PixelFormat = "yuv420p",
         video_mode: VideoMode = "auto",
-        key_frame_interval: int = KEY_FRAME_INTERVAL,
+        key_frame_interval: int = VideoSettings.key_frame_interval,
     ) -> None:
         if self.finished(root):
-            raise DataError(
-                "Folder already holds a finished EpisodeSet",
-                where=str(root),
-                next_step="write to a new folder",
-            )
+            raise DataError("Folder already holds a finished EpisodeSet", where=root, next_step="write to a new folder")
         self.root = root
         self.fps = fps
         self.image_size = image_size
-        self.video = VideoSettings(video_crf, video_preset, pixel_format, video_mode, key_frame_interval)
+        self.video = VideoSettings(video_crf, video_preset, pixel_format, key_frame_interval, video_mode)
         self._work = root / "run" / "episodes"
         self._parts = self._work / "parts"
         self._rejected = self._work / "rejected"
@@ -126,43 +117,40 @@ class EpisodeSetWriter:
         Raises: DataError when frames, masks, cameras and states do not belong together; RejectedInputError for
             recordings that cannot be read.
         """
+        where = f"episode {episode.episode_id}"
         if not frames:
-            raise DataError(
-                "Episode has no images", where=f"episode {episode.episode_id}", expected="at least one view", got="none"
-            )
-        in_memory = {view: images for view, images in frames.items() if isinstance(images, np.ndarray)}
-        check_images(episode, in_memory)
-        self._check_image_size(episode, in_memory)
-        safe_name(episode.embodiment, "Embodiment")
-        for view in frames:
-            safe_name(view, "View")
+            raise DataError("Episode has no images", where=where, expected="at least one view", got="none")
         if self.fps is not None and abs(episode.fps - self.fps) > 1e-6:
             raise DataError(
                 "Episode has another frame rate than the set",
-                where=f"episode {episode.episode_id}",
+                where=where,
                 expected=f"{self.fps} fps",
                 got=f"{episode.fps} fps",
             )
-        views = {view: RecordedView.of(v) if isinstance(v, np.ndarray) else v for view, v in frames.items()}
-        write_part(self._parts, episode, views, robot_masks, self.video, described, thing_labels)
-
-    def _check_image_size(self, episode: Episode, frames: Mapping[str, np.ndarray]) -> None:
+        safe_name(episode.embodiment, "Embodiment")
+        views: dict[str, RecordedView] = {}
         for view, images in frames.items():
-            if self.image_size is not None and tuple(images.shape[1:3]) != tuple(self.image_size):
-                raise DataError(
-                    "Images have a wrong size",
-                    where=f"episode {episode.episode_id}, view {view}",
-                    expected=str(self.image_size),
-                    got=str(images.shape[1:3]),
-                )
+            safe_name(view, "View")
+            if isinstance(images, np.ndarray):
+                self._check_images(images, episode, f"{where}, view {view}")
+            views[view] = RecordedView.of(images) if isinstance(images, np.ndarray) else images
+        write_part(self._parts, episode, views, robot_masks or {}, self.video, described, thing_labels or {})
+
+    def _check_images(self, images: np.ndarray, episode: Episode, where: str) -> None:
+        """Raises: DataError when they are no pictures, or not of the set's size; RejectedInputError for a wrong number."""
+        size = ("H", "W") if self.image_size is None else self.image_size
+        fits = images.ndim == 4 and images.shape[3] == 3 and self.image_size in (None, images.shape[1:3])
+        if images.dtype != np.uint8 or not fits:
+            raise DataError(
+                "Images have a wrong size or type",
+                where=where,
+                expected=f"uint8 (N, {size[0]}, {size[1]}, 3)",
+                got=f"{images.dtype} {images.shape}",
+            )
+        check_length("Images", where, states=episode.num_video_frames, unit="frames", found=len(images))
 
     def quarantine(
-        self,
-        episode_id: str,
-        source: str,
-        reason: str,
-        detail: str,
-        evidence: Mapping[str, Any] | None = None,
+        self, episode_id: str, source: str, reason: str, detail: str, evidence: Mapping[str, Any] | None = None
     ) -> None:
         """Note an input that did not get through."""
         row = QuarantineRow(episode_id, source, reason, detail, json.dumps(dict(evidence or {}), sort_keys=True))
@@ -199,18 +187,16 @@ class EpisodeSetWriter:
         if not parts:
             named = sorted({row.reason for row in rejected})
             raise DataError(
-                "No episode was kept",
-                where=str(self.root),
-                got=f"{len(rejected)} quarantined: {', '.join(named) or 'none'}",
+                "No episode was kept", where=self.root, got=f"{len(rejected)} quarantined: {', '.join(named) or 'none'}"
             )
         groups: dict[tuple[Any, ...], list[Part]] = {}
         for part in parts:
             groups.setdefault(part.signature, []).append(part)
         rows: list[EpisodeRow] = []
-        used: dict[str, int] = {}
+        used: Counter[str] = Counter()
         for members in groups.values():
             embodiment = members[0].episode.embodiment
-            used[embodiment] = used.get(embodiment, 0) + 1
+            used[embodiment] += 1
             name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
             dataset = self.root / "datasets" / name
             write_dataset(dataset, [_dataset_episode(part) for part in members])
@@ -224,9 +210,7 @@ class EpisodeSetWriter:
         shutil.rmtree(leftovers, ignore_errors=True)
         self._work.rename(leftovers)
         shutil.rmtree(leftovers)
-        reasons: dict[str, int] = {}
-        for row in rejected:
-            reasons[row.reason] = reasons.get(row.reason, 0) + 1
+        reasons = Counter(row.reason for row in rejected)
         return {"kept": len(parts), "quarantined": len(rejected), "reasons": dict(sorted(reasons.items()))}
 
 

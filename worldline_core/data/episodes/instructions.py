@@ -23,6 +23,10 @@ _QUOTES = dict.fromkeys(map(ord, "\u2018\u2019\u201a\u201b\u2032"), "'") | dict.
     map(ord, "\u201c\u201d\u201e\u201f\u2033"), '"'
 )
 _PAIRS = {'"': '"', "'": "'", "(": ")", "[": "]", "<": ">"}
+_PLACEHOLDERS = (
+    "n/a", "na", "none", "null", "nan", "unknown", "todo", "tbd", "test", "task", "instruction", "no instruction",
+    "no language", "no description", "default", "default task", "dummy", "placeholder", "untitled", "-", "?", "...",
+)  # fmt: skip
 
 
 class InstructionConfig(StrictModel):
@@ -34,30 +38,7 @@ class InstructionConfig(StrictModel):
     )
     strip_trailing: str = Field(default=".!,;:", description="punctuation that is taken off the end")
     placeholders: tuple[str, ...] = Field(
-        default=(
-            "n/a",
-            "na",
-            "none",
-            "null",
-            "nan",
-            "unknown",
-            "todo",
-            "tbd",
-            "test",
-            "task",
-            "instruction",
-            "no instruction",
-            "no language",
-            "no description",
-            "default",
-            "default task",
-            "dummy",
-            "placeholder",
-            "untitled",
-            "-",
-            "?",
-            "...",
-        ),
+        default=_PLACEHOLDERS,
         description="texts that say nothing (compared in lower case); the instruction is then empty",
     )
 

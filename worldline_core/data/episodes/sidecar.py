@@ -5,10 +5,11 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
@@ -19,7 +20,6 @@ from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
 FOLDER = Path("meta") / "worldline"
-CONTRACT_VERSION = 1
 
 _CAMERAS = pa.schema(
     [
@@ -34,12 +34,7 @@ _CAMERAS = pa.schema(
 )
 # Masks are packed bits, labels of things bytes; both compressed with zlib.
 _MASKS = pa.schema(
-    [
-        ("episode_index", pa.int64()),
-        ("view", pa.string()),
-        ("shape", pa.list_(pa.int64())),
-        ("bits", pa.binary()),
-    ]
+    [("episode_index", pa.int64()), ("view", pa.string()), ("shape", pa.list_(pa.int64())), ("bits", pa.binary())]
 )
 _PER_ARM = [name for name, stored in ARRAYS.items() if "A" in stored.axes]
 _TRAJECTORIES = pa.schema(
@@ -94,7 +89,7 @@ def contract(part: Part) -> dict[str, Any]:
     """Units and conventions of a dataset, stated once."""
     episode = part.episode
     return {
-        "version": CONTRACT_VERSION,
+        "version": 1,
         "embodiment": episode.embodiment,
         "fps": episode.fps,
         "views": {view: {"height": video.size[0], "width": video.size[1]} for view, video in part.videos.items()},
@@ -109,30 +104,33 @@ def contract(part: Part) -> dict[str, Any]:
     }
 
 
+class Contract(BaseModel):
+    """What is read of a dataset's contract."""
+
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    version: Literal[1]
+    state_kind: str
+    state_names: list[str] | None = None
+
+
 class Sidecar:
-    """Read access; tables are loaded once."""
+    """Read access; tables are loaded once.
+
+    Raises: DataError where the contract is missing, of another version, or does not say what the state is.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root / FOLDER
-        self.contract: dict[str, Any] = read_json(self.root / "contract.json")
-        if not isinstance(self.contract, dict):
-            raise DataError("Sidecar's contract is no mapping", where=str(self.root), got=type(self.contract).__name__)
-        if self.contract.get("version") != CONTRACT_VERSION:
+        try:
+            self.contract = Contract.model_validate(read_json(self.root / "contract.json"))
+        except ValidationError as error:
             raise DataError(
-                "Sidecar has another version",
-                where=str(self.root),
-                expected=CONTRACT_VERSION,
-                got=self.contract.get("version"),
-            )
-        names = self.contract.get("state_names")
-        kind = self.contract.get("state_kind")
-        if not isinstance(kind, str) or not (names is None or isinstance(names, list)):
-            raise DataError(
-                "Sidecar does not say what the state is",
-                where=str(self.root),
-                expected="state_kind (a text) and state_names (a list or null)",
-                got=f"{kind!r} and {str(names)[:100]}",
-            )
+                "Sidecar's contract is not understood",
+                where=self.root,
+                expected="version 1, state_kind (a text) and state_names (a list or null)",
+                got=str(error),
+            ) from error
         self._rows: dict[str, dict[int, list[dict[str, Any]]]] = {}
 
     def _of(self, name: str, schema: pa.Schema, episode_index: int, *, optional: bool) -> list[dict[str, Any]]:

@@ -27,11 +27,6 @@ EVALUATION_ONLY = "evaluation_only"
 _DROID = re.compile(r"(?<![a-z])droid(?![a-z])", re.IGNORECASE)  # and not "android"
 
 
-def no_masks(view: str) -> None:
-    """Robot masks, or labels of things, of a source that has none."""
-    del view
-
-
 @dataclass(frozen=True)
 class LoadedEpisode:
     """An episode at the source's own rate and image size; images are read when they are asked for, one at a time.
@@ -49,10 +44,10 @@ class LoadedEpisode:
     episode: Episode
     views: tuple[str, ...]
     images: Callable[[str], Iterable[np.ndarray]] = lambda view: ()
-    robot_masks: Callable[[str], np.ndarray | None] = no_masks
+    robot_masks: Callable[[str], np.ndarray | None] = lambda view: None
     distortions: Mapping[str, Distortion] = field(default_factory=dict)
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
-    thing_labels: Callable[[str], np.ndarray | None] = no_masks
+    thing_labels: Callable[[str], np.ndarray | None] = lambda view: None
 
     def each_image(self, view: str) -> Iterator[np.ndarray]:
         """uint8 (H, W, 3) RGB per frame.

@@ -1,39 +1,51 @@
 """One view of an episode is written into a set: in one pass over its pictures it gets its video, thumbnails and statistics.
 
-Where no pixel changes the video is copied without encoding; otherwise its pictures are encoded. Either way one picture is in
-memory at a time.
+Where no pixel changes the video is copied without encoding: its packets stay as they are and only their times are written
+anew, on the exact grid of the clip's rate, so that frame i of the copy lies at i / fps whatever the source's times were.
+Otherwise its pictures are encoded. Either way few pictures are in memory at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
+import av
 import cv2
 import numpy as np
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.stream import VideoStream
 
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.lerobot.statistics import ImageSampler
-from worldline_core.data.video.clip import VideoClip, damaged_frame, open_video, read_clip
-from worldline_core.data.video.copy import clip_copy
-from worldline_core.data.video.encoder import KEY_FRAME_INTERVAL, PixelFormat, VideoEncoder
-from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails
+from worldline_core.data.lerobot.v3_writer import EpisodeVideo
+from worldline_core.data.video.clip import (
+    FRAME_TOLERANCE,
+    Picture,
+    VideoClip,
+    damaged_frame,
+    open_video,
+    read_clip,
+    wrong_count,
+)
+from worldline_core.data.video.encoder import BITEXACT, Encoding, VideoEncoder, frame_rate, length_prefixed
+from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, write_thumbnails
 from worldline_core.geometry.cameras import Fit, ImageTransform
 
 VideoMode = Literal["auto", "encode"]
 
 
 @dataclass(frozen=True)
-class VideoSettings:
+class VideoSettings(Encoding):
     """How images are stored. mode "auto" copies an encoded video in which nothing changes, "encode" never does."""
 
-    crf: int = 18
-    preset: str = "slow"
-    pixel_format: PixelFormat = "yuv420p"
     mode: VideoMode = "auto"
-    key_frame_interval: int = KEY_FRAME_INTERVAL
 
 
 @dataclass(frozen=True)
@@ -61,29 +73,10 @@ class RecordedView:
         return cls(lambda: iter(frames), len(frames))
 
 
-@dataclass(frozen=True)
-class StoredView:
-    """A view's video in a set, and what was measured while it was written.
-
-    Attributes:
-        size: (height, width).
-        codec, pixel_format: as FFmpeg names them.
-        copied: whether its packets are those of the recording.
-        histogram: (3, 256) counts of sampled pixels.
-        thumbnails: of the kept pictures, at the size they were recorded in.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    codec: str
-    pixel_format: str
-    copied: bool
-    histogram: np.ndarray
-    thumbnails: ViewThumbnails
-
-
-def store_view(recorded: RecordedView, path: Path, fps: float, video: VideoSettings) -> StoredView:
-    """Write a view's video to `path`.
+def store_view(
+    recorded: RecordedView, path: Path, fps: float, video: VideoSettings
+) -> tuple[EpisodeVideo, ViewThumbnails]:
+    """Write a view's video to `path`, beside it the thumbnails of a video that was copied; both are handed back.
 
     Args:
         fps: rate of the stored video: frame i lies at i / fps.
@@ -91,34 +84,47 @@ def store_view(recorded: RecordedView, path: Path, fps: float, video: VideoSetti
     Raises: RejectedInputError (length_mismatch, truncated_video, and whatever else reading raises); DataError for
         pictures that cannot be encoded.
     """
-    return (_copied(recorded, path, fps) if video.mode == "auto" else None) or _encoded(recorded, path, fps, video)
+    small = ThumbnailMaker(fps)
+    sampler = ImageSampler(-(-recorded.num_frames // recorded.step))
+    copied = _copied(recorded, path, fps, small, sampler) if video.mode == "auto" else None
+    size, codec, pixel_format = copied or _encoded(recorded, path, fps, video, small, sampler)
+    thumbnails, cache = small.thumbnails(), thumbnails_beside(path)
+    if copied:
+        write_thumbnails(cache, path, thumbnails)
+    return EpisodeVideo(path, size, codec, pixel_format, bool(copied), sampler.histogram, cache), thumbnails
 
 
-def _copied(recorded: RecordedView, path: Path, fps: float) -> StoredView | None:
+def thumbnails_beside(video: Path) -> Path:
+    """Where the thumbnails of a view lie until its set is assembled."""
+    return video.with_name(f"{video.stem}.arrow")
+
+
+type _Format = tuple[tuple[int, int], str, str]
+"""(height, width), codec and pixel format of a stored video."""
+
+
+def _copied(
+    recorded: RecordedView, path: Path, fps: float, small: ThumbnailMaker, sampler: ImageSampler
+) -> _Format | None:
     if recorded.clip is None or recorded.step != 1:
         return None
     with open_video(recorded.clip.path) as (container, stream):
         size = stream.height, stream.width
         if ImageTransform.of(size).fitted(recorded.image_size, recorded.fit).steps:
             return None
-        copy = clip_copy(recorded.clip, container, stream)
-        if copy is None:
+        pictures = copy_clip(recorded.clip, container, stream, path, fps)
+        if pictures is None:
             return None
-        small = ThumbnailMaker(fps)
-        sampler = ImageSampler(recorded.num_frames)
-        for number, picture in enumerate(copy.pictures(path, fps)):
+        for number, picture in enumerate(pictures):
             small.add(picture.luma, full_range=picture.full_range)
             if sampler.wants(number):
                 sampler.add(picture.rgb)
-        context = stream.codec_context
-        pixel_format = context.pix_fmt or "unknown"
-        codec = context.codec.canonical_name
-    return StoredView(path, size, codec, pixel_format, True, sampler.histogram, small.thumbnails())
+        return size, stream.codec_context.codec.canonical_name, stream.codec_context.pix_fmt or "unknown"
 
 
-def _encoded(recorded: RecordedView, path: Path, fps: float, video: VideoSettings) -> StoredView:
-    small = ThumbnailMaker(fps)
-    sampler = ImageSampler(-(-recorded.num_frames // recorded.step))
+def _encoded(
+    recorded: RecordedView, path: Path, fps: float, video: VideoSettings, small: ThumbnailMaker, sampler: ImageSampler
+) -> _Format:
     encoder: VideoEncoder | None = None
     transform = None
     count = 0
@@ -129,15 +135,7 @@ def _encoded(recorded: RecordedView, path: Path, fps: float, video: VideoSetting
                 image = rgb()
                 if encoder is None or transform is None:
                     transform = ImageTransform.of(image.shape[:2]).fitted(recorded.image_size, recorded.fit)
-                    encoder = VideoEncoder(
-                        path,
-                        transform.image_size,
-                        fps,
-                        crf=video.crf,
-                        preset=video.preset,
-                        pixel_format=video.pixel_format,
-                        key_frame_interval=video.key_frame_interval,
-                    )
+                    encoder = VideoEncoder(path, transform.image_size, fps, video)
                 image = transform.frames(image[None])[0]
                 if sampler.wants(encoder.count):
                     sampler.add(image)
@@ -146,16 +144,10 @@ def _encoded(recorded: RecordedView, path: Path, fps: float, video: VideoSetting
     finally:
         if encoder is not None:
             encoder.close()
-    if count != recorded.num_frames or encoder is None:
-        raise RejectedInputError(
-            "length_mismatch",
-            "Video and states differ in length",
-            where=path.stem,
-            expected=f"{recorded.num_frames} frames",
-            got=f"{count} frames",
-            evidence={"states": recorded.num_frames, "frames": count},
-        )
-    return StoredView(path, encoder.size, "h264", video.pixel_format, False, sampler.histogram, small.thumbnails())
+    check_length("Video", path.stem, states=recorded.num_frames, unit="frames", found=count)
+    if encoder is None:
+        raise RejectedInputError("truncated_video", "View has no pictures", where=path.stem)
+    return encoder.size, "h264", video.pixel_format
 
 
 def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callable[[], np.ndarray]]]:
@@ -168,3 +160,137 @@ def _pictures(recorded: RecordedView) -> Iterator[tuple[np.ndarray, bool, Callab
         return
     for image in recorded.images():
         yield cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), True, lambda image=image: image
+
+
+COPIED_CODECS = ("h264", "hevc", "av1", "vp9")
+"""Codecs that mp4 holds and that the usual readers of datasets (torchcodec, PyAV, LeRobot) decode."""
+# A clip that is larger than this is read from the file twice rather than held in memory.
+_HELD_BYTES = 64 << 20
+# Codecs store a frame at most this many frames before or after the place where it is shown (H.264 and HEVC: 16).
+_REORDERED = 32
+
+
+@dataclass(frozen=True)
+class _Selection:
+    """Which packets of a file, counted in the order of decoding from `start_time`'s key frame, make up a clip.
+
+    Attributes:
+        first: number of the first packet; the others follow without a gap.
+        shown_at: (n,) for each packet, the place of its frame in the order of presentation.
+        packets: the packets themselves, None where they are too many to hold.
+    """
+
+    first: int
+    shown_at: np.ndarray
+    packets: list[Packet] | None
+
+
+def copy_clip(
+    clip: VideoClip, container: InputContainer, stream: VideoStream, target: Path, fps: float | None = None
+) -> Iterator[Picture] | None:
+    """The clip's decoded frames in order; when they are exhausted, its copy at `target` is complete.
+
+    None where packets and frames of the clip are not the same thing: another codec or container, a clip that does not
+    begin at a key frame or that needs frames outside of it, an edit list that cuts inside of it, or another number of
+    frames than stated (decoding will say what is wrong).
+
+    Args:
+        container, stream: of clip.path, from `open_video`, not used before; they stay open while the frames are read.
+        fps: rate of the copy, by default the clip's.
+
+    Raises, while it is iterated: RejectedInputError (truncated_video) when a frame cannot be decoded or only in part.
+    """
+    if "mp4" not in container.format.name or stream.codec_context.codec.canonical_name not in COPIED_CODECS:
+        return None
+    selection = _select(clip, container, stream)
+    return (
+        None
+        if selection is None
+        else _write_copy(clip, container, stream, selection, target, frame_rate(fps or clip.fps))
+    )
+
+
+def _write_copy(
+    clip: VideoClip, container: InputContainer, stream: VideoStream, selection: _Selection, target: Path, rate: Fraction
+) -> Iterator[Picture]:
+    # Frames by which decoding must run ahead of showing.
+    delay = int((np.arange(clip.num_frames) - selection.shown_at).max())
+    packets: Iterable[Packet] | None = selection.packets
+    if packets is None:
+        every = _packets_from(clip, container, stream)
+        packets = islice(every, selection.first, selection.first + clip.num_frames)
+    size = stream.height, stream.width  # as the container says it: a damaged packet may change the stream's
+    found = 0
+    with av.open(str(target), "w", format="mp4", options=BITEXACT) as out:
+        written = out.add_stream_from_template(stream, opaque=True)
+        written.time_base = 1 / rate
+        for number, packet in enumerate(chain(packets, (None,))):  # None: what the decoder still holds
+            for frame in stream.codec_context.decode(packet):
+                picture = Picture(frame)
+                if picture.damaged or picture.size != size:
+                    raise damaged_frame(clip, picture, found)
+                yield picture
+                found += 1
+            if packet is not None:
+                packet = length_prefixed(packet, stream)
+                packet.time_base = 1 / rate
+                packet.pts = int(selection.shown_at[number])
+                packet.dts = number - delay
+                packet.duration = 1
+                packet.stream = written
+                out.mux(packet)
+    if found != clip.num_frames:
+        raise wrong_count(clip.path, clip.num_frames, found)
+
+
+def _packets_from(clip: VideoClip, container: InputContainer, stream: VideoStream) -> Iterator[Packet]:
+    """Packets in the order of decoding, from a key frame at or before the clip's start to the end of the file."""
+    time_base = stream.time_base or Fraction(1, 1000)
+    start = 0.0 if clip.from_time is None else clip.start_time
+    container.seek(max(round(start / time_base), 0), stream=stream, backward=True, any_frame=False)
+    # The demuxer ends with an empty flushing packet.
+    return (packet for packet in container.demux(stream) if packet.size)
+
+
+def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> _Selection | None:
+    times: list[int] = []
+    keys: list[bool] = []
+    held: list[Packet] | None = []
+    held_bytes = 0
+    time_base = stream.time_base or Fraction(1, 1000)
+    until = math.inf if clip.from_time is None else clip.start_time + (clip.num_frames + _REORDERED) / clip.fps
+    for packet in _packets_from(clip, container, stream):
+        if packet.pts is None or packet.is_discard or packet.is_corrupt:
+            return None
+        if float(packet.pts * time_base) > until:
+            break
+        times.append(packet.pts)
+        keys.append(packet.is_keyframe)
+        held_bytes += packet.size
+        if held is not None:
+            held.append(packet)
+            held = held if held_bytes <= _HELD_BYTES else None
+    numbers = _frame_numbers(clip, np.asarray(times, dtype=np.int64), time_base)
+    if numbers is None:
+        return None
+    inside = np.flatnonzero((numbers >= 0) & (numbers < clip.num_frames))
+    if not len(inside) == clip.num_frames == inside[-1] - inside[0] + 1:
+        return None
+    first, shown_at = int(inside[0]), numbers[inside]
+    if not keys[first] or shown_at[0] != 0 or len(np.unique(shown_at)) != len(shown_at):
+        return None
+    return _Selection(first, shown_at, None if held is None else held[first : first + len(shown_at)])
+
+
+def _frame_numbers(clip: VideoClip, times: np.ndarray, time_base: Fraction) -> np.ndarray | None:
+    """(packets,) which frame of the clip each packet holds; numbers outside of 0..num_frames-1 belong to others."""
+    if clip.from_time is None:
+        if clip.file_frames is not None and len(times) != clip.file_frames:
+            return None
+        shown = np.empty(len(times), dtype=np.int64)
+        shown[np.argsort(times, kind="stable")] = np.arange(len(times))
+        return shown - clip.skip
+    exact = (times * float(time_base) - clip.start_time) * clip.fps
+    numbers = np.rint(exact).astype(np.int64)
+    near = (numbers >= 0) & (numbers < clip.num_frames)
+    return None if (np.abs(exact - numbers)[near] >= FRAME_TOLERANCE).any() else numbers

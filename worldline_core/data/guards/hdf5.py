@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,15 @@ import numpy as np
 
 from worldline_core.data.guards.hdf5_heap import check_entries
 from worldline_core.data.guards.images import decode_image
-from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, MAX_FRAMES, RejectedInputError, check_shape, too_large
+from worldline_core.data.guards.rejection import (
+    MAX_ARRAY_BYTES,
+    MAX_FRAMES,
+    RejectedInputError,
+    check_finite,
+    check_shape,
+    too_large,
+    unreadable,
+)
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import UnavailableError
 
@@ -100,16 +108,7 @@ class Hdf5File:
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, shape)
         with self._reading(key):
             values = np.asarray(dataset[()], dtype=np.float64)
-        bad = ~np.isfinite(values)
-        if bad.any():
-            raise RejectedInputError(
-                "nan_state",
-                "Dataset holds values that are not finite",
-                where=f"{self._path}, {key}",
-                expected="finite numbers",
-                got=f"{int(bad.sum())} that are not",
-                evidence={"track": key, "first_frame": int(np.argwhere(bad)[0][0]), "values": int(bad.sum())},
-            )
+        check_finite(key, values, self._path)
         return values
 
     def times_ns(self, key: str, length: int) -> np.ndarray:
@@ -232,12 +231,8 @@ class Hdf5File:
     def _rejected(self, reason: Any, what: str, key: str, expected: object, got: object) -> RejectedInputError:
         return RejectedInputError(reason, what, where=f"{self._path}, {key}", expected=expected, got=got)
 
-    @contextmanager
-    def _reading(self, key: str) -> Iterator[None]:
-        try:
-            yield
-        except _DAMAGED as error:
-            raise self._rejected("unreadable", "Dataset cannot be read", key, "an intact file", str(error)) from error
+    def _reading(self, key: str) -> AbstractContextManager[None]:
+        return unreadable("Dataset cannot be read", f"{self._path}, {key}", _DAMAGED)
 
 
 @contextmanager
@@ -248,17 +243,8 @@ def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
     """
     h5py = require_h5py()
     local = regular_file(path)
-    try:
+    with unreadable("HDF5 file cannot be opened", path, _DAMAGED):
         handle = h5py.File(local, "r", locking=False)
-    except _DAMAGED as error:
-        raise RejectedInputError(
-            "unreadable",
-            "HDF5 file cannot be opened",
-            where=str(path),
-            expected="a complete HDF5 file",
-            got=str(error),
-            next_step="copy the file again; it may be truncated",
-        ) from error
     with handle:
         yield Hdf5File(path, local, handle)
 

@@ -7,7 +7,7 @@ import struct
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size
+from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -27,14 +27,12 @@ def image_size(content: bytes, where: object) -> tuple[int, int]:
 
     Raises: RejectedInputError: unreadable for another format or a header that breaks off.
     """
-    try:
+    with unreadable("Image header breaks off", where, (struct.error, IndexError)):
         if content.startswith(_PNG) and content[12:16] == b"IHDR":
             width, height = struct.unpack(">II", content[16:24])
             return height, width
         if content.startswith(_JPEG):
             return _jpeg_size(content)
-    except (struct.error, IndexError) as error:
-        raise RejectedInputError("unreadable", "Image header breaks off", where=where, got=str(error)) from error
     raise RejectedInputError(
         "unreadable",
         "Image is of no known format",
@@ -81,10 +79,8 @@ def decode_image(content: bytes, where: object, *, channels: str = "rgb") -> np.
             expected="the end mark of its format",
             got=f"{len(content)} bytes that end with {content[-8:].hex()}",
         )
-    try:
+    with unreadable("Image cannot be decoded", where, (cv2.error,)):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise RejectedInputError("unreadable", "Image cannot be decoded", where=where, got=str(error)) from error
     if image is None or image.shape[:2] not in ((height, width), (width, height)):  # EXIF may turn a JPEG
         raise RejectedInputError(
             "unreadable",
@@ -102,8 +98,6 @@ def read_image(path: AnyPath) -> np.ndarray:
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
     """
     file = regular_file(path, "Image", max_bytes=_MAX_FILE_BYTES)
-    try:
+    with unreadable("Image cannot be read", path, (OSError,)):
         content = file.read_bytes()
-    except OSError as error:
-        raise RejectedInputError("unreadable", "Image cannot be read", where=str(path), got=str(error)) from error
-    return decode_image(content, str(path))
+    return decode_image(content, path)

@@ -26,6 +26,7 @@ from worldline_core.data.guards.rejection import (
     MAX_TEXT_BYTES,
     RejectedInputError,
     too_large,
+    unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
@@ -44,18 +45,9 @@ def parse_json(text: str | bytes, where: object) -> Any:
 
     Raises: RejectedInputError (unreadable).
     """
-    try:
+    # ValueError: of the decoder, of UTF-8, of a key given twice, of a number with too many digits.
+    with unreadable("File is not valid JSON", where, (ValueError, RecursionError)):
         return json.loads(text, object_pairs_hook=_without_repetition)
-    except RecursionError as error:
-        raise RejectedInputError(
-            "unreadable",
-            "JSON is nested too deeply",
-            where=str(where),
-            expected="some levels",
-            got="more than Python's recursion limit",
-        ) from error
-    except ValueError as error:  # of the decoder, of UTF-8, of a key given twice, of a number with too many digits
-        raise RejectedInputError("unreadable", "File is not valid JSON", where=str(where), got=str(error)) from error
 
 
 def read_json_lines(path: AnyPath) -> Iterator[Any]:
@@ -74,12 +66,8 @@ def read_text(path: AnyPath, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str =
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8).
     """
     file = regular_file(path, "Text file", max_bytes=max_bytes)
-    try:
+    with unreadable("File cannot be read as text", path, (OSError, UnicodeDecodeError)):
         return file.read_text(encoding=encoding)
-    except (OSError, UnicodeDecodeError) as error:
-        raise RejectedInputError(
-            "unreadable", "File cannot be read as text", where=str(path), got=str(error)
-        ) from error
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -103,7 +91,7 @@ def well_formed(where: object, layout: str) -> Iterator[None]:
         raise RejectedInputError(
             "unreadable",
             "Content has another shape than its layout",
-            where=str(where),
+            where=where,
             expected=layout,
             got=f"{type(error).__name__}: {error}",
         ) from error
@@ -127,33 +115,31 @@ def validated[M: BaseModel](model: type[M], content: Any, where: object, what: s
         ) from error
 
 
+_NPY_FAULTS = (ValueError, TypeError, SyntaxError, EOFError, OSError, OverflowError, tokenize.TokenError)
+
+
 def read_npy(path: AnyPath) -> np.ndarray:
     """The array of a .npy file; never unpickles.
 
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, of objects, or cut off).
     """
     file = regular_file(path)
-    try:
+    with unreadable("Array cannot be read", path, _NPY_FAULTS), file.open("rb") as stream:
         size = file.stat().st_size
-        with file.open("rb") as stream:
-            version = npy.read_magic(stream)
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"format version {version}")
-            read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, fortran_order, dtype = read_header(stream)
-            if dtype.hasobject:
-                raise ValueError("an array of Python objects")
-            declared = math.prod(shape) * dtype.itemsize
-            if declared > MAX_ARRAY_BYTES:
-                raise too_large(
-                    "Array is too large", where=str(path), limit=MAX_ARRAY_BYTES, got=declared, unit="bytes"
-                )
-            if declared != size - stream.tell():
-                raise ValueError(f"{size - stream.tell()} bytes of data where the header declares {declared}")
-            values = np.frombuffer(stream.read(declared), dtype=dtype)
-            return values.reshape(shape, order="F" if fortran_order else "C").copy()
-    except (ValueError, TypeError, SyntaxError, EOFError, OSError, OverflowError, tokenize.TokenError) as error:
-        raise RejectedInputError("unreadable", "Array cannot be read", where=str(path), got=str(error)) from error
+        version = npy.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"format version {version}")
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, fortran_order, dtype = read_header(stream)
+        if dtype.hasobject:
+            raise ValueError("an array of Python objects")
+        declared = math.prod(shape) * dtype.itemsize
+        if declared > MAX_ARRAY_BYTES:
+            raise too_large("Array is too large", where=path, limit=MAX_ARRAY_BYTES, got=declared, unit="bytes")
+        if declared != size - stream.tell():
+            raise ValueError(f"{size - stream.tell()} bytes of data where the header declares {declared}")
+        values = np.frombuffer(stream.read(declared), dtype=dtype)
+        return values.reshape(shape, order="F" if fortran_order else "C").copy()
 
 
 # A dictionary of long texts unpacks to far more than the footer says. No text is longer than its column chunk, so tables
@@ -170,26 +156,21 @@ def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
     Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), too_large, unreadable.
     """
     local = regular_file(path)
-    try:
-        # No memory map: where somebody shortens the file meanwhile, a map ends in a signal instead of an error.
-        with pq.ParquetFile(local, memory_map=False) as file:
-            names = file.schema_arrow.names
-            missing = [column for column in columns or () if column not in names]
-            if missing:
-                raise RejectedInputError(
-                    "missing_column",
-                    "Parquet file lacks a column",
-                    where=str(path),
-                    expected=", ".join(missing),
-                    got="columns " + ", ".join(names),
-                )
-            wanted = None if columns is None else list(columns)
-            _check_size(file, wanted, path)
-            return _read(file, wanted, path)
-    except _FAULTS as error:
-        raise RejectedInputError(
-            "unreadable", "Parquet file cannot be read", where=str(path), got=str(error)
-        ) from error
+    # No memory map: where somebody shortens the file meanwhile, a map ends in a signal instead of an error.
+    with unreadable("Parquet file cannot be read", path, _FAULTS), pq.ParquetFile(local, memory_map=False) as file:
+        names = file.schema_arrow.names
+        missing = [column for column in columns or () if column not in names]
+        if missing:
+            raise RejectedInputError(
+                "missing_column",
+                "Parquet file lacks a column",
+                where=path,
+                expected=", ".join(missing),
+                got="columns " + ", ".join(names),
+            )
+        wanted = None if columns is None else list(columns)
+        _check_size(file, wanted, path)
+        return _read(file, wanted, path)
 
 
 def column_names(path: AnyPath) -> list[str]:
@@ -198,24 +179,18 @@ def column_names(path: AnyPath) -> list[str]:
     Raises: RejectedInputError: missing_file, special_file, unreadable.
     """
     local = regular_file(path)
-    try:
+    with unreadable("Parquet file cannot be read", path, _FAULTS):
         return list(pq.read_schema(local, memory_map=False).names)
-    except _FAULTS as error:
-        raise RejectedInputError(
-            "unreadable", "Parquet file cannot be read", where=str(path), got=str(error)
-        ) from error
 
 
 def _check_size(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> None:
     """By the footer: 8 bytes per value, which is what Arrow takes for numbers."""
     footer = file.metadata
     if footer.num_rows > MAX_ROWS:
-        raise too_large("Table has too many rows", where=str(path), limit=MAX_ROWS, got=footer.num_rows, unit="rows")
+        raise too_large("Table has too many rows", where=path, limit=MAX_ROWS, got=footer.num_rows, unit="rows")
     values = sum(max(count, 0) for count, _ in _chunks(file, columns))
     if 8 * values > MAX_TABLE_BYTES:
-        raise too_large(
-            "Table has too many values", where=str(path), limit=MAX_TABLE_BYTES, got=8 * values, unit="bytes"
-        )
+        raise too_large("Table has too many values", where=path, limit=MAX_TABLE_BYTES, got=8 * values, unit="bytes")
 
 
 def _chunks(file: pq.ParquetFile, columns: list[str] | None) -> Iterator[tuple[int, int]]:
@@ -239,7 +214,7 @@ def _read(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> pa.
     for batch in file.iter_batches(rows, columns=columns, use_threads=False):
         total += batch.nbytes
         if total > MAX_TABLE_BYTES:
-            raise too_large("Table is too large", where=str(path), limit=MAX_TABLE_BYTES, got=total, unit="bytes")
+            raise too_large("Table is too large", where=path, limit=MAX_TABLE_BYTES, got=total, unit="bytes")
         batches.append(batch)
     schema = file.schema_arrow
     if columns is not None:

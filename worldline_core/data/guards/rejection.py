@@ -6,9 +6,12 @@ with these limits before they decode or allocate; none of them stands in the way
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from worldline_core.errors import DataError
 
@@ -90,6 +93,20 @@ class RejectedInputError(DataError):
         return partial(RejectedInputError, self.reason, self.what, **shown), ()
 
 
+@contextmanager
+def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Around reading: what a library raises for a damaged file becomes a rejection.
+
+    Raises: RejectedInputError (unreadable).
+    """
+    try:
+        yield
+    except faults as error:
+        raise RejectedInputError(
+            "unreadable", what, where=where, got=str(error), next_step="copy the file again; it may be damaged"
+        ) from error
+
+
 def too_large(what: str, *, where: object, limit: int, got: int, unit: str) -> RejectedInputError:
     """The rejection of something that declares more than a limit."""
     return RejectedInputError(
@@ -116,6 +133,21 @@ def check_shape(what: str, where: object, found: Sequence[int], wanted: Sequence
             expected=tuple("N" if want is None else want for want in wanted),
             got=tuple(found),
             evidence={"shape": list(found)},
+        )
+
+
+def check_finite(name: str, values: np.ndarray, where: object) -> None:
+    """Raises: RejectedInputError (nan_state) naming the first frame where (N, ...) numbers are not finite."""
+    bad = ~np.isfinite(values)
+    if bad.any():
+        frame, count = int(np.argwhere(bad)[0][0]), int(bad.sum())
+        raise RejectedInputError(
+            "nan_state",
+            f"{name} is not finite",
+            where=f"{where}, frame {frame}",
+            expected="finite numbers",
+            got=f"{count} values that are not",
+            evidence={"track": name, "first_frame": frame, "values": count},
         )
 
 

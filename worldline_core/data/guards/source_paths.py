@@ -1,14 +1,10 @@
 """Paths of recordings: on this machine or in an object store, and, where a dataset's own metadata names them, not to be
 trusted.
 
-Readers keep the paths they are given (messages name those) and open `local_file(path)`, at the moment of reading: the
-copy of a remote file stays only while there is room.
-
-Whether the files of a recording stayed what they were while it was read.
-
-A recording that is written, replaced or cut while it is read would come out half old and half new. Every reader opens its
-files through `source_paths.local_file`, which notes them here; when the episode is done their size, time of change
-and identity are compared with what they were when this process first opened them.
+Readers keep the paths they are given (messages name those) and open `local_file(path)`, at the moment of reading: the copy
+of a remote file stays only while there is room. A recording that is written, replaced or cut while it is read would come
+out half old and half new. So each file that is opened is noted, and when the episode is done its size, time of change and
+identity are compared with what they were when this process first opened it (`unchanged_files`).
 """
 
 from __future__ import annotations
@@ -134,7 +130,7 @@ _FILE_KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-_FIELD = re.compile(r"\{(video_key|chunk_index|file_index|episode_chunk|episode_index)(?::0?(\d{1,2})d)?\}")
+_FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
 
@@ -153,7 +149,7 @@ def inside[P: AnyPath](root: P, relative: str) -> P:
         raise RejectedInputError(
             "path_traversal",
             "Path leads outside of the dataset folder",
-            where=str(root),
+            where=root,
             expected="a path below the dataset folder",
             got=relative,
             next_step="repair the dataset's metadata, or copy linked files into the folder",
@@ -186,7 +182,7 @@ def local_file(path: AnyPath) -> Path:
     try:
         return process_cache().fetch(path)
     except (FileNotFoundError, IsADirectoryError) as error:
-        raise RejectedInputError("missing_file", "File is missing", where=str(path)) from error
+        raise RejectedInputError("missing_file", "File is missing", where=path) from error
     except PermissionError as error:
         raise _not_allowed(path) from error
 
@@ -204,7 +200,7 @@ def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = N
         raise RejectedInputError(
             "missing_file",
             f"{what} is missing",
-            where=str(path),
+            where=path,
             got=None if isinstance(error, FileNotFoundError) else str(error),
             next_step="restore the file or drop the episode",
         ) from error
@@ -212,12 +208,12 @@ def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = N
         raise RejectedInputError(
             "special_file",
             f"{what} is no regular file",
-            where=str(path),
+            where=path,
             expected="a regular file",
             got=_FILE_KINDS.get(stat.S_IFMT(found.st_mode), "something else"),
         )
     if max_bytes is not None and found.st_size > max_bytes:
-        raise too_large(f"{what} is too large", where=str(path), limit=max_bytes, got=found.st_size, unit="bytes")
+        raise too_large(f"{what} is too large", where=path, limit=max_bytes, got=found.st_size, unit="bytes")
     return local
 
 
@@ -248,7 +244,7 @@ def _remote_kind(path: AnyPath) -> str | None:
 
 def _not_allowed(path: AnyPath) -> RejectedInputError:
     return RejectedInputError(
-        "unreadable", "File may not be read", where=str(path), next_step="check the rights of the account"
+        "unreadable", "File may not be read", where=path, next_step="check the rights of the account"
     )
 
 
@@ -292,17 +288,9 @@ def fill_template(template: str, **values: int | str) -> str:
     Raises: DataError for any other brace expression.
     """
 
-    def substitute(match: re.Match[str]) -> str:
-        name, width = match.group(1), match.group(2)
-        if name not in values:
-            raise RejectedInputError(
-                "path_traversal",
-                "Path template asks for an unknown value",
-                where=template,
-                expected=", ".join(values),
-                got=name,
-            )
-        return str(values[name]).zfill(int(width)) if width else str(values[name])
+    def substitute(field: re.Match[str]) -> str:
+        name, width = field.groups()
+        return str(values[name]).zfill(int(width or 0)) if name in values else field[0]
 
     filled = _FIELD.sub(substitute, template)
     if "{" in filled or "}" in filled:
@@ -310,7 +298,7 @@ def fill_template(template: str, **values: int | str) -> str:
             "path_traversal",
             "Path template is not understood",
             where=template,
-            expected=_FIELD.pattern,
+            expected="no other fields than " + ", ".join(values),
             got=filled,
         )
     return filled
@@ -328,8 +316,6 @@ def safe_name(name: str, what: str) -> str:
     """
     if not _SAFE_NAME.fullmatch(name):
         raise DataError(
-            f"{what} cannot be a file name",
-            expected="letters, digits and . _ + = - (not leading)",
-            got=repr(name),
+            f"{what} cannot be a file name", expected="letters, digits and . _ + = - (not leading)", got=repr(name)
         )
     return name

@@ -20,7 +20,7 @@ from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import AnyPath, local_file
-from worldline_core.data.video.header import check_video_header
+from worldline_core.data.video.header import check_video_header, undecodable
 
 _LUMA_FIRST = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
@@ -104,10 +104,6 @@ class Picture:
         """Whether the decoder had to make up parts of it."""
         return bool(self._frame.is_corrupt)
 
-    def seconds(self, time_base: Fraction) -> float | None:
-        """Presentation time."""
-        return None if self._frame.pts is None else float(self._frame.pts * time_base)
-
 
 @contextmanager
 def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -129,11 +125,7 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
         ) as container:
             if not container.streams.video:
                 raise RejectedInputError(
-                    "unreadable",
-                    "File holds no video stream",
-                    where=str(path),
-                    expected="one video stream",
-                    got="none",
+                    "unreadable", "File holds no video stream", where=path, expected="one video stream", got="none"
                 )
             stream = container.streams.video[0]
             if stream.codec_context is None:  # the type stubs know no such stream
@@ -144,18 +136,6 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
             yield container, stream
     except av.error.FFmpegError as error:
         raise undecodable(path, error) from error
-
-
-def undecodable(path: AnyPath, error: object) -> RejectedInputError:
-    """The rejection of a video that breaks off."""
-    return RejectedInputError(
-        "truncated_video",
-        "Video cannot be decoded",
-        where=str(path),
-        expected="a complete video file",
-        got=str(error),
-        next_step="copy the file again; it may be truncated",
-    )
 
 
 def video_size(path: AnyPath) -> tuple[int, int, float]:
@@ -186,7 +166,7 @@ def frame_times(path: AnyPath) -> np.ndarray:
         raise RejectedInputError(
             "unreadable",
             "Frames of the video have no time",
-            where=str(path),
+            where=path,
             expected=f"{len(ticks)} frames with a time",
             got=f"{len(timed)}",
         )
@@ -292,7 +272,7 @@ def wrong_count(path: AnyPath, expected: int | None, got: int, cause: str | None
     return RejectedInputError(
         "truncated_video" if too_few else "length_mismatch",
         "Video is truncated or undecodable" if too_few else "Video has too many frames",
-        where=str(path),
+        where=path,
         expected="at least 1 frame" if expected is None else f"{expected} frames",
         got=f"{got} frames" + (f" ({cause})" if cause else ""),
         next_step="copy the file again, or leave the episode in quarantine",

@@ -9,6 +9,7 @@ frame, and presentation order equals file order: clips can be joined without enc
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -67,7 +68,6 @@ _RGB_TO_YUV = np.array(
     [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]], dtype=np.float32
 ) / np.float32(255.0)
 _YUV_OFFSET = (16.0, 128.0, 128.0)
-KEY_FRAME_INTERVAL = 250
 BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
 """How an mp4 is opened for writing, so that its bytes hold no times and no versions."""
 X264_PARAMETERS = "cpu-independent=1"
@@ -81,7 +81,7 @@ def frame_rate(fps: float) -> Fraction:
     Raises: DataError when fps is not a positive number.
     """
     if not np.isfinite(fps) or fps <= 0:
-        raise DataError("Frame rate must be a positive number", expected="fps > 0", got=str(fps))
+        raise DataError("Frame rate must be a positive number", expected="fps > 0", got=fps)
     return Fraction(fps).limit_denominator(1001)
 
 
@@ -101,33 +101,37 @@ def _planar(frame: np.ndarray, pixel_format: PixelFormat) -> np.ndarray:
     return flat.reshape(height * 3 // 2, width)
 
 
+@dataclass(frozen=True)
+class Encoding:
+    """How pictures become H.264.
+
+    Attributes:
+        crf: quality, 0 (exact up to the colour conversion) .. 51; 18 is visually exact, 28 small.
+        key_frame_interval: frames from one key frame to the next at most.
+    """
+
+    crf: int = 18
+    preset: str = "slow"
+    pixel_format: PixelFormat = "yuv420p"
+    key_frame_interval: int = 250
+
+
 class VideoEncoder:
     """Writes an H.264 mp4 picture by picture; use as a context manager. Its bytes depend on the arguments alone.
 
     Args:
         size: (height, width); both even for yuv420p.
-        crf: quality, 0 (exact up to the colour conversion) .. 51.
-        key_frame_interval: frames from one key frame to the next at most.
 
     Raises: DataError for a size or rate that cannot be encoded.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        size: tuple[int, int],
-        fps: float,
-        *,
-        crf: int = 18,
-        preset: str = "slow",
-        pixel_format: PixelFormat = "yuv420p",
-        key_frame_interval: int = KEY_FRAME_INTERVAL,
-    ) -> None:
+    def __init__(self, path: Path, size: tuple[int, int], fps: float, encoding: Encoding) -> None:
         height, width = size
+        pixel_format = encoding.pixel_format
         if pixel_format == "yuv420p" and (height % 2 or width % 2):
             raise DataError(
                 "yuv420p needs even image sides",
-                where=str(path),
+                where=path,
                 expected="even height and width",
                 got=f"{height}x{width}",
                 next_step="choose another image size, or pixel_format yuv444p",
@@ -145,10 +149,10 @@ class VideoEncoder:
         context.time_base = 1 / self._rate
         context.flags |= int(Flags.bitexact)
         stream.options = {
-            "crf": str(crf),
-            "preset": preset,
+            "crf": str(encoding.crf),
+            "preset": encoding.preset,
             "bf": "0",
-            "g": str(key_frame_interval),
+            "g": str(encoding.key_frame_interval),
             "threads": "1",
             "x264-params": X264_PARAMETERS,
             "colorspace": "smpte170m",
@@ -209,12 +213,12 @@ def encode_video(
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or frames.shape[0] == 0:
         raise DataError(
             "Cannot encode these frames as video",
-            where=str(path),
+            where=path,
             expected="uint8 (N > 0, H, W, 3)",
             got=f"{frames.dtype} {frames.shape}",
         )
     size = frames.shape[1], frames.shape[2]
-    with VideoEncoder(path, size, fps, crf=crf, preset=preset, pixel_format=pixel_format) as encoder:
+    with VideoEncoder(path, size, fps, Encoding(crf, preset, pixel_format)) as encoder:
         for frame in frames:
             encoder.add(frame)
 
@@ -250,7 +254,7 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
             if count != expected:
                 raise DataError(
                     "Video part has another length than its episode",
-                    where=str(part),
+                    where=part,
                     expected=f"{expected} frames",
                     got=f"{count} frames",
                 )

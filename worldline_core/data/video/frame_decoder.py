@@ -11,7 +11,7 @@ import importlib.metadata
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import av
 import av.error
 import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import AnyPath, local_file
-from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, undecodable, wrong_count
-from worldline_core.data.video.header import check_video_header
+from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, wrong_count
+from worldline_core.data.video.header import check_video_header, undecodable
 from worldline_core.errors import DataError, UnavailableError
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ DecoderChoice = Literal["auto", "torchcodec", "pyav"]
 _CHUNK_BYTES = 8 << 20
 """torchcodec's frames are fetched in chunks of this size, so that the allocator hands out the same warm memory again: for
 whole clips of 480 x 640 the page faults of fresh memory cost about a third of the decoding."""
+_NOT_IN_PLACE = "a frame is not where it should be"
 FFMPEG_ADVICE = "install FFmpeg's libraries (apt-get install ffmpeg), or take decoder pyav, which carries its own"
 
 
@@ -48,9 +51,8 @@ class FrameDecoder(Protocol):
 
         A picture is valid until the next one is asked for.
 
-        Raises:
-            RejectedInputError: missing_file; unreadable, truncated_video when a frame is not there.
-            DataError: the indices are not increasing, or lie outside of the clip.
+        Raises: RejectedInputError: missing_file; unreadable, truncated_video when a frame is not there. DataError when the
+            indices are not increasing, or lie outside of the clip.
         """
         ...
 
@@ -65,8 +67,7 @@ def open_decoder(choice: DecoderChoice = "auto", *, open_files: int = 16) -> Fra
     Args:
         open_files: how many files stay open at most.
 
-    Raises:
-        UnavailableError: torchcodec was asked for and cannot be loaded.
+    Raises: UnavailableError when torchcodec was asked for and cannot be loaded.
     """
     if choice == "pyav":
         return PyavDecoder(open_files=open_files)
@@ -109,8 +110,7 @@ def torchcodec_name() -> str:
 def _frame_times(clip: VideoClip, indices: Sequence[int]) -> list[float]:
     """Presentation times [s] of a clip's frames.
 
-    Raises:
-        DataError: the indices are not increasing, or lie outside of the clip.
+    Raises: DataError when the indices are not increasing, or lie outside of the clip.
     """
     if not indices or any(b <= a for a, b in pairwise(indices)):
         raise DataError("Frames are read in order", where=clip.path, expected="increasing indices", got=list(indices))
@@ -124,54 +124,47 @@ def _frame_times(clip: VideoClip, indices: Sequence[int]) -> list[float]:
     return [clip.start_time + index / clip.fps for index in indices]
 
 
-def _lost_frame(clip: VideoClip, wanted: int, found: int) -> RejectedInputError:
-    return wrong_count(clip.path, wanted, found, "a frame is not where it should be")
-
-
 class _OpenFiles[F]:
     """A bounded number of open files by path; the least recently used one is closed first.
 
     Args:
         limit: how many stay open at most.
-        close: what closes one.
+        open_file: opens the file of a clip.
     """
 
-    def __init__(self, limit: int, close: Callable[[F], object]) -> None:
+    def __init__(self, limit: int, open_file: Callable[[AnyPath], AbstractContextManager[F]]) -> None:
         self._limit = limit
-        self._close = close
-        self._open: OrderedDict[str, F] = OrderedDict()
+        self._open_file = open_file
+        self._open: OrderedDict[str, tuple[F, ExitStack]] = OrderedDict()
 
-    def get(self, clip: VideoClip, open_file: Callable[[VideoClip], F]) -> F:
-        """The clip's file, opened by `open_file` unless it still is."""
-        key = str(clip.path)
-        if key not in self._open:
-            self._open[key] = open_file(clip)
+    def get(self, path: AnyPath) -> F:
+        """The file, opened unless it still is."""
+        if str(path) not in self._open:
+            with ExitStack() as stack:
+                file = stack.enter_context(self._open_file(path))
+                self._open[str(path)] = file, stack.pop_all()
             while len(self._open) > self._limit:
-                self._close(self._open.popitem(last=False)[1])
-        self._open.move_to_end(key)
-        return self._open[key]
+                self.drop(next(iter(self._open)))
+        self._open.move_to_end(str(path))
+        return self._open[str(path)][0]
 
-    def drop(self, clip: VideoClip) -> None:
-        """Close a file that failed: it is opened afresh next time."""
-        file = self._open.pop(str(clip.path), None)
-        if file is not None:
-            self._close(file)
+    def drop(self, path: object) -> None:
+        """Close a file, where it is open: it is opened afresh next time."""
+        if str(path) in self._open:
+            self._open.pop(str(path))[1].close()
 
     def clear(self) -> None:
         """Close all files."""
-        while self._open:
-            self._close(self._open.popitem()[1])
+        for path in list(self._open):
+            self.drop(path)
 
 
-class _PyavFile:
-    def __init__(self, clip: VideoClip) -> None:
-        self._stack = ExitStack()
-        self.container, self.stream = self._stack.enter_context(open_video(clip.path))
+@contextmanager
+def _in_one_thread(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
+    with open_video(path) as (container, stream):
         # dav1d starts threads of its own unless told otherwise: processes are parallel already.
-        self.stream.codec_context.thread_count = 1
-
-    def close(self) -> None:
-        self._stack.close()
+        stream.codec_context.thread_count = 1
+        yield container, stream
 
 
 class PyavDecoder:
@@ -180,14 +173,13 @@ class PyavDecoder:
     name = f"PyAV {importlib.metadata.version('av')}"
 
     def __init__(self, *, open_files: int = 16) -> None:
-        self._files: _OpenFiles[_PyavFile] = _OpenFiles(open_files, _PyavFile.close)
+        self._files = _OpenFiles(open_files, _in_one_thread)
 
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
         times = _frame_times(clip, indices)
         found = 0
         try:
-            file = self._files.get(clip, _PyavFile)
-            for frame in seek_before(file.container, file.stream, times[0]):
+            for frame in seek_before(*self._files.get(clip.path), times[0]):
                 if frame.time is None or frame.pts is None:
                     continue
                 late = (float(frame.time) - times[found]) * clip.fps
@@ -200,10 +192,10 @@ class PyavDecoder:
                 if found == len(times):
                     return
         except av.error.FFmpegError as error:
-            self._files.drop(clip)
+            self._files.drop(clip.path)
             raise wrong_count(clip.path, len(times), found, str(error)) from error
-        self._files.drop(clip)
-        raise _lost_frame(clip, len(times), found)
+        self._files.drop(clip.path)
+        raise wrong_count(clip.path, len(times), found, _NOT_IN_PLACE)
 
     def close(self) -> None:
         self._files.clear()
@@ -220,21 +212,21 @@ class TorchcodecDecoder:
 
     def __init__(self, *, open_files: int = 16) -> None:
         self.name = torchcodec_name()
-        self._files: _OpenFiles[VideoDecoder] = _OpenFiles(open_files, lambda _: None)
+        self._files = _OpenFiles(open_files, self._opened)
         self.exact_files: set[str] = set()
 
     def frames(self, clip: VideoClip, indices: Sequence[int]) -> Iterator[np.ndarray]:
         times = _frame_times(clip, indices)
         done = 0
         while done < len(times):
-            decoder = self._files.get(clip, self._opened)
+            decoder = self._files.get(clip.path)
             frame_bytes = 3 * (decoder.metadata.width or 0) * (decoder.metadata.height or 0)
             wanted = times[done : done + max(1, _CHUNK_BYTES // max(1, frame_bytes))]
             pictures = _frames_at(decoder, clip, wanted)
             if pictures is None:
-                self._files.drop(clip)
+                self._files.drop(clip.path)
                 if str(clip.path) in self.exact_files:
-                    raise _lost_frame(clip, len(times), done)
+                    raise wrong_count(clip.path, len(times), done, _NOT_IN_PLACE)
                 self.exact_files.add(str(clip.path))
                 continue
             yield from pictures
@@ -243,22 +235,23 @@ class TorchcodecDecoder:
     def close(self) -> None:
         self._files.clear()
 
-    def _opened(self, clip: VideoClip) -> VideoDecoder:
+    @contextmanager
+    def _opened(self, path: AnyPath) -> Iterator[VideoDecoder]:
         from torchcodec.decoders import VideoDecoder
 
-        file = check_video_header(local_file(clip.path))
+        file = check_video_header(local_file(path))
         try:
             decoder = VideoDecoder(
                 str(file),
                 dimension_order="NHWC",
                 num_ffmpeg_threads=1,
-                seek_mode="exact" if str(clip.path) in self.exact_files else "approximate",
+                seek_mode="exact" if str(path) in self.exact_files else "approximate",
                 device="cpu",
             )
         except (RuntimeError, ValueError) as error:
-            raise undecodable(clip.path, str(error).splitlines()[0]) from error
-        check_image_size(decoder.metadata.width or 0, decoder.metadata.height or 0, str(clip.path))
-        return decoder
+            raise undecodable(path, str(error).splitlines()[0]) from error
+        check_image_size(decoder.metadata.width or 0, decoder.metadata.height or 0, path)
+        yield decoder
 
 
 def _frames_at(decoder: VideoDecoder, clip: VideoClip, times: list[float]) -> np.ndarray | None:

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
@@ -37,15 +37,7 @@ def check_video_header(path: AnyPath) -> Path:
             size = file.stat().st_size
             head = stream.read(12)
             if size == 0:
-                raise RejectedInputError(
-                    "truncated_video",
-                    "Video file is empty",
-                    where=str(path),
-                    expected="a complete video file",
-                    got="0 bytes",
-                    next_step="copy the file again; it may be truncated",
-                    evidence={"bytes": 0},
-                )
+                raise undecodable(path, "0 bytes")
             if head[4:8] in _QUICKTIME:
                 walk = _Walk(path, size)
                 for kind, start, stop in _boxes(stream, 0, size, walk):
@@ -54,20 +46,25 @@ def check_video_header(path: AnyPath) -> Path:
                 raise RejectedInputError(
                     "unreadable",
                     "File is no video container",
-                    where=str(path),
+                    where=path,
                     expected="mp4, QuickTime, Matroska, WebM or AVI",
                     got=f"{size} bytes that begin with {head.hex()}",
                 )
     except (struct.error, OSError) as error:
-        raise RejectedInputError(
-            "truncated_video",
-            "Video header breaks off",
-            where=str(path),
-            expected="a complete video file",
-            got=str(error),
-            next_step="copy the file again; it may be truncated",
-        ) from error
+        raise undecodable(path, f"a header that breaks off: {error}") from error
     return file
+
+
+def undecodable(path: AnyPath, got: object) -> RejectedInputError:
+    """The rejection of a video that breaks off."""
+    return RejectedInputError(
+        "truncated_video",
+        "Video cannot be decoded",
+        where=path,
+        expected="a complete video file",
+        got=got,
+        next_step="copy the file again; it may be truncated",
+    )
 
 
 @dataclass
@@ -81,22 +78,9 @@ class _Walk:
 
     def count_samples(self, samples: int) -> None:
         self.samples += samples
-        if self.samples > MAX_FRAMES:
-            raise too_large(
-                "Video claims too many frames",
-                where=str(self.path),
-                limit=MAX_FRAMES,
-                got=self.samples,
-                unit="frames",
-            )
-        if self.samples > self.size:
-            raise too_large(
-                "Video claims more frames than it has bytes",
-                where=str(self.path),
-                limit=self.size,
-                got=self.samples,
-                unit="frames",
-            )
+        for limit, what in ((MAX_FRAMES, "too many frames"), (self.size, "more frames than it has bytes")):
+            if self.samples > limit:
+                raise too_large(f"Video claims {what}", where=self.path, limit=limit, got=self.samples, unit="frames")
 
 
 def _boxes(stream: BinaryIO, start: int, stop: int, walk: _Walk) -> Iterator[tuple[bytes, int, int]]:
@@ -105,9 +89,7 @@ def _boxes(stream: BinaryIO, start: int, stop: int, walk: _Walk) -> Iterator[tup
     while position + 8 <= stop:
         walk.boxes += 1
         if walk.boxes > _MAX_BOXES:
-            raise too_large(
-                "Video has too many boxes", where=str(walk.path), limit=_MAX_BOXES, got=walk.boxes, unit="boxes"
-            )
+            raise too_large("Video has too many boxes", where=walk.path, limit=_MAX_BOXES, got=walk.boxes, unit="boxes")
         stream.seek(position)
         length, kind = struct.unpack(">I4s", stream.read(8))
         content = position + 8
@@ -124,21 +106,20 @@ def _boxes(stream: BinaryIO, start: int, stop: int, walk: _Walk) -> Iterator[tup
 
 
 def _check_box(stream: BinaryIO, kind: bytes, start: int, stop: int, walk: _Walk) -> None:
+    def read(offset: int, layout: str) -> tuple[Any, ...]:
+        stream.seek(start + offset)
+        return struct.unpack(layout, stream.read(struct.calcsize(layout)))
+
     if kind == b"stsz" and stop - start >= 12:
-        stream.seek(start + 8)
-        walk.count_samples(struct.unpack(">I", stream.read(4))[0])
+        walk.count_samples(*read(8, ">I"))
     elif kind == b"trun" and stop - start >= 8:
-        stream.seek(start + 4)
-        walk.count_samples(struct.unpack(">I", stream.read(4))[0])
+        walk.count_samples(*read(4, ">I"))
     elif kind == b"elst" and stop - start >= 8:
-        stream.seek(start + 4)
-        edits = struct.unpack(">I", stream.read(4))[0]
+        (edits,) = read(4, ">I")
         if edits > _MAX_EDITS:
-            raise too_large("Video has too many edits", where=str(walk.path), limit=_MAX_EDITS, got=edits, unit="edits")
+            raise too_large("Video has too many edits", where=walk.path, limit=_MAX_EDITS, got=edits, unit="edits")
     elif kind == b"stsd" and stop - start >= 8 + 16 + 20:
-        stream.seek(start + 8)
-        _, codec = struct.unpack(">I4s", stream.read(8))
-        stream.seek(start + 8 + 32)
-        width, height = struct.unpack(">HH", stream.read(4))
+        _, codec = read(8, ">I4s")
+        width, height = read(8 + 32, ">HH")
         if codec in _VIDEO_CODECS:
-            check_image_size(width, height, str(walk.path))
+            check_image_size(width, height, walk.path)

@@ -8,7 +8,6 @@ for another one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.store.digest import digest_file
+from worldline_core.store.artifact_files import digest_file
 
 GRAY_WIDTH = 96
 SHARPNESS_PERIOD_S = 0.25
@@ -92,21 +91,6 @@ class ThumbnailMaker:
         return ViewThumbnails(np.stack(self._gray), sharpness[: len(self._gray)])
 
 
-def view_thumbnails(frames_rgb: Iterable[np.ndarray], fps: float = 30.0) -> ViewThumbnails:
-    """Of pictures that do not come from a video.
-
-    Args:
-        frames_rgb: uint8 (H, W, 3) each, RGB.
-        fps: their rate, from which follows how often sharpness is measured.
-
-    Raises: RejectedInputError when there are none, or they differ in shape.
-    """
-    maker = ThumbnailMaker(fps)
-    for frame in frames_rgb:
-        maker.add(cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2GRAY), full_range=True)
-    return maker.thumbnails()
-
-
 def shrunk(luma: np.ndarray) -> np.ndarray:
     """uint8 (H, W) at 96 pixels of width.
 
@@ -133,12 +117,11 @@ def _sharpness(luma: np.ndarray) -> float:
 
 _VERSION = "1"
 """Raised whenever thumbnails of the same video come out differently."""
-_SUFFIX = ".arrow"
 
 
 def cache_path(set_root: Path, video: Path) -> Path:
     """Where the thumbnails of one of the set's videos lie."""
-    return (set_root / "run" / "thumbnails" / video.relative_to(set_root)).with_suffix(_SUFFIX)
+    return (set_root / "run" / "thumbnails" / video.relative_to(set_root)).with_suffix(".arrow")
 
 
 def write_thumbnails(path: Path, video: Path, thumbnails: ViewThumbnails) -> None:
