@@ -32,7 +32,7 @@ Make = Callable[..., tuple]
 SIZE = (64, 96)
 
 
-def batch_array(number: int, name: str, *, num_frames: int = 40, scene_seed: int = 0, **changes: Any) -> tuple:
+def room(number: int, name: str, *, num_frames: int = 40, scene_seed: int = 0, **changes: Any) -> tuple:
     """An episode of two dots that follow its joints before a textured wall of its scene: (episode, frames)."""
     rng, time = np.random.default_rng(number), np.arange(num_frames) / 8
     state = np.stack([0.9 * np.sin(rng.uniform(0.5, 1.5) * time + rng.uniform(0, 6)) for _ in range(14)], 1)
