@@ -7,7 +7,6 @@ from worldline_core.evaluation.planning.selectors import (
     CandidateScore,
     CandidateVideo,
     Comparison,
-    ShownFrames,
     VLMSelector,
     planning_indices,
 )
@@ -15,7 +14,7 @@ from worldline_core.evaluation.planning.selectors import (
 
 def load(candidate: int) -> CandidateVideo:
     """The candidate's number is all that its video shows."""
-    return CandidateVideo("", ShownFrames({"head": np.full((1, 1, 1, 3), candidate, np.uint8)}), (0,), 8.0, 1)
+    return CandidateVideo({"head": np.full((1, 1, 1, 3), candidate, np.uint8)}, (0,), 8.0, 1)
 
 
 class PerfectSelector:
@@ -31,9 +30,9 @@ class PerfectSelector:
         return self.quality[int(candidate.frames["head"][0, 0, 0, 0])]
 
     def compare(self, instruction, candidates, select_count):
-        self.shown.append(tuple(int(c.frames["head"][0, 0, 0, 0]) for c in candidates))
-        ranked = sorted(candidates, key=self._of, reverse=True)
-        return Comparison(tuple(c.label for c in ranked[:select_count]))
+        self.shown.append(tuple(int(c.frames["head"][0, 0, 0, 0]) for c in candidates.values()))
+        ranked = sorted(candidates, key=lambda letter: self._of(candidates[letter]), reverse=True)
+        return Comparison(tuple(ranked[:select_count]))
 
     def score(self, instruction, candidate):
         return CandidateScore(50.0 if self.ties else float(self._of(candidate)))
@@ -78,15 +77,11 @@ def test_labels_are_letters_and_say_nothing_of_the_identity():
 
     class Spy(PerfectSelector):
         def compare(self, instruction, candidates, select_count):
-            labels.extend(c.label for c in candidates)
+            labels.extend(candidates)
             return super().compare(instruction, candidates, select_count)
 
-        def score(self, instruction, candidate):
-            labels.append(candidate.label)
-            return super().score(instruction, candidate)
-
     choose(Spy(np.arange(8)), "t", range(8), load, scene="s", seed=0)
-    assert labels == list("ABCD") * 2 + ["A"] * 4
+    assert labels == list("ABCD") * 2
 
 
 def test_answers_that_name_nobody_are_counted_and_filled_up():
@@ -130,14 +125,14 @@ class ScriptedModel:
 
 
 def test_vlm_selector_reads_labels_and_scores():
-    videos = [load(index) for index in range(4)]
+    videos = {letter: load(index) for index, letter in enumerate("ABCD")}
     model = ScriptedModel('Sure: {"selected_labels": ["b", "D"], "reason": "held"}')
-    assert VLMSelector(model).compare("lift it", videos, 2) == Comparison(("B", "D"), "held", True)
+    assert VLMSelector(model).compare("lift it", videos, 2) == Comparison(("B", "D"), True)
     assert "exactly 2 candidate" in model.parts[0][-1].text
     answer = VLMSelector(
         ScriptedModel('{"task_completed": true, "score": 85, "final_state": "up", "failure_reason": ""}')
     )
-    assert answer.score("lift it", videos[0]).score == 85.0
+    assert answer.score("lift it", videos["A"]).score == 85.0
 
 
 @pytest.mark.parametrize("text", ["no idea", '{"score": "85"}', '{"score": 850}', '{"score": true}'])

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import ConfigError, UnavailableError
-from worldline_core.evaluation.policy.judge import Trajectory
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-from worldline_core.evaluation.vlm.message import Image, Text
-from worldline_core.evaluation.vlm.openai_compatible import OpenAICompatibleModel
-from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.evaluation.vlm import Image, OpenAICompatibleModel, Text, VLMConfig, open_vlm
 
 
 class Server:
@@ -54,7 +52,7 @@ def _reply(text):
 
 
 def _model(server, **options):
-    return OpenAICompatibleModel(server.url, "some-model", timeout_s=5, backoff_s=0.01, **options)
+    return OpenAICompatibleModel(VLMConfig(url=server.url, model="some-model", timeout_s=5, **options), backoff_s=0.01)
 
 
 def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
@@ -95,7 +93,7 @@ def test_does_not_retry_a_refusal_or_a_malformed_reply(server):
 
 
 def test_nobody_there():
-    model = OpenAICompatibleModel("http://127.0.0.1:9/v1", "m", timeout_s=1, attempts=2, backoff_s=0.01)
+    model = OpenAICompatibleModel(VLMConfig(url="http://127.0.0.1:9/v1", timeout_s=1, attempts=2), backoff_s=0.01)
     with pytest.raises(UnavailableError, match="cannot be used"):
         model.answer([Text("?")])
 

@@ -16,13 +16,13 @@ from worldline_core.evaluation.policy.evidence import (
 )
 from worldline_core.evaluation.policy.judge import (
     Extracted,
-    Trajectory,
     first_pass_indices,
     judge_trajectory,
     motion_indices,
     verification_indices,
 )
-from worldline_core.evaluation.vlm.message import parse_answer
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.evaluation.vlm import parse_answer
 
 FACTS = (True, False, None)
 
@@ -170,7 +170,12 @@ def test_unsuccessful_state_change_goes_through_every_pass():
     judge = ScriptedJudge([_state(False, text="one"), _state(None, text="two")])
     result = judge_trajectory(judge, _trajectory("press the bell"))
     assert not result.success
-    assert [name for name, _ in result.statements] == ["first_pass", "verification", "reconciliation", "motion"]
+    assert [statement["pass"] for statement in result.statements] == [
+        "first_pass",
+        "verification",
+        "reconciliation",
+        "motion",
+    ]
     assert judge.asked[1:] == [("extract", 6, 480), ("reconcile", "two", "one", "two"), ("motion", 12, "two")]
 
 
@@ -191,10 +196,10 @@ def test_a_drop_that_was_seen_is_never_overturned():
 def test_single_view_skips_the_group_verification_and_grasp_skips_the_motion_check():
     judge = ScriptedJudge([_state(None)])
     result = judge_trajectory(judge, _trajectory("press the bell", views=("head",)))
-    assert [name for name, _ in result.statements] == ["first_pass", "reconciliation", "motion"]
+    assert [statement["pass"] for statement in result.statements] == ["first_pass", "reconciliation", "motion"]
     grasp = ScriptedJudge([Extracted(GraspEvidence()), Extracted(GraspEvidence())])
     result = judge_trajectory(grasp, _trajectory("grasp the cup"))
-    assert [name for name, _ in result.statements] == ["first_pass", "verification"]
+    assert [statement["pass"] for statement in result.statements] == ["first_pass", "verification"]
 
 
 def test_malformed_answers_are_counted_and_never_successful():

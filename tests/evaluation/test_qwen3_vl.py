@@ -13,11 +13,9 @@ from transformers import LogitsProcessor, LogitsProcessorList
 
 from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.policy.evidence import GraspEvidence, MotionEvidence, establishes_success
-from worldline_core.evaluation.policy.judge import Trajectory
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-from worldline_core.evaluation.vlm.message import MAX_NEW_TOKENS, Image, Text, Video
-from worldline_core.evaluation.vlm.qwen3_vl import Qwen3VLModel
-from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, Qwen3VLModel, Text, Video, VLMConfig, open_vlm
 
 SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>",
            "<|video_pad|>")  # fmt: skip

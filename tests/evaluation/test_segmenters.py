@@ -7,7 +7,6 @@ import torch
 
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.metrics import video_iou
-from worldline_core.evaluation.segmenters.augmentation import augment
 from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
@@ -15,6 +14,7 @@ from worldline_core.evaluation.segmenters.train_segmenter import (
     MaskBatch,
     MaskObjective,
     SegmenterConfig,
+    augment,
     train_segmenter,
 )
 from worldline_core.training import trainer

@@ -2,101 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.rollout.rollout_set import RolloutSet
 
 ROLLOUT_PREFIX = "rollouts."
 TRUE_METHOD = "true"
+HEAD = "head"
 
 
 @dataclass(frozen=True)
-class SeenVideo:
-    """One recorded or predicted video, as judges and selectors are given it.
+class Trajectory:
+    """One recorded or predicted video, as judges and selectors are given it; nothing in it tells the recorded outcome.
 
     Attributes:
         frames: by view, uint8 (n, h, w, 3); the views are synchronised.
-        num_frames: of the shortest view.
         points: (num_frames, arms, 2) projected tool centres in the head view [px], NaN where not valid; or None.
     """
 
+    instruction: str
     frames: Mapping[str, np.ndarray]
-    num_frames: int
-    points: np.ndarray | None
+    fps: float
+    points: np.ndarray | None = None
+
+    @property
+    def num_frames(self) -> int:
+        return min(len(frames) for frames in self.frames.values())
 
 
-@dataclass(frozen=True)
-class Recordings:
-    """An EpisodeSet looked up by episode_id."""
+def rows_of(episodes: EpisodeSet, episode_ids: Iterable[str]) -> list[EpisodeRow]:
+    """Rows of episodes that were predicted, in the order of their ids.
 
-    episodes: EpisodeSet
-    position: Mapping[str, int]
-
-    @classmethod
-    def open(cls, root: Path) -> Recordings:
-        """The recordings of an EpisodeSet's folder."""
-        episodes = EpisodeSet.open(root)
-        return cls(episodes, {row.episode_id: index for index, row in enumerate(episodes.rows)})
-
-    def episode(self, episode_id: str) -> Episode:
-        """Raises DataError for an episode that was predicted but is not in the set."""
-        if episode_id not in self.position:
-            raise DataError(
-                "A predicted episode is not in the EpisodeSet",
-                where=episode_id,
-                expected="rollouts and episodes of the same recordings",
-                next_step="give the EpisodeSet that the rollouts were made from",
-            )
-        return self.episodes.episode(self.position[episode_id])
-
-    def views(self, episode_id: str, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Those of ``wanted`` that were recorded; a robot with one arm has one wrist camera."""
-        recorded = self.episodes.rows[self.position[episode_id]].views
-        return tuple(view for view in wanted if view in recorded)
-
-    def frames(self, episode_id: str, view: str, num_frames: int | None = None) -> np.ndarray:
-        """uint8 (n, h, w, 3), the first ``num_frames`` frames.
-
-        Raises: DataError when fewer were recorded.
-        """
-        frames = self.episodes.frames(self.position[episode_id], view)
-        return _leading(frames, num_frames, f"recorded video of {episode_id}, view {view}")
-
-    def seen_video(
-        self,
-        episode_id: str,
-        wanted: Sequence[str],
-        *,
-        rollout: RolloutSet | None,
-        seed: int,
-        tracks: ActionTracks | None,
-    ) -> SeenVideo:
-        """The recorded video of an episode in the ``wanted`` views, or its prediction in ``rollout``."""
-        frames = {
-            view: self.frames(episode_id, view) if rollout is None else rollout.frames(episode_id, view, seed)
-            for view in self.views(episode_id, wanted)
-        }
-        count = min(len(video) for video in frames.values())
-        points = None if tracks is None else tool_points(tracks, episode_id, "head", count)
-        return SeenVideo(frames, count, points)
-
-    def robot_masks(self, episode_id: str, view: str, num_frames: int | None = None) -> np.ndarray | None:
-        """Exact bool masks (n, h, w) where the recording carries them, otherwise None."""
-        masks = self.episodes.robot_masks(self.position[episode_id], view)
-        return None if masks is None else _leading(masks, num_frames, f"robot masks of {episode_id}, view {view}")
+    Raises: DataError for an episode that is not in the set.
+    """
+    rows = {row.episode_id: row for row in episodes.rows}
+    wanted = sorted(episode_ids)
+    missing = [name for name in wanted if name not in rows]
+    if missing:
+        raise DataError(
+            "A predicted episode is not in the EpisodeSet",
+            where=missing[0],
+            expected="rollouts and episodes of the same recordings",
+            next_step="give the EpisodeSet that the rollouts were made from",
+        )
+    return [rows[name] for name in wanted]
 
 
-def _leading(values: np.ndarray, count: int | None, where: str) -> np.ndarray:
-    if count is None:
-        return values
+def leading(values: np.ndarray, count: int, where: str) -> np.ndarray:
+    """The first ``count`` recorded frames or masks.
+
+    Raises: DataError when fewer were recorded.
+    """
     if len(values) < count:
         raise DataError(
             "A prediction is longer than its recording", where=where, expected=f"<= {len(values)}", got=count
@@ -104,18 +69,39 @@ def _leading(values: np.ndarray, count: int | None, where: str) -> np.ndarray:
     return values[:count]
 
 
-def open_tracks(root: Path | None) -> ActionTracks | None:
-    """The ActionTracks of an optional input."""
-    return None if root is None else ActionTracks.open(root)
+def trajectory_of(
+    episodes: EpisodeSet,
+    row: EpisodeRow,
+    views: Sequence[str],
+    *,
+    rollout: RolloutSet | None,
+    seed: int,
+    tracks: ActionTracks | None,
+) -> Trajectory:
+    """The recorded video of an episode in those of ``views`` that it has, or its prediction in ``rollout``."""
+    position = episodes.position(row.episode_id)
+    frames = {
+        view: episodes.frames(position, view) if rollout is None else rollout.frames(row.episode_id, view, seed)
+        for view in views
+        if view in row.views
+    }
+    count = min(len(video) for video in frames.values())
+    points = None if tracks is None else tool_points(tracks, row.episode_id, count)
+    return Trajectory(row.instruction, frames, row.fps, points)
 
 
-def tool_points(tracks: ActionTracks, episode_id: str, view: str, num_frames: int) -> np.ndarray:
-    """Projected tool centres (n, arms, 2) [px of the recording's frame]; NaN where not valid."""
+def tool_points(tracks: ActionTracks, episode_id: str, num_frames: int) -> np.ndarray:
+    """Projected tool centres in the head view (n, arms, 2) [px of the recording's frame]; NaN where not valid."""
     track = tracks.tracks(episode_id)
-    column = VIEWS.index(view)
+    column = VIEWS.index(HEAD)
     points = np.array(track.uv[:num_frames, column], dtype=np.float64)
     points[~np.asarray(track.valid[:num_frames, column], dtype=bool)] = np.nan
     return points
+
+
+def open_tracks(inputs: Mapping[str, Path]) -> ActionTracks | None:
+    """The ActionTracks among a step's inputs; None where there are none."""
+    return ActionTracks.open(inputs["tracks"]) if "tracks" in inputs else None
 
 
 def open_rollouts(inputs: Mapping[str, Path]) -> dict[str, RolloutSet]:

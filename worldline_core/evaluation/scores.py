@@ -6,9 +6,11 @@ equally. Trajectories are what is resampled: their views, seeds and frames are n
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.errors import DataError
-from worldline_core.store.atomic import atomic_path
+from worldline_core.store.atomic import atomic_path, write_json_atomic
+
+SCORES_FILE = "scores.parquet"
+SUMMARY_FILE = "summary.json"
+_TYPES = {
+    **dict.fromkeys(("seed", "run", "budget", "frame", "count", "answers", "malformed_answers"), pa.int32()),
+    **dict.fromkeys(("value", "mean"), pa.float64()),
+}
+"""Columns of the tables that evaluations write; all others are strings."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +38,6 @@ class Interval:
     low: float
     high: float
     count: int
-
-    def as_json(self) -> dict[str, float | int]:
-        return {"mean": self.mean, "low": self.low, "high": self.high, "count": self.count}
 
 
 def bootstrap_mean(
@@ -66,12 +73,7 @@ def bootstrap_mean(
 
 
 def paired_difference(
-    first: Mapping[str, float],
-    second: Mapping[str, float],
-    *,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    first: Mapping[str, float], second: Mapping[str, float], *, resamples: int = 2000, seed: int = 0
 ) -> Interval | None:
     """``first - second`` over the trajectories that both have (keys are trajectory names); None without any.
 
@@ -80,12 +82,31 @@ def paired_difference(
     common = sorted(first.keys() & second.keys())
     if not common:
         return None
-    differences = [first[name] - second[name] for name in common]
-    return bootstrap_mean(differences, confidence=confidence, resamples=resamples, seed=seed)
+    return bootstrap_mean([first[name] - second[name] for name in common], resamples=resamples, seed=seed)
 
 
-SCORES_FILE = "scores.parquet"
-SUMMARY_FILE = "summary.json"
+def method_differences(
+    by_method: Mapping[str, Mapping[str, float]],
+    metric: str,
+    *,
+    comparisons: Sequence[tuple[str, str]] | None = None,
+    resamples: int,
+    seed: int,
+) -> list[dict[str, Any]]:
+    """Rows {"first", "second", "metric", mean, low, high, count} of paired differences of a metric.
+
+    Args:
+        by_method: the metric of each trajectory, by method.
+        comparisons: pairs (first, second), reported as first - second; None takes every pair of methods.
+    """
+    pairs = combinations(sorted(by_method), 2) if comparisons is None else comparisons
+    rows: list[dict[str, Any]] = []
+    for first, second in pairs:
+        if first in by_method and second in by_method:
+            found = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
+            if found is not None:
+                rows.append({"first": first, "second": second, "metric": metric, **asdict(found)})
+    return rows
 
 
 @dataclass(frozen=True, order=True)
@@ -104,33 +125,31 @@ class Score:
     task_family: str = ""
     outcome: str = ""
 
-
-_TYPES = {"seed": pa.int32(), "value": pa.float64()}
-SCORE_SCHEMA = pa.schema([(field.name, _TYPES.get(field.name, pa.string())) for field in fields(Score)])
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups that it is reported in: its split, and within it its embodiment and outcome."""
+        outcome = [f"{self.split}/{self.outcome}"] if self.outcome in ("success", "failure") else []
+        return self.split, f"{self.split}/{self.embodiment}", *outcome
 
 
 def write_scores(folder: Path, scores: Iterable[Score]) -> None:
     """Write ``scores.parquet``, sorted, so that equal scores give equal bytes."""
-    write_table(folder / SCORES_FILE, [asdict(score) for score in sorted(scores)], SCORE_SCHEMA)
+    rows = [asdict(score) for score in sorted(scores)]
+    write_table(folder / SCORES_FILE, rows, [field.name for field in fields(Score)])
 
 
-def read_scores(folder: Path) -> list[Score]:
-    """The scores of a finished Scores artifact."""
-    return [Score(**row) for row in pq.read_table(folder / SCORES_FILE).to_pylist()]
-
-
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as Parquet, whole or not at all."""
+    schema = pa.schema([(name, _TYPES.get(name, pa.string())) for name in columns])
     with atomic_path(path) as temporary:
         pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema), temporary)
 
 
-def group_names(score: Score) -> tuple[str, ...]:
-    """The groups a score is reported in: its split, and within it its embodiment and outcome."""
-    names = [score.split, f"{score.split}/{score.embodiment}"]
-    if score.outcome in ("success", "failure"):
-        names.append(f"{score.split}/{score.outcome}")
-    return tuple(names)
+def kept_part(path: Path, make: Callable[[], Any]) -> Any:
+    """What `make` returns, as JSON: written to `path` the first time and read from there, so killed steps continue."""
+    if not path.exists():
+        write_json_atomic(path, make())
+    return json.loads(path.read_text())
 
 
 def summarise(
@@ -154,7 +173,7 @@ def summarise(
     values: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for score in sorted(scores):
         names = [score.metric] + ([f"{score.metric}@{score.view}"] if by_view and score.view else [])
-        for group in group_names(score):
+        for group in score.groups:
             for name in names:
                 values[group, score.method, name][score.episode_id].append(score.value)
 
@@ -165,18 +184,11 @@ def summarise(
         means[group, metric][method] = episode_means
         weights = [len(items) for items in by_episode.values()]
         interval = bootstrap_mean(list(episode_means.values()), weights=weights, resamples=resamples, seed=seed)
-        metrics[group][method][metric] = interval.as_json()
+        metrics[group][method][metric] = asdict(interval)
 
     differences: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for (group, metric), by_method in means.items():
-        methods = sorted(by_method)
-        pairs = comparisons
-        if pairs is None:
-            pairs = [(a, b) for index, a in enumerate(methods) for b in methods[index + 1 :]]
-        for first, second in pairs:
-            if first not in by_method or second not in by_method:
-                continue
-            interval = paired_difference(by_method[first], by_method[second], resamples=resamples, seed=seed)
-            if interval is not None:
-                differences[group].append({"first": first, "second": second, "metric": metric, **interval.as_json()})
+        rows = method_differences(by_method, metric, comparisons=comparisons, resamples=resamples, seed=seed)
+        if rows:
+            differences[group] += rows
     return {"metrics": metrics, "differences": differences}

@@ -10,8 +10,7 @@ from __future__ import annotations
 import hashlib
 import string
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,8 +20,6 @@ from worldline_core.evaluation.planning.selectors import CandidateVideo, Selecto
 GROUP_SIZE = 4
 SURVIVORS = 2
 
-LoadCandidate = Callable[[int], CandidateVideo]
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -30,27 +27,16 @@ class Choice:
 
     candidate: int
     scores: dict[int, float]
-    rounds: tuple[tuple[int, ...], ...]
+    rounds: list[list[int]]
     malformed_answers: int
     answers: int
-
-
-@dataclass
-class _Tally:
-    answers: int = 0
-    malformed: int = 0
-    rounds: list[tuple[int, ...]] = field(default_factory=list)
-
-    def count(self, well_formed: bool) -> None:
-        self.answers += 1
-        self.malformed += not well_formed
 
 
 def choose(
     selector: Selector,
     instruction: str,
     candidates: Sequence[int],
-    load: LoadCandidate,
+    load: Callable[[int], CandidateVideo],
     *,
     scene: str,
     seed: int,
@@ -58,33 +44,41 @@ def choose(
     """Choose one of ``candidates`` (numbers in the bank).
 
     Args:
-        load: gives a candidate's video; its label is replaced by a letter here.
+        load: gives a candidate's video.
         scene: names the scene and the run; with ``seed`` it decides the order of showing.
 
     Raises: DataError for no candidates or a number that occurs twice.
     """
     if not candidates or len(set(candidates)) != len(candidates):
         raise DataError("Candidates must be distinct and at least one", where=scene, got=list(candidates))
-    tally = _Tally()
+    well_formed: list[bool] = []
+
+    def best_of(group: Sequence[int], count: int) -> list[int]:
+        """``count`` of the group, in the order shown; a group no larger than that passes whole."""
+        if len(group) <= count:
+            return list(group)
+        shown = dict(zip(string.ascii_uppercase, group, strict=False))
+        answer = selector.compare(instruction, {letter: load(number) for letter, number in shown.items()}, count)
+        labels = list(dict.fromkeys(label for label in answer.labels if label in shown))[:count]
+        well_formed.append(answer.well_formed and len(labels) == count)
+        # An answer that names too few is filled up in the order shown, which the shuffle made arbitrary; it is counted.
+        labels += [letter for letter in shown if letter not in labels][: count - len(labels)]
+        return [number for letter, number in shown.items() if letter in labels]
+
     survivors = shown_order(candidates, scene, seed)
+    rounds = [survivors]
     while len(survivors) > GROUP_SIZE:
-        tally.rounds.append(tuple(survivors))
-        survivors = [
-            winner
-            for start in range(0, len(survivors), GROUP_SIZE)
-            for winner in _best_of(selector, instruction, survivors[start : start + GROUP_SIZE], SURVIVORS, load, tally)
-        ]
-    tally.rounds.append(tuple(survivors))
+        groups = [survivors[start : start + GROUP_SIZE] for start in range(0, len(survivors), GROUP_SIZE)]
+        survivors = [winner for group in groups for winner in best_of(group, SURVIVORS)]
+        rounds.append(survivors)
     scores: dict[int, float] = {}
     for candidate in survivors:
-        answer = selector.score(instruction, replace(load(candidate), label=string.ascii_uppercase[0]))
-        tally.count(answer.well_formed)
+        answer = selector.score(instruction, load(candidate))
+        well_formed.append(answer.well_formed)
         scores[candidate] = answer.score
     best = max(scores.values())
-    tied = [candidate for candidate in survivors if scores[candidate] == best]
-    if len(tied) > 1:
-        tied = _best_of(selector, instruction, tied, 1, load, tally)
-    return Choice(tied[0], scores, tuple(tally.rounds), tally.malformed, tally.answers)
+    (winner,) = best_of([candidate for candidate in survivors if scores[candidate] == best], 1)
+    return Choice(winner, scores, rounds, well_formed.count(False), len(well_formed))
 
 
 def shown_order(candidates: Sequence[int], scene: str, seed: int) -> list[int]:
@@ -92,30 +86,3 @@ def shown_order(candidates: Sequence[int], scene: str, seed: int) -> list[int]:
     digest = hashlib.sha256(f"{scene}\0{seed}".encode()).digest()
     generator = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
     return [sorted(candidates)[index] for index in generator.permutation(len(candidates))]
-
-
-def _best_of(
-    selector: Selector, instruction: str, group: Sequence[int], count: int, load: LoadCandidate, tally: _Tally
-) -> list[int]:
-    """``count`` of the group, in the order shown; a group no larger than that passes whole."""
-    if len(group) <= count:
-        return list(group)
-    letters = string.ascii_uppercase[: len(group)]
-    videos = [replace(load(candidate), label=letter) for letter, candidate in zip(letters, group, strict=True)]
-    answer = selector.compare(instruction, videos, count)
-    labels = list(dict.fromkeys(label for label in answer.labels if label in letters))[:count]
-    tally.count(answer.well_formed and len(labels) == count)
-    # An answer that names too few is filled up in the order shown, which the shuffle made arbitrary; it is counted.
-    labels += [letter for letter in letters if letter not in labels][: count - len(labels)]
-    return [candidate for letter, candidate in zip(letters, group, strict=True) if letter in labels]
-
-
-def describe(choice: Choice) -> dict[str, Any]:
-    """A choice as JSON."""
-    return {
-        "candidate": choice.candidate,
-        "scores": {str(candidate): score for candidate, score in sorted(choice.scores.items())},
-        "rounds": [list(members) for members in choice.rounds],
-        "malformed_answers": choice.malformed_answers,
-        "answers": choice.answers,
-    }

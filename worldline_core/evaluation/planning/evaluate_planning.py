@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field
 from tqdm import tqdm
@@ -23,36 +24,27 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.evaluation.planning.bracket import choose, describe, shown_order
+from worldline_core.evaluation.planning.bracket import choose, shown_order
 from worldline_core.evaluation.planning.selectors import (
     CandidateVideo,
     MeasuredSelector,
     Selector,
-    ShownFrames,
     VLMSelector,
     planning_indices,
 )
-from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts, open_tracks
-from worldline_core.evaluation.scores import SUMMARY_FILE, Interval, Score, bootstrap_mean, write_scores, write_table
+from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
+from worldline_core.evaluation.scores import SUMMARY_FILE, Score, bootstrap_mean, kept_part, write_scores, write_table
 from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
-from worldline_core.evaluation.vlm.vlm_config import VLMConfig, open_vlm
+from worldline_core.evaluation.vlm import VLMConfig, open_vlm
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
 
 CHOICES_FILE = "choices.parquet"
 SEALED_FILE = "sealed_outcomes.parquet"
 DIRECT = "direct_execution"
-_CHOICE_SCHEMA = pa.schema(
-    [
-        ("method", pa.string()),
-        ("bank", pa.string()),
-        ("run", pa.int32()),
-        ("budget", pa.int32()),
-        ("episode_id", pa.string()),
-        ("trace", pa.string()),
-    ]
-)
+_CHOICE_COLUMNS = ("method", "bank", "run", "budget", "episode_id", "trace")
 
 
 class PlanningConfig(StrictModel):
@@ -77,21 +69,24 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     Inputs: banks, rollouts.<method>; tracks and segmenter where the selector uses them.
     Output: choices.parquet, scores.parquet (metric ``success@N``), summary.json.
     """
-    recordings = Recordings.open(inputs["banks"])
+    episodes = EpisodeSet.open(inputs["banks"])
     rollouts = open_rollouts(inputs)
-    tracks = open_tracks(inputs.get("tracks"))
-    banks = list_banks(recordings.episodes.rows)
+    tracks = open_tracks(inputs)
+    banks = list_banks(episodes.rows)
     selector = open_selector(config, inputs.get("segmenter"))
+
+    def choose_in_bank(method: str, bank: str) -> list[dict[str, Any]]:
+        load = candidate_loader(config.views, episodes, tracks, rollouts.get(method), method, banks[bank])
+        return choices_of_bank(config, selector, bank, banks[bank], load)
+
     choices: list[dict[str, Any]] = []
     for method in (TRUE_METHOD, *rollouts):
-        for bank, rows in tqdm(banks.items(), desc=f"evaluate_planning {method}", unit="bank", disable=None):
+        for bank in tqdm(banks, desc=f"evaluate_planning {method}", unit="bank", disable=None):
             part = output / "run" / "parts" / method / f"{bank}.json"
-            if not part.exists():
-                load = _Candidates(config, recordings, tracks, rollouts.get(method), method, rows)
-                write_json_atomic(part, _choose_in_bank(config, selector, bank, rows, load))
-            choices += [{"method": method, "bank": bank, **choice} for choice in json.loads(part.read_text())]
+            found = kept_part(part, partial(choose_in_bank, method, bank))
+            choices += [{"method": method, "bank": bank, **choice} for choice in found]
     table = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
-    write_table(output / CHOICES_FILE, table, _CHOICE_SCHEMA)
+    write_table(output / CHOICES_FILE, table, _CHOICE_COLUMNS)
     # Only now: nothing above has read, or could read, how any candidate ended.
     outcomes = read_outcomes(
         inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
@@ -128,8 +123,12 @@ def open_selector(config: PlanningConfig, segmenter: Path | None) -> Selector:
     return VLMSelector(open_vlm(config.selector, config.vlm))
 
 
-def _choose_in_bank(
-    config: PlanningConfig, selector: Selector, bank: str, rows: list[EpisodeRow], load: _Candidates
+def choices_of_bank(
+    config: PlanningConfig,
+    selector: Selector,
+    bank: str,
+    rows: Sequence[EpisodeRow],
+    load: Callable[[int], CandidateVideo],
 ) -> list[dict[str, Any]]:
     """One choice per run and budget; budgets larger than the bank are left out.
 
@@ -144,52 +143,43 @@ def _choose_in_bank(
             scene = f"{bank} {run} {budget}"
             choice = choose(selector, rows[0].instruction, order[:budget], load, scene=scene, seed=config.seed)
             episode_id = rows[choice.candidate].episode_id
-            results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": describe(choice)})
+            results.append({"run": run, "budget": budget, "episode_id": episode_id, "trace": asdict(choice)})
     return results
 
 
-class _Candidates:
-    """Videos of one bank's candidates by one method, decoded once."""
+def candidate_loader(
+    views: Sequence[str],
+    episodes: EpisodeSet,
+    tracks: ActionTracks | None,
+    rollout: RolloutSet | None,
+    method: str,
+    rows: Sequence[EpisodeRow],
+) -> Callable[[int], CandidateVideo]:
+    """Gives what is shown of a candidate by its number in the bank: recorded, or predicted by a method. Decoded once.
 
-    def __init__(
-        self,
-        config: PlanningConfig,
-        recordings: Recordings,
-        tracks: ActionTracks | None,
-        rollout: RolloutSet | None,
-        method: str,
-        rows: list[EpisodeRow],
-    ) -> None:
-        self.config, self.recordings, self.tracks, self.rollout, self.rows = config, recordings, tracks, rollout, rows
-        self.kept: dict[int, CandidateVideo] = {}
-        predicted = {row.episode_id for row in rows} if rollout is None else set(rollout.episode_ids)
-        missing = [row.episode_id for row in rows if row.episode_id not in predicted]
-        if missing:
-            raise ArtifactError(
-                "A method has not predicted every candidate of a bank",
-                where=f"method {method}, bank {rows[0].bank}",
-                got=f"{len(missing)} missing, for example {missing[0]}",
-                next_step="roll out all candidates with this method",
-            )
+    Raises: ArtifactError when the method has not predicted every candidate.
+    """
+    predicted = {row.episode_id for row in rows} if rollout is None else set(rollout.episode_ids)
+    missing = [row.episode_id for row in rows if row.episode_id not in predicted]
+    if missing:
+        raise ArtifactError(
+            "A method has not predicted every candidate of a bank",
+            where=f"method {method}, bank {rows[0].bank}",
+            got=f"{len(missing)} missing, for example {missing[0]}",
+            next_step="roll out all candidates with this method",
+        )
 
-    def __call__(self, candidate: int) -> CandidateVideo:
-        """The frames that are shown of a candidate (its number in the bank)."""
-        if candidate not in self.kept:
-            row = self.rows[candidate]
-            seed = 0 if self.rollout is None else self.rollout.seeds(row.episode_id)[0]
-            video = self.recordings.seen_video(
-                row.episode_id, self.config.views, rollout=self.rollout, seed=seed, tracks=self.tracks
-            )
-            indices = planning_indices(video.num_frames)
-            self.kept[candidate] = CandidateVideo(
-                label="",
-                shown=ShownFrames({view: frames[list(indices)] for view, frames in video.frames.items()}),
-                indices=indices,
-                fps=row.fps,
-                total_frames=video.num_frames,
-                points=None if video.points is None else video.points[list(indices)],
-            )
-        return self.kept[candidate]
+    @cache
+    def load(candidate: int) -> CandidateVideo:
+        row = rows[candidate]
+        seed = 0 if rollout is None else rollout.seeds(row.episode_id)[0]
+        video = trajectory_of(episodes, row, views, rollout=rollout, seed=seed, tracks=tracks)
+        indices = planning_indices(video.num_frames)
+        frames = {view: shown[list(indices)] for view, shown in video.frames.items()}
+        points = None if video.points is None else video.points[list(indices)]
+        return CandidateVideo(frames, indices, row.fps, video.num_frames, points)
+
+    return load
 
 
 def read_outcomes(path: Path, episode_ids: Sequence[str]) -> dict[str, bool]:
@@ -242,8 +232,8 @@ def write_results(
     scores += [_score(DIRECT, banks[bank][0], 0, "success", value) for bank, value in direct.items()]
     write_scores(output, scores)
 
-    def interval(values: Sequence[float]) -> Interval:
-        return bootstrap_mean(values, resamples=config.resamples, seed=config.seed)
+    def interval(values: Sequence[float]) -> dict[str, Any]:
+        return asdict(bootstrap_mean(values, resamples=config.resamples, seed=config.seed))
 
     def deviation(values: Sequence[float]) -> float:
         return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
@@ -253,8 +243,8 @@ def write_results(
         over_runs = deviation([float(np.mean(run)) for run in zip(*by_bank.values(), strict=True)])
         spread = {"std_over_banks": deviation(list(means.values())), "std_over_runs": over_runs}
         return {
-            "success": {**interval(list(means.values())).as_json(), **spread},
-            "gain": interval([means[bank] - direct[bank] for bank in means]).as_json(),
+            "success": interval(list(means.values())) | spread,
+            "gain": interval([means[bank] - direct[bank] for bank in means]),
             "banks": means,
         }
 
@@ -280,8 +270,8 @@ def write_results(
             }
             for bank, rows in banks.items()
         },
-        DIRECT: interval(list(direct.values())).as_json(),
-        "oracle": interval(list(oracle.values())).as_json(),
+        DIRECT: interval(list(direct.values())),
+        "oracle": interval(list(oracle.values())),
         "methods": methods,
         "interval": "95 % bootstrap over banks",
     }

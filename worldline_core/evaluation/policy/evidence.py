@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, StrictBool
 
-from worldline_core.evaluation.vlm.message import Answer, AnswerText
+from worldline_core.evaluation.vlm import Answer, AnswerText
 
 EvidenceFamily = Literal["grasp", "lift", "state_change"]
 Fact = StrictBool | None

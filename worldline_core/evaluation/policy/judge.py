@@ -7,7 +7,6 @@ reconciliation for state changes; a twelve-frame motion check for lifts and stat
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -23,29 +22,12 @@ from worldline_core.evaluation.policy.evidence import (
     reconciliation_establishes_success,
     route,
 )
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.evaluation.vlm import Answer
 
 
 @dataclass(frozen=True)
-class Trajectory:
-    """One video to be judged; nothing in it tells the recorded outcome.
-
-    Attributes:
-        frames: by view, uint8 (n, h, w, 3); the views are synchronised.
-        points: (n, arms, 2) projected tool centres in the head view [px], to start a segmenter; or None.
-    """
-
-    instruction: str
-    frames: Mapping[str, np.ndarray]
-    fps: float
-    points: np.ndarray | None = None
-
-    @property
-    def num_frames(self) -> int:
-        return min(len(frames) for frames in self.frames.values())
-
-
-@dataclass(frozen=True)
-class Extracted[T]:
+class Extracted[T: Answer]:
     """What a judge stated; ``well_formed`` is False when its answer could not be read (then every fact is null)."""
 
     evidence: T
@@ -109,56 +91,54 @@ Pass = Literal["first_pass", "verification", "reconciliation", "motion"]
 
 @dataclass(frozen=True)
 class Judgement:
-    """The decision, the pass that made it (the last one for a failure), and every statement on the way."""
+    """The decision, the pass that made it (the last one for a failure), and what was stated in every pass."""
 
     success: bool
     family: EvidenceFamily
     decided_by: Pass
     malformed_answers: int
     answers: int
-    statements: tuple[tuple[Pass, dict[str, Any]], ...]
+    statements: list[dict[str, Any]]
 
 
-def judge_trajectory(judge: Judge, trajectory: Trajectory, family: EvidenceFamily | None = None) -> Judgement:
-    """Judge one video; ``family`` None routes by the instruction."""
-    family = family or route(trajectory.instruction)
-    statements: list[tuple[Pass, dict[str, Any]]] = []
-    malformed = 0
+def judge_trajectory(judge: Judge, trajectory: Trajectory) -> Judgement:
+    """Judge one video by the evidence of the family that its instruction belongs to."""
+    family, count = route(trajectory.instruction), trajectory.num_frames
+    passes: list[Pass] = []
+    stated: list[Extracted[Any]] = []
+
+    def take[T: Answer](name: Pass, answer: Extracted[T]) -> T:
+        passes.append(name)
+        stated.append(answer)
+        return answer.evidence
 
     def done(success: bool) -> Judgement:
-        return Judgement(success, family, statements[-1][0], malformed, len(statements), tuple(statements))
+        malformed = sum(not answer.well_formed for answer in stated)
+        facts = [{"pass": n, **answer.evidence.model_dump()} for n, answer in zip(passes, stated, strict=True)]
+        return Judgement(success, family, passes[-1], malformed, len(stated), facts)
 
-    num_frames = trajectory.num_frames
-    first = judge.extract(trajectory, family, first_pass_indices(num_frames), FIRST_PASS_HEIGHT_PX)
-    statements.append(("first_pass", first.evidence.model_dump()))
-    malformed += not first.well_formed
-    if establishes_success(first.evidence):
+    first = take("first_pass", judge.extract(trajectory, family, first_pass_indices(count), FIRST_PASS_HEIGHT_PX))
+    if establishes_success(first):
         return done(True)
 
     # What later passes argue about: the newest evidence that could be read.
-    selected: Evidence = first.evidence
-    verification_text = ""
+    selected: Evidence = first
+    verification = ""
     if len(trajectory.frames) > 1:
-        second = judge.extract(trajectory, family, verification_indices(num_frames), VERIFICATION_HEIGHT_PX)
-        statements.append(("verification", second.evidence.model_dump()))
-        malformed += not second.well_formed
-        verification_text = second.evidence.observations
-        if establishes_success(second.evidence):
+        indices = verification_indices(count)
+        second = take("verification", judge.extract(trajectory, family, indices, VERIFICATION_HEIGHT_PX))
+        verification = second.observations
+        if establishes_success(second):
             return done(True)
-        if second.well_formed:
-            selected = second.evidence
+        if stated[-1].well_formed:
+            selected = second
 
     if family == "state_change":
-        answer = judge.reconcile(trajectory, selected.observations, first.evidence.observations, verification_text)
-        statements.append(("reconciliation", answer.evidence.model_dump()))
-        malformed += not answer.well_formed
-        if reconciliation_establishes_success(answer.evidence, selected):
+        answer = judge.reconcile(trajectory, selected.observations, first.observations, verification)
+        if reconciliation_establishes_success(take("reconciliation", answer), selected):
             return done(True)
 
     if family in ("lift", "state_change"):
-        motion = judge.inspect_motion(trajectory, motion_indices(num_frames), selected.observations)
-        statements.append(("motion", motion.evidence.model_dump()))
-        malformed += not motion.well_formed
-        if motion_establishes_success(motion.evidence, selected):
-            return done(True)
+        answer = judge.inspect_motion(trajectory, motion_indices(count), selected.observations)
+        return done(motion_establishes_success(take("motion", answer), selected))
     return done(False)

@@ -24,7 +24,7 @@ from worldline_core.evaluation.policy.evidence import (
     establishes_success,
     route,
 )
-from worldline_core.evaluation.policy.judge import Extracted, Trajectory
+from worldline_core.evaluation.policy.judge import Extracted
 from worldline_core.evaluation.policy.measurements import (
     LATE_COUNT,
     LiftMeasurement,
@@ -35,6 +35,7 @@ from worldline_core.evaluation.policy.measurements import (
     measure_push,
     named_things,
 )
+from worldline_core.evaluation.recordings import HEAD, Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 
 Measurement = LiftMeasurement | PlaceMeasurement | PushMeasurement
@@ -48,17 +49,8 @@ MAX_REMAINING, REMAINING_WIDTH = 0.56, 0.12
 MIN_RETREAT, RETREAT_WIDTH = 0.53, 0.12
 UNSEEN_SCORE = 0.25
 
+# What is to be pushed in or closed.
 _CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
-
-
-def closes(instruction: str) -> bool:
-    """Whether the instruction asks that something be pushed in or closed."""
-    return _CLOSING.search(instruction.lower()) is not None
-
-
-def unmeasurable(family: EvidenceFamily, reason: str) -> Evidence:
-    """Evidence in which every fact is null."""
-    return SCHEMAS[family](observations=reason)
 
 
 def lift_facts(measured: LiftMeasurement, name: str, family: EvidenceFamily) -> Evidence:
@@ -79,31 +71,6 @@ def lift_facts(measured: LiftMeasurement, name: str, family: EvidenceFamily) -> 
         target_held_for_two_late_steps=held,
         target_on_original_support_at_end=None if raised is None else not raised,
         wrong_object_or_drop=dropped,
-        observations=words,
-    )
-
-
-def place_facts(measured: PlaceMeasurement, name: str, destination: str) -> Evidence:
-    """Facts of a placement: the object lies at its destination and rests."""
-    there = None if measured.distance is None else measured.distance < MAX_DISTANCE
-    words = f"{name}: {_text(measured.distance)} destination sizes from the {destination} in the end"
-    return StateChangeEvidence(
-        required_final_state_visible=there,
-        wrong_object_or_drop=None if there is None else False,
-        observations=words,
-    )
-
-
-def push_facts(measured: PushMeasurement, name: str) -> Evidence:
-    """Facts of closing: little of the thing is left, and its near edge has retreated."""
-    closed = None
-    if measured.remaining is not None:
-        retreated = measured.retreat is None or measured.retreat > MIN_RETREAT
-        closed = measured.remaining < MAX_REMAINING and retreated
-    words = f"{name}: {_text(measured.remaining)} of it still visible, edge moved in by {_text(measured.retreat)} of its size"
-    return StateChangeEvidence(
-        required_final_state_visible=closed,
-        wrong_object_or_drop=None if closed is None else False,
         observations=words,
     )
 
@@ -132,9 +99,6 @@ def _text(value: float | None) -> str:
     return "(not visible)" if value is None else f"{value:.2f}"
 
 
-_HEAD = "head"
-
-
 def measure(
     segmenter: Segmenter,
     instruction: str,
@@ -148,27 +112,40 @@ def measure(
     (it measures holding, lifting, placing one thing on another, and closing).
     """
     things = named_things(instruction)
-    if len(things) == 0 or len(frames[_HEAD]) < LATE_COUNT:
+    if len(things) == 0 or len(frames[HEAD]) < LATE_COUNT:
         return None
     if family in ("grasp", "lift"):
-        return measure_lift(frames, things[0], _robot_late(segmenter, frames[_HEAD], points))
+        return measure_lift(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
     if len(things) > 1:
         return measure_place(frames, things[0], things[1])
-    if closes(instruction):
-        return measure_push(frames, things[0], _robot_late(segmenter, frames[_HEAD], points))
+    if _CLOSING.search(instruction.lower()):
+        return measure_push(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
     return None
 
 
 def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily) -> Evidence:
-    """The family's evidence from a measurement."""
+    """The family's evidence from a measurement.
+
+    Placed is what lies at its destination; closed is what little is left of, and whose near edge has retreated.
+    """
     if measured is None:
-        return unmeasurable(family, "nothing in the instruction can be followed by its colour")
+        return SCHEMAS[family](observations="nothing in the instruction can be followed by its colour")
     names = [f"{thing.colour} {thing.noun}" for thing in named_things(instruction)]
     if isinstance(measured, LiftMeasurement):
         return lift_facts(measured, names[0], family)
+    done = None
     if isinstance(measured, PlaceMeasurement):
-        return place_facts(measured, names[0], names[1])
-    return push_facts(measured, names[0])
+        if measured.distance is not None:
+            done = measured.distance < MAX_DISTANCE
+        words = f"{names[0]}: {_text(measured.distance)} destination sizes from the {names[1]} in the end"
+    else:
+        if measured.remaining is not None:
+            retreated = measured.retreat is None or measured.retreat > MIN_RETREAT
+            done = measured.remaining < MAX_REMAINING and retreated
+        left, moved = _text(measured.remaining), _text(measured.retreat)
+        words = f"{names[0]}: {left} of it still visible, edge moved in by {moved} of its size"
+    dropped = None if done is None else False
+    return StateChangeEvidence(required_final_state_visible=done, wrong_object_or_drop=dropped, observations=words)
 
 
 def _robot_late(segmenter: Segmenter, head: np.ndarray, points: np.ndarray | None) -> np.ndarray:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from worldline_core.evaluation.recordings import HEAD
+
 # Hue of each colour word [degrees]; at least 25 degrees apart. A pixel's share falls from 1 to 0 between FULL and NONE,
 # the distance of its hue [degrees], its saturation and its value: a blurred edge keeps its share of the area.
 HUES_DEG = {"red": 0.0, "orange": 28.0, "yellow": 53.0, "green": 126.0, "cyan": 180.0, "blue": 229.0, "purple": 283.0}
@@ -33,7 +35,6 @@ _SURROUNDINGS_QUANTILE, _SURROUNDINGS_MARGIN = 0.98, 0.05
 _THING = re.compile(rf"\b({'|'.join(HUES_DEG)})\s+(\w+)")
 
 LATE_COUNT = 3
-_HEAD = "head"
 _MIN_AREA_FRACTION = 0.0009  # of the frame: about 5.5 px at 64 x 96
 _VISIBLE = 0.12  # of the thing's largest area
 _CLEAR = 0.35  # of the thing's largest area: enough to measure its position
@@ -156,11 +157,9 @@ class LiftMeasurement:
 
 @dataclass(frozen=True)
 class PlaceMeasurement:
-    """distance: between object and destination in the end, in destination sizes; motion: of the object between the last
-    two frames, in its sizes."""
+    """distance: between object and destination in the end, in destination sizes."""
 
     distance: float | None
-    motion: float | None
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
         frames: by view, chosen frames (n, h, w, 3) in order.
         robot_late: robot masks (LATE_COUNT, h, w) of the last frames of the head view.
     """
-    head = sight(frames[_HEAD], thing)
+    head = sight(frames[HEAD], thing)
     clear, visible = head.seen(_CLEAR), head.seen(_VISIBLE)
     late = np.arange(len(head.area)) >= len(head.area) - LATE_COUNT
     rise = peak = vacated = None
@@ -211,26 +210,22 @@ def measure_place(
     frames: Mapping[str, np.ndarray], thing: ColouredThing, destination: ColouredThing
 ) -> PlaceMeasurement:
     """Where the object is in the end, against where the destination was seen best."""
-    item, place = sight(frames[_HEAD], thing), sight(frames[_HEAD], destination)
-    visible = item.seen(_VISIBLE)
-    late = visible.copy()
+    item, place = sight(frames[HEAD], thing), sight(frames[HEAD], destination)
+    late = item.seen(_VISIBLE)
     late[:-LATE_COUNT] = False
     if not late.any() or not place.seen(_CLEAR).any():
-        return PlaceMeasurement(None, None)
+        return PlaceMeasurement(None)
     best = int(np.argmax(place.area))
     size = max(1.0, float(np.sqrt(place.area[best])))
     # The centre of a thing that stands on a spot is seen a little above the spot.
     du = float(item.u[late].mean()) - float(place.u[best])
     dv = float(item.v[late].mean()) + 0.1 * item.size - float(place.v[best])
-    motion = None
-    if visible[-1] and visible[-2]:
-        motion = float(np.hypot(item.u[-1] - item.u[-2], item.v[-1] - item.v[-2])) / item.size
-    return PlaceMeasurement(float(np.hypot(du, dv)) / size, motion)
+    return PlaceMeasurement(float(np.hypot(du, dv)) / size)
 
 
 def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> PushMeasurement:
     """How much of a drawer still sticks out."""
-    head = sight(frames[_HEAD], thing)
+    head = sight(frames[HEAD], thing)
     best = int(np.argmax(head.area))
     if not head.seen(_CLEAR)[best]:
         return PushMeasurement(None, None)
@@ -265,7 +260,7 @@ def _held(
     wrists = [
         thing_share(frames[view][-LATE_COUNT:], thing.colour, head.own).mean(axis=(1, 2))
         for view in frames
-        if view != _HEAD
+        if view != HEAD
     ]
     in_hand = np.max(wrists, axis=0) / HELD_WRIST_SHARE if wrists else np.full(LATE_COUNT, np.nan)
     signs = [np.minimum(values, 1.0) for values in (touching / HELD_TOUCH, in_hand) if not np.isnan(values).all()]

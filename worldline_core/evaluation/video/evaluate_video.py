@@ -8,45 +8,40 @@ Means over trajectories of every frame show drift along a rollout.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import pyarrow as pa
+import numpy as np
 import torch
 from pydantic import Field
 from tqdm import tqdm
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS, Episode
-from worldline_core.errors import UnavailableError
-from worldline_core.evaluation.recordings import TRUE_METHOD, Recordings, open_rollouts
-from worldline_core.evaluation.scores import SUMMARY_FILE, Score, summarise, write_scores, write_table
+from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, leading, open_rollouts, rows_of, tool_points
+from worldline_core.evaluation.scores import SUMMARY_FILE, Score, kept_part, summarise, write_scores, write_table
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, SegmenterName, open_segmenter
-from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
 from worldline_core.model.lpips import LPIPS, load_lpips
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
 
 logger = logging.getLogger(__name__)
 
 BY_FRAME_FILE = "by_frame.parquet"
-_BY_FRAME_SCHEMA = pa.schema(
-    [
-        ("method", pa.string()),
-        ("split", pa.string()),
-        ("view", pa.string()),
-        ("metric", pa.string()),
-        ("frame", pa.int32()),
-        ("mean", pa.float64()),
-        ("count", pa.int32()),
-    ]
-)
+_BY_FRAME_COLUMNS: tuple[str, ...] = ("method", "split", "view", "metric", "frame", "mean", "count")
+FrameValues = dict[str, list[float | None]]
+"""Values of each frame by metric; None where a frame is left out."""
 
 
 class VideoEvaluationConfig(StrictModel):
@@ -72,42 +67,37 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     Output: scores.parquet (one row per method, episode, view, seed and metric), by_frame.parquet (means over
     trajectories of each frame), summary.json.
     """
-    recordings = Recordings.open(inputs["episodes"])
+    episodes = EpisodeSet.open(inputs["episodes"])
     tracks = ActionTracks.open(inputs["tracks"])
     rollouts = open_rollouts(inputs)
     segmenters = {
-        name: open_segmenter(name, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
-        for name in config.segmenters
+        f"[{name}]" if place else "": open_segmenter(name, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
+        for place, name in enumerate(config.segmenters)
     }
-    lpips, lpips_reason = _open_lpips(config.lpips_weights)
+    lpips, unavailable = _open_lpips(config.lpips_weights)
     parts = output / "run" / "parts"
-
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
 
-    def measure(episode_id: str) -> list[tuple[str, Episode, dict[str, Any]]]:
-        episode = recordings.episode(episode_id)
-        measurement = EpisodeMeasurement(recordings, tracks, episode_id, config.views, segmenters, lpips)
-        found: list[tuple[str, Episode, dict[str, Any]]] = []
-        for method, rollout in rollouts.items():
-            if episode_id in predicted[method]:
-                part = parts / method / f"{episode_id}.json"
-                if not part.exists():
-                    write_json_atomic(part, measurement.measure(method, rollout))
-                found.append((method, episode, json.loads(part.read_text())))
-        num_frames = max(content["num_frames"] for _, _, content in found)
-        part = parts / TRUE_METHOD / f"{episode_id}.json"
-        if not part.exists():
-            write_json_atomic(part, measurement.segmenter_accuracy(num_frames))
-        return [*found, (TRUE_METHOD, episode, json.loads(part.read_text()))]
+    def measure(row: EpisodeRow) -> list[tuple[str, EpisodeRow, dict[str, Any]]]:
+        name = row.episode_id
+        measurement = EpisodeMeasurement(episodes, tracks, row, config.views, segmenters, lpips)
+        found = [
+            (method, row, kept_part(parts / method / f"{name}.json", partial(measurement.measure, method, rollout)))
+            for method, rollout in rollouts.items()
+            if name in predicted[method]
+        ]
+        longest = max(content["num_frames"] for _, _, content in found)
+        accuracy = partial(measurement.segmenter_accuracy, longest)
+        return [*found, (TRUE_METHOD, row, kept_part(parts / TRUE_METHOD / f"{name}.json", accuracy))]
 
-    episode_ids = sorted(set().union(*predicted.values()))
-    records: list[tuple[str, Episode, dict[str, Any]]] = []
+    rows = rows_of(episodes, set().union(*predicted.values()))
+    records: list[tuple[str, EpisodeRow, dict[str, Any]]] = []
     with _workers(on_gpu="sam3" in config.segmenters) as pool:
         for found in tqdm(
-            pool.map(measure, episode_ids), total=len(episode_ids), desc="evaluate_video", unit="episode", disable=None
+            pool.map(measure, rows), total=len(rows), desc="evaluate_video", unit="episode", disable=None
         ):
             records += found
-    return _write(config, records, segmenters, lpips_reason, output)
+    return _write(config, records, segmenters, unavailable, output)
 
 
 @contextmanager
@@ -124,65 +114,165 @@ def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _open_lpips(folder: Path | None) -> tuple[LPIPS | None, str | None]:
+def _open_lpips(folder: Path | None) -> tuple[LPIPS | None, dict[str, str]]:
+    """LPIPS where it is available, and otherwise the reason why it is not, by metric."""
     try:
-        return load_lpips(folder), None
+        return load_lpips(folder), {}
     except UnavailableError as error:
         logger.warning("%s", error)
-        return None, f"{error.what}: {error.got}" if error.got else error.what
+        return None, {"lpips": f"{error.what}: {error.got}" if error.got else error.what}
+
+
+class EpisodeMeasurement:
+    """Measures predictions of one episode; its recorded frames and their masks are read and made once.
+
+    Args:
+        segmenters: by the suffix of their metrics.
+        lpips: None where it is not available.
+    """
+
+    def __init__(
+        self,
+        episodes: EpisodeSet,
+        tracks: ActionTracks,
+        row: EpisodeRow,
+        views: Sequence[str],
+        segmenters: Mapping[str, Segmenter],
+        lpips: LPIPS | None,
+    ) -> None:
+        self.episodes, self.tracks, self.segmenters, self.lpips = episodes, tracks, segmenters, lpips
+        self.episode_id = row.episode_id
+        self.position = episodes.position(row.episode_id)
+        self.views = [view for view in views if view in row.views]
+        self._frames: dict[str, np.ndarray] = {}
+        self._masks: dict[tuple[str, int], np.ndarray] = {}
+
+    def measure(self, method: str, rollout: RolloutSet) -> dict[str, Any]:
+        """Values of every frame, for every view and seed that was predicted.
+
+        Raises: DataError when the prediction has another frame size or more frames than the recording.
+        """
+        measured: list[dict[str, Any]] = []
+        num_frames = 0
+        for seed in rollout.seeds(self.episode_id):
+            for view in self.views:
+                predicted = rollout.frames(self.episode_id, view, seed)
+                num_frames = len(predicted)
+                true = self._true_frames(view, num_frames)
+                if predicted.shape != true.shape:
+                    raise DataError(
+                        "Predicted and recorded frames differ in size",
+                        where=f"method {method}, episode {self.episode_id}, view {view}",
+                        expected=true.shape,
+                        got=predicted.shape,
+                        next_step="write the predictions at the recording's frame size",
+                    )
+                values = self._full_frame(predicted, true)
+                if view == HEAD:
+                    values |= self._robot(predicted, true)
+                measured.append({"view": view, "seed": seed, "frames": values})
+        return {"num_frames": num_frames, "measured": measured}
+
+    def segmenter_accuracy(self, num_frames: int) -> dict[str, Any]:
+        """The segmenters' masks of the true frames against the exact ones, where the recording has them."""
+        exact = self._exact_masks(num_frames)
+        values: FrameValues = {}
+        if exact is not None:
+            for suffix in self.segmenters:
+                iou = frame_iou(exact, self._true_masks(suffix, num_frames))
+                values[f"robot_iou_exact{suffix}"] = _or_none(iou)
+        return {"num_frames": num_frames, "measured": [{"view": HEAD, "seed": 0, "frames": values}]}
+
+    def _full_frame(self, predicted: np.ndarray, true: np.ndarray) -> FrameValues:
+        p, t = (frames_to_unit(torch.from_numpy(np.ascontiguousarray(frames))) for frames in (predicted, true))
+        values: FrameValues = {"psnr": psnr(p, t).tolist(), "ssim": ssim(p, t).tolist()}
+        if self.lpips is not None:
+            values["lpips"] = self.lpips(p, t).tolist()
+        return values
+
+    def _robot(self, predicted: np.ndarray, true: np.ndarray) -> FrameValues:
+        count = len(predicted)
+        points = tool_points(self.tracks, self.episode_id, count)
+        errors = end_effector_error(true, predicted, points)
+        values: FrameValues = {"end_effector_error_px": [finite_mean(row) for row in errors]}
+        exact = self._exact_masks(count)
+        for suffix, segmenter in self.segmenters.items():
+            masks = segmenter.segment(predicted, points)
+            values[f"robot_iou{suffix}"] = _or_none(frame_iou(self._true_masks(suffix, count), masks))
+            if exact is not None:
+                values[f"robot_iou_exact{suffix}"] = _or_none(frame_iou(exact, masks))
+        return values
+
+    def _true_frames(self, view: str, count: int) -> np.ndarray:
+        if view not in self._frames:
+            self._frames[view] = self.episodes.frames(self.position, view)
+        return leading(self._frames[view], count, f"recorded video of {self.episode_id}, view {view}")
+
+    def _exact_masks(self, count: int) -> np.ndarray | None:
+        masks = self.episodes.robot_masks(self.position, HEAD)
+        return None if masks is None else leading(masks, count, f"robot masks of {self.episode_id}, view {HEAD}")
+
+    def _true_masks(self, suffix: str, count: int) -> np.ndarray:
+        if (suffix, count) not in self._masks:
+            points = tool_points(self.tracks, self.episode_id, count)
+            self._masks[suffix, count] = self.segmenters[suffix].segment(self._true_frames(HEAD, count), points)
+        return self._masks[suffix, count]
+
+
+def finite_mean(values: Sequence[float | None] | np.ndarray) -> float | None:
+    """Mean of the values that are there; None without any."""
+    finite = [float(value) for value in values if value is not None and np.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
+
+
+def _or_none(values: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(value) else float(value) for value in values]
 
 
 def _write(
     config: VideoEvaluationConfig,
-    records: Sequence[tuple[str, Episode, dict[str, Any]]],
+    records: Sequence[tuple[str, EpisodeRow, dict[str, Any]]],
     segmenters: Mapping[str, Segmenter],
-    lpips_reason: str | None,
+    unavailable: Mapping[str, str],
     output: Path,
 ) -> dict[str, Any]:
     scores: list[Score] = []
     by_frame: list[tuple[str, str, str, str, list[float | None]]] = []
-    for method, episode, content in records:
+    for method, row, content in records:
         for item in content["measured"]:
             for metric, frames in item["frames"].items():
-                by_frame.append((method, episode.split, item["view"], metric, frames))
+                by_frame.append((method, row.split, item["view"], metric, frames))
                 value = finite_mean(frames)
-                if value is None:
-                    continue  # empty in every frame: the video is left out
-                scores.append(
-                    Score(
-                        method, episode.episode_id, episode.embodiment, episode.split, item["view"], item["seed"], metric,
-                        value, episode.scene, episode.task_family, episode.outcome,
-                    )
-                )  # fmt: skip
+                if value is not None:  # otherwise empty in every frame: the video is left out
+                    scores.append(
+                        Score(
+                            method, row.episode_id, row.embodiment, row.split, item["view"], item["seed"], metric, value,
+                            row.scene, row.task_family, row.outcome,
+                        )
+                    )  # fmt: skip
     write_scores(output, scores)
     write_by_frame(output / BY_FRAME_FILE, by_frame)
     options = {"comparisons": config.comparisons, "resamples": config.resamples, "seed": config.seed, "by_view": True}
-    predicted = summarise([score for score in scores if score.method != TRUE_METHOD], **options)
+    predicted = [score for score in scores if score.method != TRUE_METHOD]
     accuracy = summarise([score for score in scores if score.method == TRUE_METHOD], **options)["metrics"]
+    accuracy = {group: methods[TRUE_METHOD] for group, methods in accuracy.items()}
     summary = {
-        **predicted,
-        "methods": sorted({score.method for score in scores if score.method != TRUE_METHOD}),
-        "unavailable": {} if lpips_reason is None else {"lpips": lpips_reason},
+        **summarise(predicted, **options),
+        "methods": sorted({score.method for score in predicted}),
+        "unavailable": unavailable,
         "segmenters": [
-            {
-                "name": name,
-                "description": segmenter.description,
-                "suffix": "" if name == config.segmenters[0] else f"[{name}]",
-                "accuracy_on_true_frames": {
-                    group: methods[TRUE_METHOD] for group, methods in accuracy.items() if TRUE_METHOD in methods
-                },
-            }
-            for name, segmenter in segmenters.items()
+            {"name": s.name, "description": s.description, "suffix": suffix, "accuracy_on_true_frames": accuracy}
+            for suffix, s in segmenters.items()
         ],
         "units": {"psnr": "dB", "end_effector_error_px": "px"},
-        "num_episodes": len({episode.episode_id for _, episode, _ in records}),
+        "num_episodes": len({row.episode_id for _, row, _ in records}),
         "interval": "95 % bootstrap over trajectories",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
     return {"episodes": summary["num_episodes"], "methods": summary["methods"], "scores": len(scores)}
 
 
-def write_by_frame(path: Path, videos: Iterable[tuple[str, str, str, str, Sequence[float | None]]]) -> None:
+def write_by_frame(path: Path, videos: Sequence[tuple[str, str, str, str, Sequence[float | None]]]) -> None:
     """Average per-frame values over videos.
 
     Args:
@@ -194,7 +284,7 @@ def write_by_frame(path: Path, videos: Iterable[tuple[str, str, str, str, Sequen
             if value is not None:
                 cells[method, split, view, metric, frame].append(value)
     rows = [
-        dict(zip(_BY_FRAME_SCHEMA.names, (*key, sum(values) / len(values), len(values)), strict=True))
+        dict(zip(_BY_FRAME_COLUMNS, (*key, sum(values) / len(values), len(values)), strict=True))
         for key, values in sorted(cells.items())
     ]
-    write_table(path, rows, _BY_FRAME_SCHEMA)
+    write_table(path, rows, _BY_FRAME_COLUMNS)
