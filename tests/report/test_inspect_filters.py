@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from rerun.chunk import RrdReader
@@ -15,10 +18,9 @@ from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
-from worldline_core.report.filters import CUT, QUARANTINED, episode_of, filter_refusals, first_of_each_episode
+from worldline_core.report.filters import CUT, QUARANTINED, episode_of, filter_refusals, read_outcomes
 from worldline_core.report.inspect import inspect
 from worldline_core.report.inspect_filters import FilteredSet
-from worldline_core.store.artifact_files import read_rows
 from worldline_core.store.atomic import write_json_atomic
 
 CONFIG = FilterConfig(min_segment_frames=8)
@@ -53,14 +55,14 @@ def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 def test_every_clip_stands_under_its_reasons(filtered: Path) -> None:
     found = FilteredSet(filtered, filtered.parent.parent / "curate" / "key")
-    assert found.clips["healthy"].reasons == ["kept"]
-    assert found.clips["black"].reasons == ["too_dark"]
-    assert found.clips["black"].segments == ()
-    assert found.clips["dark"].reasons == ["too_dark"]
-    assert found.clips["dark"].segments == ((0, 12), (18, 33))
-    assert found.clips["dark"].cut_by == {"too_dark": 6}
-    assert found.clips["turned"].stage2_reason is not None
-    assert found.clips["turned"].segments == ((0, 33),)
+    assert found.outcomes["healthy"].reasons == ["kept"]
+    assert found.outcomes["black"].reasons == ["too_dark"]
+    assert found.segments("black") == []
+    assert found.outcomes["dark"].reasons == ["too_dark"]
+    assert found.segments("dark") == [(0, 12), (18, 33)]
+    assert found.outcomes["dark"].cut_by == {"too_dark": 6}
+    assert found.outcomes["turned"].stage2_reason is not None
+    assert found.segments("turned") == [(0, 33)]
     assert next(iter(found.by_reason())) == "too_dark"
     assert list(found.by_reason())[-1] == "kept"
     assert found.config == CONFIG
@@ -114,8 +116,27 @@ def test_without_the_curated_set_it_is_said(filtered: Path, tmp_path: Path) -> N
 
 
 def test_the_report_knows_which_episode_a_segment_is_of(filtered: Path) -> None:
-    found = {(item.episode_id, item.effect) for item in filter_refusals(filtered)}
+    outcomes = read_outcomes(filtered)
+    found = {(item.episode_id, item.effect) for episode in outcomes.values() for item in filter_refusals(episode)}
     assert ("dark", CUT) in found
     assert ("black", QUARANTINED) in found
-    assert len(first_of_each_episode(read_rows(filtered / "index.parquet"))) == 3
+    assert {name: len(episode.kept) for name, episode in outcomes.items()} == {
+        "black": 0, "dark": 2, "healthy": 1, "turned": 1,
+    }  # fmt: skip
     assert [episode_of(name) for name in ("a@00012", "a@b", "a", "a@b@00001")] == ["a", "a@b", "a", "a@b"]
+
+
+def test_hostile_reasons_stay_text(filtered: Path, hostile_text: str, tmp_path: Path) -> None:
+    copy = tmp_path / "filter" / "key"
+    shutil.copytree(filtered, copy)
+    (tmp_path / "curate").symlink_to(filtered.parent.parent / "curate")
+    for name, column in (("quarantine.parquet", "reason"), ("index.parquet", "stage2_reason")):
+        table = pq.read_table(copy / name)
+        texts = [None if text is None else hostile_text for text in table[column].to_pylist()]
+        place = table.column_names.index(column)
+        pq.write_table(table.set_column(place, table.schema.field(place), pa.array(texts, pa.string())), copy / name)
+    inspect(copy, tmp_path / "out")
+    page = (tmp_path / "out" / "filters" / "index.html").read_text()
+    assert "<script>alert" not in page
+    assert page.count("&lt;script&gt;alert(") >= 3  # in the list, as a heading and as an address
+    assert sorted(path.suffix for path in (tmp_path / "out" / "filters").iterdir()) == [".html", ".jpg", ".jpg", ".jpg"]

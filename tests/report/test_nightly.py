@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from worldline_core.errors import ArtifactError
-from worldline_core.report.nightly import Measured, compare_with_history, read_history, record_night, verdict
+from worldline_core.evaluation.scores import Interval
+from worldline_core.report.nightly import compare_with_history, read_history, record_night, verdict
 
 
 def scores(folder: Path, mean: float) -> dict[str, Path]:
@@ -55,7 +56,7 @@ def test_a_drop_beyond_the_interval_is_a_regression(tmp_path: Path) -> None:
     ],
 )
 def test_verdicts(metric: str, mean: float, expected: str) -> None:
-    assert verdict(metric, Measured(mean, mean, mean), Measured(0.5, 0.4, 0.6)) == expected
+    assert verdict(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)) == expected
 
 
 def test_the_same_night_is_replaced(tmp_path: Path) -> None:
@@ -92,3 +93,22 @@ def test_a_damaged_history_is_named(tmp_path: Path) -> None:
     (tmp_path / "history.jsonl").write_text('{"night": "2026-11-20"}\n')
     with pytest.raises(ArtifactError, match=r"(?s)not a night.*history\.jsonl"):
         read_history(tmp_path)
+
+
+def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifacts: dict[str, Path]) -> None:
+    name = "<b onmouseover=alert(1)>"
+    for number, mean in enumerate((0.6, 0.5)):
+        found = scores(tmp_path / str(number), mean)
+        summary = json.loads((tmp_path / str(number) / "summary.json").read_text())
+        summary["metrics"]["test"][name] = summary["metrics"]["test"]["shipped_stage2"]
+        (tmp_path / str(number) / "summary.json").write_text(json.dumps(summary))
+        found["evaluate_planning"] = run_artifacts["evaluate_planning"]  # its instructions are hostile, too
+        folder = compare_with_history(found, tmp_path / "history", f"{number} {hostile_text}")
+    pages = {path.name: path.read_text() for path in sorted(folder.glob("*.html"))}
+    assert {"index.html", "quality.html", "planning.html"} <= set(pages)
+    for text in pages.values():
+        assert "<script>alert" not in text
+        assert name not in text
+    assert "Night 1 &lt;script&gt;" in pages["index.html"]
+    assert "&lt;b onmouseover=alert(1)&gt;/robot_iou@head" in pages["index.html"]
+    assert "&lt;script&gt;alert(" in pages["planning.html"]

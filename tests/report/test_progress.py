@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from worldline_core.pages.page import duration
 from worldline_core.report.progress import (
     SHARES,
     DoneNode,
     Estimate,
-    duration,
     estimate_left,
     write_finished_page,
     write_progress_page,

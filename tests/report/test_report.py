@@ -11,8 +11,11 @@ from pathlib import Path
 import av
 import pytest
 
+from tests.report.conftest import EPISODES, write_episode_set
 from worldline_core.errors import ArtifactError
-from worldline_core.report.cost import block_ratio, block_words, blocks_of
+from worldline_core.report.context import ReportContext
+from worldline_core.report.cost import Timing
+from worldline_core.report.filters import filters_section
 from worldline_core.report.report import ReportConfig, report
 
 SECTIONS = (
@@ -104,6 +107,17 @@ def test_hostile_text_stays_text(full_report: Path) -> None:
     assert "</script>" not in (full_report / "run" / "run.js").read_text()
 
 
+def test_hostile_names_and_reasons_of_what_was_refused_stay_text(hostile_text: str, tmp_path: Path) -> None:
+    inputs = {name: tmp_path / name for name in ("curate", "filter")}
+    for folder in inputs.values():
+        write_episode_set(folder, EPISODES[:1], name=hostile_text, reason=hostile_text)
+    section = filters_section(ReportContext(ReportConfig(), inputs, tmp_path / "out"))
+    page = Page(str(section.body))
+    assert (page.scripts, page.handlers, page.open) == (0, [], [])
+    assert str(section.body).count("&lt;script&gt;alert(") >= 4
+    assert "&lt;b&gt;12&lt;/b&gt; of 33 frames" in str(section.body)
+
+
 def test_videos_are_loaded_when_they_are_seen(full_report: Path) -> None:
     found = pages(full_report)
     videos = [tag for name in ("index", "videos") for tag in re.findall(r"<video[^>]*>", found[name])]
@@ -153,7 +167,7 @@ def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path) -> 
     cost = parts["cost"]
     assert "Time of each block, from the first to number 50" in cost
     assert "1.04\u202f\u00d7" in cost
-    assert "block 1 500\u202fms, median 510\u202fms, block 50 520\u202fms" in cost
+    assert "Block 1: 500\u202fms, median: 510\u202fms, block 50: 520\u202fms" in cost
     assert "a slow machine" in cost
     assert "ratio 1.04" in parts["efficiency_tile"]
     # A chart's line has a point for every block.
@@ -162,11 +176,10 @@ def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path) -> 
 
 
 def test_a_ratio_needs_enough_blocks_at_both_ends() -> None:
-    assert block_ratio([1.0] * 9) is None
-    assert block_ratio([1.0] * 5 + [2.0] * 5) == 2.0
-    assert blocks_of({"block_seconds": [1.0, 2.0]}) == [1.0, 2.0]
-    assert blocks_of({}) == []
-    assert "1.04" not in block_words("causal", [0.5, 0.52])
+    assert Timing("causal", {"block_seconds": [1.0] * 9}).ratio is None
+    assert Timing("causal", {"block_seconds": [1.0] * 5 + [2.0] * 5}).ratio == 2.0
+    assert Timing("causal", {"block_seconds": [1.0, 2.0]}).blocks == [1.0, 2.0]
+    assert Timing("causal", {}).blocks == []
 
 
 def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
@@ -177,7 +190,7 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
     assert "no weights in the configured folder" in found["quality"]
     assert "0.930" in found["quality"]  # the segmenter's own accuracy
     assert "by a second segmenter, colour" in found["quality"]
-    assert "selector&#39;s ceiling" in found["planning"]
+    assert "recorded videos (ceiling)" in found["planning"]
     # A choice that succeeds in two of five runs is neither a success nor a failure.
     assert re.search(r"bank_2.*?<td[^>]*>0\.40</td>", found["planning"], re.DOTALL)
     assert re.search(r"<th[^>]*>lift</th><td[^>]*>3</td><td[^>]*>0\.45</td><td[^>]*>0\.95</td>", found["planning"])
@@ -187,7 +200,7 @@ def test_numbers_of_the_scores_are_on_the_pages(full_report: Path) -> None:
 
 
 def test_split_is_checked_not_assumed(full_report: Path) -> None:
-    assert "none of the 2 test scenes is among the 1 training scenes" in pages(full_report)["data"]
+    assert "None of the 2 test scenes is among the 1 scenes of training and validation." in pages(full_report)["data"]
 
 
 def test_missing_parts_are_said_to_be_missing(run_artifacts: dict[str, Path], tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from worldline_core.report.filters import with_unit
-from worldline_core.report.methods import in_order, method
-from worldline_core.report.video_scores import VideoScores, best_median_worst, choose_episodes
+from worldline_core.report.video_scores import VideoScores, in_order, method
+from worldline_core.report.videos import best_median_worst, choose_episodes
 
 
 @pytest.mark.parametrize(

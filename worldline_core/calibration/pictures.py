@@ -176,7 +176,7 @@ def _drawn(
     tiles = []
     for n in chosen:
         tile = draw_overlay(images[n], tracks, n - lag, view, tile_height=tile_height, style=style)
-        tiles.append(draw_tag(tile, f"frame {n}", size_px=11, corner="bottom-left"))
+        tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
     return np.stack(tiles)
 
 

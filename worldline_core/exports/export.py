@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.curation.source_table import SOURCES_FILE
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
@@ -21,6 +22,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
 from worldline_core.exports.rollout import export_rollout
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import write_json_atomic
 
@@ -140,9 +142,6 @@ def _copy_sources(episodes: EpisodeSet, output: Path, positions: Sequence[int]) 
 def _export_rollouts(
     artifact: Path, output: Path, formats: Sequence[str], episode_ids: Sequence[str], episodes: Path | None
 ) -> list[Path]:
-    from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.rollout.rollout_set import RolloutSet
-
     folder = episodes or linked_folder(artifact, "episodes")
     if folder is None:
         raise ArtifactError(

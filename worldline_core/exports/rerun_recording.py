@@ -115,9 +115,7 @@ def _log_cameras(stream: rr.RecordingStream, content: RecordingContent) -> None:
         if camera is not None:
             height, width = frames.shape[1:3]
             K = np.array(camera.resized(width, height).K, dtype=np.float64)
-            K[:2, 2] += (
-                0.5  # Rerun counts pixels from the picture's corner, this project from the first pixel's centre.
-            )
+            K[:2, 2] += 0.5  # Rerun counts pixels from the picture's corner, this project from the first pixel's centre
             pinhole = rr.Pinhole(
                 image_from_camera=K,
                 resolution=[width, height],
@@ -221,16 +219,8 @@ def _log_signals(stream: rr.RecordingStream, content: RecordingContent) -> None:
 
 
 def _log_description(stream: rr.RecordingStream, episode: Episode) -> None:
-    facts = {
-        "episode": episode.episode_id,
-        "embodiment": episode.embodiment,
-        "scene": episode.scene,
-        "task family": episode.task_family,
-        "instruction": episode.instruction,
-        "outcome": episode.outcome,
-        "split": episode.split,
-    }
-    text = "\n".join(f"{name}: {value}" for name, value in facts.items())
+    names = ("episode_id", "embodiment", "scene", "task_family", "instruction", "outcome", "split")
+    text = "\n".join(f"{name.replace('_', ' ')}: {getattr(episode, name)}" for name in names)
     stream.log("description", rr.TextDocument(text, media_type=rr.MediaType.TEXT), static=True)
 
 

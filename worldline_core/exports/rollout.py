@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.mcap.writer import write_rollout_mcap
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.pictures.side_by_side import write_side_by_side
+from worldline_core.rollout.rollout_set import RolloutSet
 
 if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-    from worldline_core.data.episodes.episode_set import EpisodeSet
     from worldline_core.exports.rerun_recording import RecordingContent
-    from worldline_core.rollout.rollout_set import RolloutSet
 
 FORMATS = ("mp4", "rrd", "mcap")
 
@@ -56,14 +58,18 @@ def export_rollout(
             got=", ".join(sets) or "no RolloutSet", next_step="list what was predicted with `worldline inspect <folder>`",
         )  # fmt: skip
     found = None if tracks is None else tracks.tracks(episode_id)
-    content = recording_content(having, episode_set, found, episode_id)
+    sigma_px_ref = SIGMA_PX_REFERENCE if tracks is None else tracks.sigma_px_ref
+    content = recording_content(having, episode_set, found, episode_id, sigma_px_ref=sigma_px_ref)
     stem = name or safe_stem(episode_id)
     output.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     if "mp4" in formats:
-        written += _write_videos(content, output, stem)
+        for view, frames in content.true_frames.items():
+            predicted = {method: views[view] for method, views in content.predicted_frames.items() if view in views}
+            made = write_side_by_side(output / f"{stem}_{view}.mp4", {"true": frames, **predicted}, content.episode.fps)
+            written += [made.video, made.poster]
     if "rrd" in formats:
-        from worldline_core.exports.rerun_recording import write_rerun_recording
+        from worldline_core.exports.rerun_recording import write_rerun_recording  # imports Rerun
 
         written.append(output / f"{stem}.rrd")
         write_rerun_recording(written[-1], content)
@@ -94,25 +100,11 @@ def recording_content(
     return RecordingContent(episode, true_frames, predicted, tracks, episode.state_names or (), sigma_px_ref)
 
 
-def _write_videos(content: RecordingContent, output: Path, stem: str) -> list[Path]:
-    """One side-by-side video per view: truth, then every method."""
-    from worldline_core.pictures.side_by_side import write_side_by_side
-
-    written: list[Path] = []
-    for view, frames in content.true_frames.items():
-        predicted = {method: views[view] for method, views in content.predicted_frames.items() if view in views}
-        made = write_side_by_side(output / f"{stem}_{view}.mp4", {"true": frames, **predicted}, content.episode.fps)
-        written += [made.video, made.poster]
-    return written
-
-
 def write_mcap_recordings(content: RecordingContent, output: Path, stem: str) -> list[Path]:
     """Write `<stem>_<method>.mcap` for every method, with cameras and commanded tool poses, and return the files.
 
     Calibration follows the frames' size; poses are cut to the prediction's length.
     """
-    from worldline_core.data.mcap.writer import write_rollout_mcap
-
     episode = content.episode
     written: list[Path] = []
     for method, views in content.predicted_frames.items():
@@ -122,11 +114,8 @@ def write_mcap_recordings(content: RecordingContent, output: Path, stem: str) ->
             for view, frames in views.items()
             if view in episode.cameras
         }
-        facts = {
-            "method": method,
-            "episode_id": episode.episode_id,
-            "embodiment": episode.embodiment,
-            "instruction": episode.instruction,
+        facts = {"method": method} | {
+            name: getattr(episode, name) for name in ("episode_id", "embodiment", "instruction")
         }
         written.append(output / f"{stem}_{method}.mcap")
         write_rollout_mcap(

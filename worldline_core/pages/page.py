@@ -1,6 +1,6 @@
 """Static pages from templates: every text is escaped, styles and scripts are inside the page, media lie beside it.
 
-Templates lie beside the code that fills them and are named from the package's root: `report/planning.html`.
+Templates lie beside the code that fills them and are named from the package's root: `report/quality.html`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     found.globals |= {"asset": asset, "interval": interval}
-    found.filters |= {"number": number, "percent": percent, "words": words, "markdown": markdown}
+    found.filters |= {"number": number, "percent": percent, "words": words, "duration": duration, "markdown": markdown}
     return found
 
 
@@ -88,6 +88,14 @@ def percent(share: float, digits: int = 0) -> str:
     return f"{number(100 * float(share), digits)}{NARROW_SPACE}%"
 
 
+def duration(seconds: float) -> str:
+    """Seconds in words that a reader takes in at once."""
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
 def words(name: object) -> str:
     """A name of the code as words: `held_out` as `held out`."""
     return str(name).replace("_", " ")
@@ -97,9 +105,13 @@ def interval(measured: dict[str, float] | None, digits: int = 2, *, signed: bool
     """`{"mean", "low", "high"}` as a value with its interval in smaller type, `0.52 [0.48, 0.56]`; None stays None."""
     if measured is None:
         return None
-    shown = Markup('<span class="value">{}</span>').format(number(float(measured["mean"]), digits, signed=signed))
-    bounds = [number(float(measured[key]), digits) for key in ("low", "high")]
-    return shown + Markup('<span class="interval">[{}, {}]</span>').format(*bounds)
+    low, high = (number(float(measured[key]), digits) for key in ("low", "high"))
+    return noted(number(float(measured["mean"]), digits, signed=signed), f"[{low}, {high}]")
+
+
+def noted(value: str, note: str) -> Markup:
+    """A value of a table with a note in smaller type."""
+    return render_macro("pages/parts.html", "noted", value=value, note=note)
 
 
 def code(text: object) -> Markup:

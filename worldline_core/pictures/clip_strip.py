@@ -72,7 +72,7 @@ def clip_strip(strip: ClipStrip, *, tile_height: int = 96) -> Picture:
         blocks.append(text_strip(strip.note, width, 18, size_px=12, ink=MUTED))
     blocks += [pad(row, _MARGIN, width), blank(3, width), pad(_bands(strip, row.shape[1]), _MARGIN, width)]
     if strip.curve is not None:
-        blocks += [blank(3, width), pad(_curve(strip, row.shape[1]), _MARGIN, width)]
+        blocks += [blank(3, width), pad(_curve(strip.curve, strip.count, row.shape[1]), _MARGIN, width)]
     return np.concatenate([*blocks, blank(12, width)], axis=0)
 
 
@@ -85,28 +85,26 @@ def stacked(pictures: Sequence[Picture]) -> Picture:
 def _bands(strip: ClipStrip, width: int) -> Picture:
     """Along time: green where kept, a band of its own colour for each reason where dropped."""
     reasons = [reason for reason, flags in strip.dropped.items() if flags.any()]
-    canvas = Image.new("RGB", (width, _BAND + max(0, len(reasons) - 1) * (_BAND // 2)), PAPER)
+    height = _BAND + max(0, len(reasons) - 1) * (_BAND // 2)
+    canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     draw.rectangle((0, 0, width, _BAND - 1), fill=KEPT_COLOUR)
     for number, reason in enumerate(reasons):
-        top = 0 if number == 0 else _BAND + (number - 1) * (_BAND // 2) + 1
-        bottom = _BAND - 1 if number == 0 else top + _BAND // 2 - 2
+        top = _BAND + (number - 1) * (_BAND // 2) + 1
         for i in np.flatnonzero(strip.dropped[reason]):
-            edges = (i * width / strip.count, (i + 1) * width / strip.count)
-            draw.rectangle((edges[0], top, edges[1] - 1, bottom), fill=reason_colour(reason))
+            left, right = i * width / strip.count, (i + 1) * width / strip.count - 1
+            draw.rectangle((left, 0, right, _BAND - 1), fill=reason_colour(reason))
             if number:
-                draw.rectangle((edges[0], 0, edges[1] - 1, _BAND - 1), fill=reason_colour(reason))
+                draw.rectangle((left, top, right, top + _BAND // 2 - 2), fill=reason_colour(reason))
     for moment in strip.moments:
         x = (moment + 0.5) * width / strip.count
         draw.line((x, _BAND - 4, x, _BAND - 1), fill=(255, 255, 255), width=2)
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def _curve(strip: ClipStrip, width: int) -> Picture:
+def _curve(curve: tuple[str, NDArray[np.floating], float], count: int, width: int) -> Picture:
     """The measured values along time with the threshold as a dashed line."""
-    if strip.curve is None:
-        return blank(1, width)
-    name, values, threshold = strip.curve
+    name, values, threshold = curve
     low, high = min(0.0, float(values.min())), max(float(values.max()), 1.15 * threshold)
     high = min(high, 6 * threshold) if threshold > 0 else high
     span = max(high - low, 1e-9)
@@ -116,7 +114,7 @@ def _curve(strip: ClipStrip, width: int) -> Picture:
     def y(value: float) -> float:
         return _CURVE - 4 - (min(value, high) - low) / span * (_CURVE - _LABEL - 8)
 
-    points = [((i + 0.5) * width / strip.count, y(float(value))) for i, value in enumerate(values)]
+    points = [((i + 0.5) * width / count, y(float(value))) for i, value in enumerate(values)]
     for x in range(0, width, 12):
         draw.line((x, y(threshold), x + 6, y(threshold)), fill=(179, 55, 47), width=1)
     if len(points) > 1:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from worldline_core.pictures.labels import INK, MUTED, PAPER, Picture, Upscale, scale_frames, scaled_size, text_strip
 
+GAP_PX, MARGIN_PX = 4, 12
+
 
 @dataclass(frozen=True)
 class SheetRow:
@@ -35,7 +37,6 @@ def contact_sheet(
     title: str | None = None,
     column_titles: Sequence[str] = (),
     upscale: Upscale = "lanczos",
-    gap_px: int = 4,
     min_width: int = 0,
 ) -> Picture:
     """Composes labelled rows into one picture.
@@ -56,24 +57,21 @@ def contact_sheet(
         scale_frames(row.frames, scaled_size(row.frames.shape[1], row.frames.shape[2], tile_height), upscale)
         for row in rows
     ]
-    margin_px = 12
-    width = max(tile.shape[0] * (tile.shape[2] + gap_px) - gap_px for tile in tiles) + 2 * margin_px
+    width = max(tile.shape[0] * (tile.shape[2] + GAP_PX) - GAP_PX for tile in tiles) + 2 * MARGIN_PX
     width = max(width, min_width)
-    blocks: list[Picture] = [blank(margin_px, width)]
+    blocks: list[Picture] = [blank(MARGIN_PX, width)]
     if title:
-        blocks += [text_strip(title, width, 30, size_px=19)]
+        blocks.append(text_strip(title, width, 30, size_px=19))
     if column_titles:
-        blocks += [column_heading(column_titles, tiles[0].shape[2], gap_px, margin_px, width)]
+        tile_width = tiles[0].shape[2]
+        strips = np.stack([text_strip(t, tile_width, 24, size_px=14, align="centre") for t in column_titles])
+        blocks.append(pad(joined(strips, GAP_PX), MARGIN_PX, width))
     for row, tile in zip(rows, tiles, strict=True):
-        if row.title:
-            blocks += [
-                pad(text_strip(row.title, width - 2 * margin_px + 12, 22, size_px=15, ink=INK), margin_px - 6, width)
-            ]
-        if row.note:
-            blocks += [
-                pad(text_strip(row.note, width - 2 * margin_px + 12, 18, size_px=12, ink=MUTED), margin_px - 6, width)
-            ]
-        blocks += [pad(joined(tile, gap_px), margin_px, width), blank(10, width)]
+        for text, height, size_px, ink in ((row.title, 22, 15, INK), (row.note, 18, 12, MUTED)):
+            if text:
+                strip = text_strip(text, width - 2 * MARGIN_PX + 12, height, size_px=size_px, ink=ink)
+                blocks.append(pad(strip, MARGIN_PX - 6, width))
+        blocks += [pad(joined(tile, GAP_PX), MARGIN_PX, width), blank(10, width)]
     return np.concatenate(blocks, axis=0)
 
 
@@ -95,9 +93,3 @@ def pad(picture: Picture, left: int, width: int) -> Picture:
     shown = picture[:, : width - left]
     page[:, left : left + shown.shape[1]] = shown
     return page
-
-
-def column_heading(titles: Sequence[str], tile_width: int, gap_px: int, left: int, width: int) -> Picture:
-    """A strip with one centred heading a column."""
-    strips = np.stack([text_strip(title, tile_width, 24, size_px=14, align="centre") for title in titles])
-    return pad(joined(strips, gap_px), left, width)

@@ -37,11 +37,8 @@ def fit_text(text: str, width_px: int, size_px: int) -> str:
     """Cuts a line so that it fits a width, ending in an ellipsis when something was cut."""
     if text_width_px(text, size_px) <= width_px:
         return text
-    for end in range(len(text) - 1, 0, -1):
-        shortened = text[:end].rstrip() + "..."
-        if text_width_px(shortened, size_px) <= width_px:
-            return shortened
-    return ""
+    shortened = (text[:end].rstrip() + "..." for end in range(len(text) - 1, 0, -1))
+    return next((found for found in shortened if text_width_px(found, size_px) <= width_px), "")
 
 
 def text_strip(
@@ -71,17 +68,16 @@ def text_strip(
     return np.asarray(strip, dtype=np.uint8)
 
 
-def draw_tag(picture: Picture, text: str, *, size_px: int = 13, corner: str = "top-left") -> Picture:
-    """A small dark tag with white text in a corner of a copy of the picture."""
+def draw_tag(picture: Picture, text: str, *, size_px: int = 13) -> Picture:
+    """A copy of the picture with a small dark tag with white text in its lower left corner."""
     height, width = picture.shape[:2]
     shown = fit_text(text, width - 10, size_px)
     tag_width, tag_height = text_width_px(shown, size_px) + 10, size_px + 7
-    left = 0 if corner.endswith("left") else width - tag_width
-    top = 0 if corner.startswith("top") else height - tag_height
+    top = height - tag_height
     canvas = Image.fromarray(picture)
     draw = ImageDraw.Draw(canvas, "RGBA")
-    draw.rectangle((left, top, left + tag_width, top + tag_height), fill=(16, 18, 22, 190))
-    draw.text((left + 5, top + tag_height / 2), shown, font=font(size_px), fill=(255, 255, 255, 255), anchor="lm")
+    draw.rectangle((0, top, tag_width, top + tag_height), fill=(16, 18, 22, 190))
+    draw.text((5, top + tag_height / 2), shown, font=font(size_px), fill=(255, 255, 255, 255), anchor="lm")
     return np.asarray(canvas, dtype=np.uint8)
 
 

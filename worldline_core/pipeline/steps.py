@@ -247,7 +247,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        7,
+        8,
         "worldline_core.report.report",
         "report",
         "ReportConfig",

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
-from worldline_core.actions.overlay_views import overlay_sheet
-from worldline_core.actions.overlays import OverlayStyle, heat_picture
+from worldline_core.actions.action_maps import render_action_maps
+from worldline_core.actions.episode_tracks import ActionTracks, collate_tracks
+from worldline_core.actions.overlays import heat_picture
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.pages.page import Table, number, percent, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import Picture
+from worldline_core.pages.page import Table, noted, number, percent, words
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
 from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.episode_sheet import episode_overlay
 from worldline_core.store.artifact_files import read_json
-
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-    from worldline_core.data.episodes.episode_set import EpisodeSet
 
 TITLE = "Action maps"
 LATENT_PIXELS = 8
@@ -29,8 +26,6 @@ CHANNEL_LABELS = ("heat", "depth", "rot 1", "rot 2", "rot 3", "rot 4", "rot 5", 
 
 def actions_section(context: ReportContext) -> Section:
     """Overlays of a few episodes in three views, and the nine channels of one moment."""
-    from worldline_core.actions.episode_tracks import ActionTracks
-
     folder = context.inputs.get("render_actions")
     if folder is None:
         return Section("actions", TITLE, missing="no ActionTracks were given (input render_actions).")
@@ -76,11 +71,8 @@ def sample_table(folder: Path) -> Table | None:
     for name, numbers in sorted(counts.items()):
         total = sum(numbers.get(cause, 0) for cause in causes) or 1
         found = [numbers.get(cause, 0) for cause in causes]
-        shown = [
-            Markup('{}<span class="interval">{}</span>').format(number(count), percent(count / total))
-            for count in found
-        ]
-        rows.append([name, numbers.get("episodes"), *shown])
+        shares = [noted(number(count), percent(count / total)) for count in found]
+        rows.append([name, numbers.get("episodes"), *shares])
     headings = ["Embodiment", "Episodes", *[words(cause).capitalize() for cause in causes]]
     caption = (
         "Samples (one per frame, view and arm). Only valid ones are drawn; the others are masked to zero and counted."
@@ -92,9 +84,6 @@ def channels_picture(
     context: ReportContext, episodes: EpisodeSet, tracks: ActionTracks, index: int
 ) -> tuple[Markup, str]:
     """The nine channels of one moment in each view, on the latent grid: what the model is given; and its caption."""
-    from worldline_core.actions.action_maps import render_action_maps
-    from worldline_core.actions.episode_tracks import collate_tracks
-
     name = episodes.rows[index].episode_id
     found = tracks.tracks(name)
     moment = found.num_frames // 2
@@ -125,17 +114,3 @@ def first_per_embodiment(context: ReportContext, episodes: EpisodeSet) -> list[i
         if row.bank is None and len(row.views) > 1:
             chosen.setdefault(row.embodiment, index)
     return [chosen[name] for name in sorted(chosen)][: context.config.overlay_episodes]
-
-
-def episode_overlay(
-    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float, title: str | None = None
-) -> Picture:
-    """Four moments of an episode in every view, with what the tracks say drawn over them.
-
-    Raises:
-        DataError: the episode has no view with a track, or its frames cannot be decoded.
-    """
-    row = episodes.rows[index]
-    moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
-    frames = {view: np.asarray(episodes.frames(index, view, moments)) for view in tracks.views if view in row.views}
-    return overlay_sheet(frames, tracks, moments, style=OverlayStyle(sigma_px_ref), title=title)

@@ -7,45 +7,43 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from markupsafe import Markup
+from pydantic import Field
 
-from worldline_core.pages.page import render
-from worldline_core.pictures.labels import jpeg_bytes, png_bytes
-from worldline_core.report.report_config import ReportConfig
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.pages.page import render, render_macro
+from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
 from worldline_core.report.video_scores import VideoScores
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import JsonObject, read_json
 from worldline_core.store.atomic import write_bytes_atomic
 
-if TYPE_CHECKING:
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.pictures.labels import Picture
-    from worldline_core.rollout.rollout_set import RolloutSet
 
+class ReportConfig(StrictModel):
+    """What the report shows."""
 
-@dataclass(frozen=True)
-class ReportInputs:
-    """Artifact folders by name: a step (`curate`) or a step and a variant (`rollout.stage2`, `curate.banks`)."""
-
-    folders: Mapping[str, Path]
-
-    def get(self, name: str) -> Path | None:
-        """The folder of a name, or None."""
-        return self.folders.get(name)
-
-    def variants(self, step: str) -> dict[str, Path]:
-        """All folders of a step: variant -> folder; the plain name has the variant ""."""
-        found = {"": self.folders[step]} if step in self.folders else {}
-        prefix = f"{step}."
-        return found | {
-            name.removeprefix(prefix): path for name, path in sorted(self.folders.items()) if name.startswith(prefix)
-        }
-
-    def manifest(self, name: str) -> JsonObject:
-        """An artifact's manifest, or an empty object for a folder without one."""
-        folder = self.folders.get(name)
-        return read_json(folder / "manifest.json") if folder is not None else {}
+    title: str = Field(default="WorldLine: from robot recordings to an action-driven simulator", min_length=1)
+    subtitle: str = (
+        "What was recorded, kept, trained, predicted and chosen in this run, and how well: measured, with intervals."
+    )
+    primary_method: str | None = Field(
+        default=None,
+        description="the method whose numbers head the page; none: the long-trained Stage II, else this run's",
+    )
+    tile_height: int = Field(
+        default=256, ge=32, le=1080, description="height of one video in a side-by-side video, pixels"
+    )
+    upscale: Literal["lanczos", "nearest"] = "lanczos"
+    max_columns: int = Field(
+        default=6, ge=2, le=12, description="columns of a side-by-side video, the truth among them"
+    )
+    contact_sheet_rows: int = Field(default=12, ge=1, le=64)
+    overlay_episodes: int = Field(default=4, ge=1, le=32)
+    rerun: bool = Field(default=True, description="write a Rerun recording of every episode shown")
+    mcap: bool = Field(default=True, description="write MCAP files of every episode shown")
 
 
 @dataclass(frozen=True)
@@ -65,16 +63,27 @@ class Section:
 
 @dataclass
 class ReportContext:
-    """The configuration, the inputs, and the folder that media go to.
+    """The configuration, the inputs, and the folder that pages and media go to.
 
-    `run_parts` collects what is not reproducible (times, devices, versions): it is written to `run/run.js`, outside of
-    the digested pages, and put into their slots when they are opened.
+    Attributes:
+        inputs: artifact folders by name: a step (`curate`), or a step and a variant (`rollout.stage2`).
+        run_parts: what is not reproducible (times, devices, versions). It is written to `run/run.js`, outside of the
+            digested pages, and put into their slots when they are opened.
     """
 
     config: ReportConfig
-    inputs: ReportInputs
+    inputs: Mapping[str, Path]
     output: Path
     run_parts: dict[str, Markup] = field(default_factory=dict)
+
+    def variants(self, step: str) -> dict[str, Path]:
+        """All folders of a step: variant -> folder; the plain name has the variant ""."""
+        found = {name.partition("."): path for name, path in sorted(self.inputs.items())}
+        return {variant: path for (name, _, variant), path in found.items() if name == step}
+
+    def manifest(self, name: str) -> JsonObject:
+        """An artifact's manifest, or an empty object for a folder without one."""
+        return read_json(self.inputs[name] / "manifest.json") if name in self.inputs else {}
 
     @cached_property
     def media(self) -> Path:
@@ -85,25 +94,21 @@ class ReportContext:
     @cached_property
     def video_scores(self) -> VideoScores:
         """Scores of every video evaluation."""
-        return VideoScores.read(self.inputs.variants("evaluate_video"))
+        return VideoScores.read(self.variants("evaluate_video").values())
 
     def summaries(self, step: str) -> list[JsonObject]:
         """Summaries of every evaluation of a step that has a method in it."""
-        found = [read_json(folder / "summary.json") for folder in self.inputs.variants(step).values()]
+        found = [read_json(folder / "summary.json") for folder in self.variants(step).values()]
         return [summary for summary in found if summary.get("methods")]
 
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
         """Predicted videos by method, those of candidate banks apart."""
-        from worldline_core.rollout.rollout_set import RolloutSet
-
-        return {name: RolloutSet.open(path) for name, path in self.inputs.variants("rollout").items()}
+        return {name: RolloutSet.open(path) for name, path in self.variants("rollout").items()}
 
     @cached_property
     def episodes(self) -> EpisodeSet | None:
         """The filtered episodes, or the curated ones when there are no filtered ones."""
-        from worldline_core.data.episodes.episode_set import EpisodeSet
-
         folder = self.inputs.get("filter") or self.inputs.get("curate") or self.inputs.get("episodes")
         return None if folder is None else EpisodeSet.open(folder)
 
@@ -112,17 +117,14 @@ class ReportContext:
         path = self.media / f"{name}.{'jpg' if photo else 'png'}"
         write_bytes_atomic(path, jpeg_bytes(picture) if photo else png_bytes(picture))
         height, width = picture.shape[:2]
-        return Markup('<img src="media/{}" alt="{}" width="{}" height="{}" loading="lazy">').format(
-            path.name, alt, width, height
-        )
+        file = f"media/{path.name}"
+        return render_macro("pages/parts.html", "picture", file=file, alt=alt, width=width, height=height)
 
-    def slot(
-        self, name: str, content: Markup, fallback: str = "Recorded when the report was made; see run/run.js."
-    ) -> Markup:
-        """A place in a page that is filled from `run/run.js`."""
-        self.run_parts[name] = content
-        note = Markup('<p class="muted">{}</p>').format(fallback) if fallback else ""
-        return Markup('<div data-run="{}">{}</div>').format(name, note)
+    def slot(self, name: str, content: Markup | str, fallback: str = "", *, inline: bool = False) -> Markup:
+        """A place in a page, or in a line of it, that is filled from `run/run.js`; `fallback` stands there until then."""
+        self.run_parts[name] = Markup.escape(content)
+        tag = "span" if inline else "div"
+        return render_macro("pages/parts.html", "slot", name=name, fallback=fallback, tag=tag)
 
     def section(self, anchor: str, title: str, lead: str = "", /, **values: object) -> Section:
         """A section whose content is the template of its name, filled with values."""
@@ -130,8 +132,7 @@ class ReportContext:
 
     def write_pages(self, home: Markup, sections: Sequence[Section]) -> None:
         """Write `index.html`, one page per section, and what is filled in when they are opened."""
-        for place, section in enumerate(sections):
-            following = sections[place + 1] if place + 1 < len(sections) else None
+        for section, following in zip(sections, [*sections[1:], None], strict=True):
             page = render("report/page.html", title=section.title, section=section, sections=sections, next=following)
             write_bytes_atomic(self.output / section.file, page.encode())
         # `</` would end a script element if this text were ever put into one.

@@ -6,21 +6,27 @@ The page is the Markdown file's text made into HTML: what is said is written onc
 from __future__ import annotations
 
 import re
-from collections import Counter
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import yaml
 from markupsafe import Markup
 
-from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.pages.charts import funnel_chart
 from worldline_core.pages.page import markdown, render, words
 from worldline_core.pictures.contact_sheet import contact_sheet
 from worldline_core.pictures.labels import jpeg_bytes
-from worldline_core.report.dataset_facts import UNKNOWN, DatasetFacts, hours_of
+from worldline_core.report.dataset_facts import (
+    UNKNOWN,
+    DatasetFacts,
+    counted,
+    frame_rates,
+    most_frequent,
+    recorded_time,
+)
 from worldline_core.report.episode_sheet import episode_rows, some_of_each
 from worldline_core.store.atomic import write_bytes_atomic
 
@@ -33,45 +39,21 @@ NONE = "-"
 
 # The hub knows these by name; every other licence is "other" with its name beside it.
 HUB_LICENSES = frozenset(
-    [
-        "apache-2.0",
-        "mit",
-        "bsd-2-clause",
-        "bsd-3-clause",
-        "cc0-1.0",
-        "cc-by-2.0",
-        "cc-by-2.5",
-        "cc-by-3.0",
-        "cc-by-4.0",
-        "cc-by-sa-3.0",
-        "cc-by-sa-4.0",
-        "cc-by-nc-2.0",
-        "cc-by-nc-3.0",
-        "cc-by-nc-4.0",
-        "cc-by-nd-4.0",
-        "cc-by-nc-nd-3.0",
-        "cc-by-nc-nd-4.0",
-        "cc-by-nc-sa-2.0",
-        "cc-by-nc-sa-3.0",
-        "cc-by-nc-sa-4.0",
-        "odc-by",
-        "odbl",
-        "pddl",
-        "gpl-3.0",
-        "lgpl-3.0",
-        "agpl-3.0",
-        "unknown",
-    ]
-)
-_SIZES = (
-    (10**3, "n<1K"),
-    (10**4, "1K<n<10K"),
-    (10**5, "10K<n<100K"),
-    (10**6, "100K<n<1M"),
-    (10**7, "1M<n<10M"),
-    (10**8, "10M<n<100M"),
-    (10**9, "100M<n<1B"),
-)
+    (
+        "apache-2.0", "mit", "bsd-2-clause", "bsd-3-clause", "cc0-1.0", "cc-by-2.0", "cc-by-2.5", "cc-by-3.0", "cc-by-4.0",
+        "cc-by-sa-3.0", "cc-by-sa-4.0", "cc-by-nc-2.0", "cc-by-nc-3.0", "cc-by-nc-4.0", "cc-by-nd-4.0", "cc-by-nc-nd-3.0",
+        "cc-by-nc-nd-4.0", "cc-by-nc-sa-2.0", "cc-by-nc-sa-3.0", "cc-by-nc-sa-4.0", "odc-by", "odbl", "pddl", "gpl-3.0",
+        "lgpl-3.0", "agpl-3.0", "unknown",
+    )
+)  # fmt: skip
+_SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B", "1B<n<10B")
+"""The hub's classes of size, a factor of ten each."""
+_PRIMARY_VIEW_REASONS = {
+    "source": "as the source declares",
+    "configured": "as configured",
+    "head": "the head's, because the source's own choice has no images",
+    "most_motion": "the view with most motion",
+}
 
 
 def write_card(folder: Path, output: Path, title: str | None = None) -> list[Path]:
@@ -89,15 +71,14 @@ def write_card(folder: Path, output: Path, title: str | None = None) -> list[Pat
     heading = title or f"EpisodeSet {folder.resolve().name}"
     pictures = _write_pictures(facts, output)
     text = render("report/card.md", pictures=pictures, picture_folder=PICTURES, **card_values(facts))
-    summary = summary_of(facts)
     header = yaml.safe_dump(hub_metadata(facts, heading), sort_keys=False, allow_unicode=True, width=120)
     readme, page = output / "README.md", output / "index.html"
-    write_bytes_atomic(readme, f"---\n{header}---\n\n# {plain(heading)}\n\n{plain(summary)}\n\n{text}".encode())
+    write_bytes_atomic(readme, f"---\n{header}---\n\n# {plain(heading)}\n\n{plain(facts.summary)}\n\n{text}".encode())
     funnel = funnel_chart(facts.funnel, title="Episodes left after each step")
     html = render(
         "report/card.html",
         title=heading,
-        subtitle=summary,
+        subtitle=facts.summary,
         funnel=funnel,
         body=markdown(text, heading=1, pictures=True),
     )
@@ -118,29 +99,34 @@ def hub_metadata(facts: DatasetFacts, title: str) -> dict[str, object]:
     metadata |= {
         "task_categories": ["robotics"],
         "tags": ["LeRobot", "WorldLine", "robotics", *embodiments],
-        "size_categories": [next((name for limit, name in _SIZES if facts.num_frames < limit), "1B<n<10B")],
+        "size_categories": [_SIZES[bisect_right([10**power for power in range(3, 10)], facts.num_frames)]],
         "configs": [
             {"config_name": Path(name).name, "data_files": f"{name}/data/*/*.parquet"}
-            for name in sorted(facts.sizes)
+            for name in sorted({row.dataset for row in facts.rows})
             if not name.startswith("..")
         ],
     }
     return {key: value for key, value in metadata.items() if value}
 
 
-def card_part(name: str, facts: DatasetFacts) -> Markup:
-    """One part of the card, `sources` or `duplicates`, as HTML for another page."""
-    return markdown(render(f"report/card_{name}.md", **card_values(facts)), heading=2)
+def card_parts(facts: DatasetFacts, names: Iterable[str]) -> Markup:
+    """Parts of the card, of `sources`, `contents` and `duplicates`, as HTML for another page."""
+    values = card_values(facts)
+    return markdown("\n\n".join(render(f"report/card_{name}.md", **values) for name in names), heading=2)
 
 
 def card_values(facts: DatasetFacts) -> dict[str, object]:
     """What the card says, by the names that its template uses: plain values, and tables as Markdown."""
-    rows = facts.rows
-    instructions = [(text or "(none)", count) for text, count in facts.instructions(MOST_INSTRUCTIONS)]
+    instructions = most_frequent(row.instruction for row in facts.rows)
+    kinds = ("Scenes", "Episodes", "Recorded", "Success", "Failure", "Unknown")
+    primary_views = [
+        f"{view} in {count} ({_PRIMARY_VIEW_REASONS.get(reason, reason)})"
+        for (view, reason), count in facts.primary_views
+    ]
     return {
         "plain": plain,
         "sources": markdown_table(
-            ("Source", "Kind", "Found", "Kept", "Hours", "fps", "Share in training", "Licence", "Redistribution"),
+            ("Source", "Kind", "Found", "Kept", "Recorded", "fps", "Share in training", "Licence", "Redistribution"),
             [_source_row(facts, name) for name in facts.names],
             range(2, 7),
         ),
@@ -148,15 +134,22 @@ def card_values(facts: DatasetFacts) -> dict[str, object]:
         "funnel": markdown_table(("Step", "Number"), facts.funnel, [1]),
         "reasons": markdown_table(("Step", "Reason", "Episodes", "For example"), facts.reasons, [2]),
         "contents": [
-            ("Embodiments", _contents(facts, "Embodiment", [row.embodiment for row in rows])),
-            ("Tasks", _contents(facts, "Task family", [words(row.task_family) for row in rows])),
-            ("Splits", _contents(facts, "Split", [words(row.split) for row in rows])),
+            (heading, markdown_table((name, *kinds), facts.by_property(value_of), range(1, 7)))
+            for heading, name, value_of in (
+                ("Embodiments", "Embodiment", lambda row: row.embodiment),
+                ("Tasks", "Task family", lambda row: words(row.task_family)),
+                ("Splits", "Split", lambda row: words(row.split)),
+            )
         ],
-        "views": markdown_table(("View", "Episodes", "Width x height", "fps", "Primary in"), _views(facts), [1, 4]),
-        "primary_views": _primary_views(facts),
-        "instructions": markdown_table(("Instruction", "Episodes"), instructions, [1]),
-        "instruction_notes": _instruction_notes(facts),
-        "calibrated": f"{facts.calibrated} of {len(rows)}",
+        "views": markdown_table(("View", "Episodes", "Width x height", "fps", "Primary in"), facts.views, [1, 4]),
+        "primary_views": "; ".join(primary_views),
+        "instructions": markdown_table(
+            ("Instruction", "Episodes"),
+            [(text or "(none)", count) for text, count in instructions[:MOST_INSTRUCTIONS]],
+            [1],
+        ),
+        "instruction_notes": _instruction_notes(facts, len(instructions)),
+        "calibrated": f"{facts.calibrated} of {len(facts.rows)}",
         "declared": markdown_table(
             ("Source", "Convention", "As recorded"),
             [(s.label, name, value) for s in facts.sources for name, value in sorted(s.conventions.items())],
@@ -168,7 +161,7 @@ def card_values(facts: DatasetFacts) -> dict[str, object]:
         ),
         "filtered": facts.filtered,
         "taken_out": {r: facts.duplicates(r) for r in ("duplicate", "near_duplicate", "duplicate_id", "scene_leak")},
-        "split_note": _split_note(facts),
+        "split_note": facts.split_note,
         "leakage": _leakage(facts),
     }
 
@@ -187,81 +180,18 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[object]], nu
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) if rows else ""
 
 
-def summary_of(facts: DatasetFacts) -> str:
-    """One sentence of size, one of what outcomes are."""
-    rows = facts.rows
-    segments = f" ({len(rows)} segments)" if len(rows) != facts.num_episodes else ""
-    outcomes = Counter(row.outcome for row in rows)
-    return (
-        f"{hours_text(rows)} hours in {facts.num_episodes} episodes{segments}, {facts.num_frames} frames per view;"
-        f" {counted(len({row.embodiment for row in rows}), 'embodiment')}, {counted(len({row.scene for row in rows}), 'scene')},"
-        f" {counted(len({row.instruction for row in rows if row.instruction}), 'instruction')}. Outcomes: {outcomes['success']}"
-        f" successes, {outcomes['failure']} failures, {outcomes['unknown']} unknown; they are labels for evaluation and"
-        " never reach a model."
-    )
-
-
-def counted(count: int, noun: str) -> str:
-    """A number and its noun."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
-def hours_text(rows: Sequence[EpisodeRow]) -> str:
-    """Hours with three digits that say something."""
-    hours = hours_of(rows)
-    if 0 < hours < 0.001:
-        return "< 0.001"
-    return f"{hours:,.0f}" if hours >= 100 else f"{hours:.3g}"
-
-
 def _source_row(facts: DatasetFacts, name: str) -> tuple[object, ...]:
     """Where episodes come from, how many came through, and what their licence allows."""
     own = [row for row in facts.rows if row.source == name]
     noted, weight = facts.source_facts(name), facts.weights.get(name)
     share = f"{100 * float(weight['share']):.1f} %" if isinstance(weight, dict) else NONE
     kind, found = (NONE, NONE) if noted is None else (noted.kind, noted.found)
-    kept, fps = len({(row.dataset, row.episode_index) for row in own}), sorted({f"{row.fps:g}" for row in own})
+    kept = len({(row.dataset, row.episode_index) for row in own})
     rights = (UNKNOWN, UNKNOWN) if noted is None else (noted.license, noted.redistribution)
-    return name, kind, found, kept, hours_text(own), ", ".join(fps) or NONE, share, *rights
+    return name, kind, found, kept, recorded_time(own), frame_rates(own) or NONE, share, *rights
 
 
-def _contents(facts: DatasetFacts, heading: str, values: Sequence[str]) -> str:
-    """Scenes, episodes, hours and outcomes by one property of the episodes."""
-    table = []
-    for value in sorted(set(values)):
-        own = [row for row, found in zip(facts.rows, values, strict=True) if found == value]
-        outcomes = Counter(row.outcome for row in own)
-        counts = (outcomes["success"], outcomes["failure"], outcomes["unknown"])
-        table.append((value, len({row.scene for row in own}), len(own), hours_text(own), *counts))
-    headings = (heading, "Scenes", "Episodes", "Hours", "Success", "Failure", "Unknown")
-    return markdown_table(headings, table, range(1, 7))
-
-
-def _views(facts: DatasetFacts) -> list[tuple[object, ...]]:
-    table = []
-    for view in facts.views:
-        own = [row for row in facts.rows if view in row.views]
-        sizes = ", ".join(facts.resolutions(own, view)) or UNKNOWN
-        fps = ", ".join(sorted({f"{row.fps:g}" for row in own}))
-        table.append((view, len(own), sizes, fps, sum(row.primary_view == view for row in own)))
-    return table
-
-
-def _primary_views(facts: DatasetFacts) -> str:
-    why = {
-        "source": "as the source declares",
-        "configured": "as configured",
-        "head": "the head's, because the source's own choice has no images",
-        "most_motion": "the view with most motion",
-    }
-    return "; ".join(
-        f"{view} in {count} ({why.get(reason, reason)})"
-        for (view, reason), count in sorted(facts.primary_views.items(), key=lambda item: (-item[1], item[0]))
-    )
-
-
-def _instruction_notes(facts: DatasetFacts) -> str:
-    kinds = len({row.instruction for row in facts.rows})
+def _instruction_notes(facts: DatasetFacts, kinds: int) -> str:
     notes: list[str] = []
     if kinds > MOST_INSTRUCTIONS:
         notes.append(f"The {MOST_INSTRUCTIONS} most frequent of {kinds}.")
@@ -290,18 +220,6 @@ def _leakage(facts: DatasetFacts) -> tuple[str, str]:
     rows = [(leak["learning_scene"], leak["testing_scene"], leak["distance"]) for leak in leaks[:MOST_LEAKS]]
     text = f"{counted(len(leaks), 'pair')} of scenes across the split look like one (first images; bits of 256):"
     return text, markdown_table(("Learnt from", "Tested on", "Differing bits"), rows, [2])
-
-
-def _split_note(facts: DatasetFacts) -> str:
-    """Whether training and test share a scene: counted, not assumed."""
-    learnt = {row.scene for row in facts.rows if row.split in ("train", "validation")}
-    tested = {row.scene for row in facts.rows if row.split in ("test", "ood_test")}
-    if not learnt or not tested:
-        return "Only one side of the split is in this set, so no scene can be on both."
-    shared = sorted(learnt & tested)
-    if shared:
-        return f"Warning: {len(shared)} scenes are both learnt from and tested on ({', '.join(shared[:4])})."
-    return f"No scene that is tested on ({len(tested)}) is among those that are learnt from ({len(learnt)})."
 
 
 def _write_pictures(facts: DatasetFacts, output: Path) -> list[tuple[str, str, int]]:

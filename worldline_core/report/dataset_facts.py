@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON
 from worldline_core.data.curation.rules import CURATION_FILE
@@ -20,6 +21,7 @@ from worldline_core.data.episodes.episode_index import (
     read_quarantine,
 )
 from worldline_core.data.episodes.instructions import RAW_INSTRUCTION
+from worldline_core.pages.page import duration
 from worldline_core.store.artifact_files import JsonObject, linked_folder, read_json, read_rows, read_table
 
 FINDINGS_FILE = "findings.parquet"
@@ -35,7 +37,6 @@ class DatasetFacts:
         rows: its episodes, or segments of episodes. curated: the same before the filters (`rows` itself where there were
             none).
         curation: curation.json. weights: source_weights.json.
-        sizes: (height, width) by dataset folder and view.
     """
 
     folder: Path
@@ -48,7 +49,6 @@ class DatasetFacts:
     curation: JsonObject
     weights: JsonObject
     findings: list[JsonObject]
-    sizes: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder: Path) -> DatasetFacts:
@@ -56,27 +56,21 @@ class DatasetFacts:
 
         Raises: DataError when it is none; ArtifactError when a table is damaged.
         """
-        rows = read_index(folder)
+        rows, refused = read_index(folder), read_quarantine(folder)
         filtered = (folder / FINDINGS_FILE).is_file()
         origin = _origin(folder, rows) if filtered else folder
-        refused = read_quarantine(folder)
         return cls(
-            folder,
-            rows,
-            rows if origin is None or not filtered else read_index(origin),
-            [] if origin is None else read_quarantine(origin),
-            refused if filtered else [],
-            filtered,
-            [] if origin is None else read_source_table(origin),
-            {} if origin is None else read_json(origin / CURATION_FILE),
-            {} if origin is None else read_json(origin / WEIGHTS_FILE),
-            read_rows(folder / FINDINGS_FILE) if filtered else [],
-            {name: _image_sizes(folder / name) for name in sorted({row.dataset for row in rows})},
+            folder=folder,
+            rows=rows,
+            curated=read_index(origin) if filtered and origin else rows,
+            refused_by_curation=read_quarantine(origin) if origin else [],
+            refused_by_filters=refused if filtered else [],
+            filtered=filtered,
+            sources=read_source_table(origin) if origin else [],
+            curation=read_json(origin / CURATION_FILE) if origin else {},
+            weights=read_json(origin / WEIGHTS_FILE) if origin else {},
+            findings=read_rows(folder / FINDINGS_FILE),
         )
-
-    @property
-    def hours(self) -> float:
-        return hours_of(self.rows)
 
     @property
     def num_frames(self) -> int:
@@ -88,30 +82,59 @@ class DatasetFacts:
         return len({(row.dataset, row.episode_index) for row in self.rows})
 
     @property
+    def summary(self) -> str:
+        """One sentence of size, one of what outcomes are."""
+        rows = self.rows
+        segments = f" ({len(rows)} segments)" if len(rows) != self.num_episodes else ""
+        kinds = (
+            counted(len({row.embodiment for row in rows}), "embodiment"),
+            counted(len({row.scene for row in rows}), "scene"),
+            counted(len({row.instruction for row in rows if row.instruction}), "instruction"),
+        )
+        outcomes = Counter(row.outcome for row in rows)
+        return (
+            f"{recorded_time(rows)} in {self.num_episodes} episodes{segments}, {self.num_frames} frames per view;"
+            f" {', '.join(kinds)}. Outcomes: {outcomes['success']} successes, {outcomes['failure']} failures,"
+            f" {outcomes['unknown']} unknown; they are labels for evaluation and never reach a model."
+        )
+
+    @property
+    def split_note(self) -> str:
+        """Whether training and test share a scene: counted, not assumed."""
+        learnt = {row.scene for row in self.rows if row.split in ("train", "validation")}
+        tested = {row.scene for row in self.rows if row.split in ("test", "ood_test")}
+        if not learnt or not tested:
+            return "Only one side of the split is in this set, so no scene can be on both."
+        shared = sorted(learnt & tested)
+        if shared:
+            return f"Warning: {len(shared)} scenes are in training and in test ({', '.join(shared[:4])})."
+        return f"None of the {len(tested)} test scenes is among the {len(learnt)} scenes of training and validation."
+
+    @property
     def funnel(self) -> list[tuple[str, int]]:
         """What is left after each step, in episodes, then in segments."""
-        found = len(self.curated) + len(self.refused_by_curation)
-        steps = [("episodes found", found), ("kept by curation", len(self.curated))]
-        if self.filtered:
-            steps += [("kept by the filters", self.num_episodes), ("segments of these", len(self.rows))]
-        steps += [
+        filtered = [("kept by the filters", self.num_episodes), ("segments of these", len(self.rows))]
+        return [
+            ("episodes found", len(self.curated) + len(self.refused_by_curation)),
+            ("kept by curation", len(self.curated)),
+            *(filtered if self.filtered else []),
             ("fit for Stage I", sum(row.stage1_ok for row in self.rows)),
             ("fit for Stage II", sum(row.stage2_ok for row in self.rows)),
         ]
-        return steps
 
     @property
     def reasons(self) -> list[tuple[str, str, int, str]]:
         """(step, reason, count, one example's detail) of everything that did not get through, the most frequent first."""
+        stage2 = [(row.stage2_reason, "kept for Stage I only") for row in self.rows if row.stage2_reason is not None]
         found: list[tuple[str, str, int, str]] = []
-        for step, refused in (("curation", self.refused_by_curation), ("filters", self.refused_by_filters)):
-            counts = Counter(row.reason for row in refused)
-            for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
-                example = next(row.detail for row in refused if row.reason == reason)
-                found.append((step, reason, count, example.splitlines()[0] if example else ""))
-        counts = Counter(row.stage2_reason for row in self.rows if row.stage2_reason is not None)
-        for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
-            found.append(("Stage II", reason, count, "kept for Stage I only"))
+        for step, refused in (
+            ("curation", [(row.reason, row.detail) for row in self.refused_by_curation]),
+            ("filters", [(row.reason, row.detail) for row in self.refused_by_filters]),
+            ("Stage II", stage2),
+        ):
+            first = dict(reversed(refused))
+            for reason, count in most_frequent(reason for reason, _ in refused):
+                found.append((step, reason, count, first[reason].partition("\n")[0]))
         return found
 
     @property
@@ -132,38 +155,50 @@ class DatasetFacts:
             found.setdefault(UNKNOWN if facts is None else facts.license, []).append(name)
         return dict(sorted(found.items()))
 
-    def resolutions(self, rows: Sequence[EpisodeRow], view: str) -> list[str]:
-        """Sizes "640x480" (width x height) of a view in some rows."""
-        sizes = {self.sizes.get(row.dataset, {}).get(view) for row in rows if view in row.views}
-        return [f"{size[1]}x{size[0]}" for size in sorted(size for size in sizes if size is not None)]
-
-    @property
-    def views(self) -> list[str]:
-        seen: dict[str, None] = {}
+    def by_property(self, value_of: Callable[[EpisodeRow], str]) -> list[tuple[object, ...]]:
+        """(value, scenes, rows, recorded time, successes, failures, unknown outcomes) of each value of a property of the rows."""
+        groups: dict[str, list[EpisodeRow]] = {}
         for row in self.rows:
-            seen |= dict.fromkeys(row.views)
-        return list(seen)
-
-    def instructions(self, most: int) -> list[tuple[str, int]]:
-        """The most frequent instructions; "" stands for none."""
-        counts = Counter(row.instruction for row in self.rows)
-        return sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:most]
-
-    def noted(self, key: str) -> Counter[str]:
-        """Values that rows note under a key of their conventions."""
-        values = (json.loads(row.conventions).get(key) for row in self.rows)
-        return Counter(str(value) for value in values if value is not None)
+            groups.setdefault(value_of(row), []).append(row)
+        table: list[tuple[object, ...]] = []
+        for value, own in sorted(groups.items()):
+            outcomes = Counter(row.outcome for row in own)
+            counts = [outcomes[name] for name in ("success", "failure", "unknown")]
+            table.append((value, len({row.scene for row in own}), len(own), recorded_time(own), *counts))
+        return table
 
     @property
-    def primary_views(self) -> Counter[tuple[str, str]]:
-        """Rows by (primary view, why it is that one)."""
-        return Counter(
-            (row.primary_view, str(json.loads(row.conventions).get(PRIMARY_VIEW_REASON, "source"))) for row in self.rows
+    def views(self) -> list[tuple[str, int, str, str, int]]:
+        """(view, rows that have it, its sizes "640x480", its frame rates, rows whose primary view it is)."""
+        contracts = {
+            name: read_json(self.folder / name / "meta" / "worldline" / "contract.json").get("views", {})
+            for name in {row.dataset for row in self.rows}
+        }
+        found: list[tuple[str, int, str, str, int]] = []
+        for view in dict.fromkeys(view for row in self.rows for view in row.views):
+            own = [row for row in self.rows if view in row.views]
+            sizes = [contracts[name].get(view) for name in {row.dataset for row in own}]
+            known = sorted({(int(size["height"]), int(size["width"])) for size in sizes if size})
+            shown = ", ".join(f"{width}x{height}" for height, width in known) or UNKNOWN
+            found.append((view, len(own), shown, frame_rates(own), sum(row.primary_view == view for row in own)))
+        return found
+
+    @cached_property
+    def conventions(self) -> list[JsonObject]:
+        """What each row notes of its source's declarations."""
+        return [json.loads(row.conventions) for row in self.rows]
+
+    @property
+    def primary_views(self) -> list[tuple[tuple[str, str], int]]:
+        """(primary view, why it is that one), and how many rows."""
+        return most_frequent(
+            (row.primary_view, str(noted.get(PRIMARY_VIEW_REASON, "source")))
+            for row, noted in zip(self.rows, self.conventions, strict=True)
         )
 
     @property
     def rewritten_instructions(self) -> int:
-        return sum(self.noted(RAW_INSTRUCTION).values())
+        return sum(noted.get(RAW_INSTRUCTION) is not None for noted in self.conventions)
 
     @property
     def calibration(self) -> list[tuple[str, int, int]]:
@@ -181,8 +216,14 @@ class DatasetFacts:
     @property
     def calibrated(self) -> int:
         """Rows whose every view has a calibration."""
-        known = {name: _calibrated_views(self.folder / name) for name in self.sizes}
-        return sum(set(row.views) <= known[row.dataset].get(row.episode_index, set()) for row in self.rows)
+        known: dict[tuple[str, int], set[str]] = {}
+        for name in {row.dataset for row in self.rows}:
+            # Only the two columns: the poses beside them may be large.
+            path = self.folder / name / "meta" / "worldline" / "cameras.parquet"
+            table = read_table(path, columns=["episode_index", "view"])
+            for row in [] if table is None else table.to_pylist():
+                known.setdefault((name, int(row["episode_index"])), set()).add(str(row["view"]))
+        return sum(set(row.views) <= known.get((row.dataset, row.episode_index), set()) for row in self.rows)
 
     def duplicates(self, reason: str) -> int:
         return sum(row.reason == reason for row in self.refused_by_curation)
@@ -197,21 +238,21 @@ def _origin(folder: Path, rows: Sequence[EpisodeRow]) -> Path | None:
     return linked
 
 
-def hours_of(rows: Iterable[EpisodeRow]) -> float:
-    """Hours of images."""
-    return sum(row.video_frames / row.fps for row in rows) / 3600
+def most_frequent[T: Any](values: Iterable[T]) -> list[tuple[T, int]]:
+    """Values and how often they occur, the most frequent first, of equals in their own order."""
+    return sorted(Counter(values).items(), key=lambda item: (-item[1], item[0]))
 
 
-def _image_sizes(dataset: Path) -> dict[str, tuple[int, int]]:
-    views = read_json(dataset / "meta" / "worldline" / "contract.json").get("views", {})
-    return {view: (int(size["height"]), int(size["width"])) for view, size in views.items()}
+def counted(count: int, noun: str) -> str:
+    """A number and its noun."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
-def _calibrated_views(dataset: Path) -> dict[int, set[str]]:
-    """Views with a calibration, by episode of a dataset."""
-    found: dict[int, set[str]] = {}
-    # Only the two names: the poses beside them may be large.
-    table = read_table(dataset / "meta" / "worldline" / "cameras.parquet", columns=["episode_index", "view"])
-    for row in [] if table is None else table.to_pylist():
-        found.setdefault(int(row["episode_index"]), set()).add(str(row["view"]))
-    return found
+def recorded_time(rows: Iterable[EpisodeRow]) -> str:
+    """How long the images of some rows last, in words."""
+    return duration(sum(row.video_frames / row.fps for row in rows))
+
+
+def frame_rates(rows: Iterable[EpisodeRow]) -> str:
+    """Every frame rate of some rows."""
+    return ", ".join(sorted({f"{row.fps:g}" for row in rows}))

@@ -1,4 +1,4 @@
-"""Rows of episodes for contact sheets: which ones, and how they are titled."""
+"""Pictures of episodes: which ones a sheet shows, how its rows are titled, and one episode with its controls."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.overlay_views import overlay_sheet
+from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.pages.page import words
 from worldline_core.pictures.contact_sheet import SheetRow, evenly_spaced
+from worldline_core.pictures.labels import Picture
 
 MOMENTS = 6
 
@@ -51,6 +55,20 @@ def episode_rows(episodes: EpisodeSet, positions: Iterable[int]) -> tuple[list[S
         note = f"{row.episode_id}  ·  {row.scene}  ·  {words(row.split)}  ·  {row.outcome}"
         shown.append(SheetRow(title, frames, note))
     return shown, unreadable
+
+
+def episode_overlay(
+    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float, title: str | None = None
+) -> Picture:
+    """Four moments of an episode in every view, with what the tracks say drawn over them.
+
+    Raises:
+        DataError: the episode has no view with a track, or its frames cannot be decoded.
+    """
+    row = episodes.rows[index]
+    moments = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
+    frames = {view: np.asarray(episodes.frames(index, view, moments)) for view in tracks.views if view in row.views}
+    return overlay_sheet(frames, tracks, moments, style=OverlayStyle(sigma_px_ref), title=title)
 
 
 def _groups(rows: Sequence[EpisodeRow], positions: Iterable[int]) -> list[list[int]]:

@@ -1,4 +1,4 @@
-"""Page "Filters": the funnel from found to trained on, each reason's count, and an example picture of each."""
+"""What the filters did with each episode, and the page "Filters": the funnel, each reason's count, and an example of each."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.overlays import draw_overlay
+from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.pages.charts import funnel_chart
 from worldline_core.pages.page import Table, code
@@ -22,14 +26,90 @@ from worldline_core.store.artifact_files import JsonObject, read_rows
 
 TITLE = "Filters"
 MOMENTS = 5
-NUMBERS_SHOWN = 5
 SHOWN_HEIGHT = 128
+QUARANTINED, NOT_STAGE2, CUT = EFFECTS = ("quarantined", "kept for Stage I only", "frames cut")
+
+KEPT = "kept"
+NUMBERS_SHOWN = 6
 UNITS = {"_rad_s": " rad/s", "_deg": "°", "_rad": " rad", "_px": " px", "_s": " s", "_m": " m"}
 """Longest suffixes first."""
-QUARANTINED = "quarantined"
-NOT_STAGE2 = "kept for Stage I only"
-CUT = "frames cut"
-EFFECTS = (QUARANTINED, NOT_STAGE2, CUT)
+
+
+@dataclass(frozen=True)
+class FilteredEpisode:
+    """One curated episode and what became of it.
+
+    Attributes:
+        dropped: why it was dropped whole; None for a kept one.
+        kept: its segments in the filtered set.
+        findings: rows of findings.parquet, their numbers parsed.
+    """
+
+    episode_id: str
+    dropped: QuarantineRow | None
+    kept: Sequence[EpisodeRow]
+    findings: Sequence[JsonObject]
+
+    @property
+    def stage2_reason(self) -> str | None:
+        """Why a kept one is barred from Stage II."""
+        return next((row.stage2_reason or "unfit for Stage II" for row in self.kept if not row.stage2_ok), None)
+
+    @property
+    def cut_by(self) -> Counter[str]:
+        """Reasons that cut frames out of a kept episode, and how many."""
+        counts: Counter[str] = Counter()
+        for finding in self.findings if self.dropped is None else ():
+            counts[finding["detector"]] += finding["cut_frames"]
+        return +counts
+
+    @property
+    def reasons(self) -> list[str]:
+        """Every reason that it is an example of; `kept` for one that nothing happened to."""
+        if self.dropped is not None:
+            return [self.dropped.reason]
+        return list(dict.fromkeys([*self.cut_by, *filter(None, [self.stage2_reason])])) or [KEPT]
+
+
+def read_outcomes(folder: Path) -> dict[str, FilteredEpisode]:
+    """Every episode that a filter step has judged, by id.
+
+    Raises: DataError, ArtifactError: a table of the step is missing or damaged.
+    """
+    dropped = {row.episode_id: row for row in read_quarantine(folder)}
+    kept: dict[str, list[EpisodeRow]] = {}
+    for row in read_index(folder):
+        kept.setdefault(episode_of(row.episode_id), []).append(row)
+    findings: dict[str, list[JsonObject]] = {}
+    for row in read_rows(folder / "findings.parquet"):
+        findings.setdefault(row["episode_id"], []).append(row | {"numbers": json.loads(row["numbers"])})
+    return {
+        name: FilteredEpisode(name, dropped.get(name), kept.get(name, ()), findings.get(name, ()))
+        for name in sorted({*dropped, *kept, *findings})
+    }
+
+
+def episode_of(name: str) -> str:
+    """The episode that a kept row was cut from: `episode@00120` is a segment of `episode`."""
+    episode, _, start = name.rpartition("@")
+    return episode if episode and len(start) == 5 and start.isdigit() else name
+
+
+def numbers_text(numbers: Mapping[str, Any]) -> str:
+    """The first measured values in one line, each with its unit."""
+    shown = [
+        with_unit(key, value)
+        for key, value in numbers.items()
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool) and key != "picture"
+    ]
+    return " · ".join(shown[:NUMBERS_SHOWN])
+
+
+def with_unit(key: str, value: float | str) -> str:
+    """`longest_still_s: 2.1` as `longest still 2.1 s`: names end in their unit."""
+    suffix, unit = next(((end, unit) for end, unit in UNITS.items() if key.endswith(end)), ("", ""))
+    shown = f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{key.removesuffix(suffix).replace('_', ' ')} {shown}{unit}"
 
 
 @dataclass(frozen=True)
@@ -48,70 +128,24 @@ class Refusal:
     view: str | None = None
 
 
-def quarantine_refusals(step: str, folder: Path) -> list[Refusal]:
-    """Rows of a step's quarantine."""
-    findings = findings_by_episode(folder)
-    refusals: list[Refusal] = []
-    for row in read_rows(folder / "quarantine.parquet"):
-        found = [f for f in findings.get(row["episode_id"], []) if f["detector"] == row["reason"]]
-        view = found[0]["view"] if found else None
-        numbers = evidence_of(row.get("evidence"))
-        refusals.append(Refusal(step, row["reason"], QUARANTINED, row["episode_id"], row["detail"], numbers, view))
-    return refusals
-
-
-def filter_refusals(folder: Path) -> list[Refusal]:
-    """Quarantine of the filters, kept episodes that Stage II cannot use, and kept episodes that lost frames."""
-    refusals = quarantine_refusals("filter", folder)
-    findings = findings_by_episode(folder)
-    kept = read_rows(folder / "index.parquet")
-    for row in first_of_each_episode(kept):
-        if row.get("stage2_ok") is False:
-            name = episode_of(row["episode_id"])
-            failed = [f for f in findings.get(name, []) if not f["passed"] and f["stage"] == 2]
-            detectors = ", ".join(dict.fromkeys(str(f["detector"]).replace("_", " ") for f in failed))
-            reason = str(row.get("stage2_reason") or "unfit for Stage II")
-            detail = f"found by {detectors}" if detectors else "see the step's findings"
-            numbers = evidence_of(failed[0]["numbers"]) if failed else {}
-            refusals.append(Refusal("filter", reason, NOT_STAGE2, name, detail, numbers, "head"))
-    names = {episode_of(row["episode_id"]) for row in kept}
-    for episode_id, rows in sorted(findings.items()):
-        for row in rows:
-            if row["cut_frames"] and episode_id in names:
-                detail = f"{row['cut_frames']} frames cut"
-                numbers = evidence_of(row["numbers"])
-                refusals.append(Refusal("filter", row["detector"], CUT, episode_id, detail, numbers, row["view"]))
-    return refusals
-
-
-def findings_by_episode(folder: Path) -> dict[str, list[JsonObject]]:
-    """Rows of the filters' findings by episode; a step without findings has none."""
-    found: dict[str, list[JsonObject]] = {}
-    for row in read_rows(folder / "findings.parquet"):
-        found.setdefault(row["episode_id"], []).append(row)
+def filter_refusals(episode: FilteredEpisode) -> list[Refusal]:
+    """That the filters dropped an episode, or barred it from Stage II and cut frames out of it."""
+    name, dropped = episode.episode_id, episode.dropped
+    if dropped is not None:
+        view = next((f["view"] for f in episode.findings if f["detector"] == dropped.reason), None)
+        return [Refusal("filter", dropped.reason, QUARANTINED, name, dropped.detail, dropped.numbers, view)]
+    found: list[Refusal] = []
+    if episode.stage2_reason is not None:
+        failed = [f for f in episode.findings if not f["passed"] and f["stage"] == 2]
+        detectors = ", ".join(dict.fromkeys(str(f["detector"]).replace("_", " ") for f in failed))
+        detail = f"found by {detectors}" if detectors else "see the step's findings"
+        numbers = failed[0]["numbers"] if failed else {}
+        found.append(Refusal("filter", episode.stage2_reason, NOT_STAGE2, name, detail, numbers, "head"))
+    for f in episode.findings:
+        if f["cut_frames"]:
+            detail = f"{f['cut_frames']} frames cut"
+            found.append(Refusal("filter", f["detector"], CUT, name, detail, f["numbers"], f["view"]))
     return found
-
-
-def first_of_each_episode(rows: list[JsonObject]) -> list[JsonObject]:
-    """One row per episode (an episode kept in several segments has several)."""
-    return list({episode_of(row["episode_id"]): row for row in reversed(rows)}.values())[::-1]
-
-
-def episode_of(name: str) -> str:
-    """The episode that a kept row was cut from: `episode@00120` is a segment of `episode`."""
-    episode, _, start = name.rpartition("@")
-    return episode if episode and len(start) == 5 and start.isdigit() else name
-
-
-def evidence_of(evidence: Any) -> JsonObject:
-    """Evidence as an object; text that is not one gives an empty object."""
-    if isinstance(evidence, dict):
-        return evidence
-    try:
-        value = json.loads(evidence) if isinstance(evidence, str) else {}
-    except json.JSONDecodeError:
-        return {}
-    return value if isinstance(value, dict) else {}
 
 
 def filters_section(context: ReportContext) -> Section:
@@ -123,16 +157,16 @@ def filters_section(context: ReportContext) -> Section:
     refusals: list[Refusal] = []
     kept = None
     if curated is not None:
-        readable, refused = read_rows(curated / "index.parquet"), read_rows(curated / "quarantine.parquet")
+        readable, refused = read_index(curated), read_quarantine(curated)
         stages += [("found in the sources", len(readable) + len(refused)), ("readable and complete", len(readable))]
-        refusals += quarantine_refusals("curate", curated)
+        refusals += [Refusal("curate", r.reason, QUARANTINED, r.episode_id, r.detail, r.numbers) for r in refused]
     if filtered is not None:
-        segments = read_rows(filtered / "index.parquet")
-        episodes = first_of_each_episode(segments)
-        stages.append(("kept, fit for Stage I", sum(bool(row.get("stage1_ok", True)) for row in episodes)))
-        stages.append(("fit for Stage II", sum(bool(row.get("stage2_ok", True)) for row in episodes)))
-        refusals += filter_refusals(filtered)
-        kept = (len(episodes), len(segments), sum(row["stop"] - row["start"] for row in segments))
+        outcomes = read_outcomes(filtered).values()
+        episodes = [episode.kept for episode in outcomes if episode.kept]
+        stages.append(("kept, fit for Stage I", sum(rows[0].stage1_ok for rows in episodes)))
+        stages.append(("fit for Stage II", sum(rows[0].stage2_ok for rows in episodes)))
+        refusals += [refusal for episode in outcomes for refusal in filter_refusals(episode)]
+        kept = (len(episodes), sum(map(len, episodes)), sum(row.num_frames for rows in episodes for row in rows))
     lead = (
         "Nothing is dropped silently: every input that did not get through is in quarantine with a reason code and the"
         " evidence; kept and quarantined together are what was found. Stage II needs three views, valid calibration,"
@@ -175,83 +209,46 @@ def examples(context: ReportContext, refusals: Sequence[Refusal]) -> tuple[list[
             continue
         name = f"refused_{''.join(c if c.isalnum() else '_' for c in item.reason)}"
         image = context.picture(name, picture, alt=f"Example for {item.reason}", photo=True)
-        cards[item.reason] = {"image": image, "item": item, "numbers": numbers_of(item)}
+        cards[item.reason] = {"image": image, "item": item, "numbers": numbers_text(item.numbers)}
     return list(cards.values()), sorted(unseen - set(cards))
 
 
 def example_picture(context: ReportContext, item: Refusal) -> Picture | None:
-    """The picture kept as evidence, or moments of the episode; None where nothing can be decoded.
-
-    Where calibration or clocks are at fault, the projected tools are drawn: that is where the fault shows.
-    """
+    """The picture kept as evidence, or moments of the episode; None where nothing can be decoded."""
     folder = context.inputs.get(item.step)
     kept = item.numbers.get("picture")
     if folder is not None and isinstance(kept, str):
         path = (folder / kept).resolve()
         if path.is_file() and path.is_relative_to(folder.resolve()):
-            from PIL import Image
-
             with Image.open(path) as image:
                 return np.asarray(image.convert("RGB"), dtype=np.uint8)
-    curated = context.inputs.get("curate")
-    if item.step != "filter" or curated is None:
+    if item.step != "filter" or "curate" not in context.inputs:
         return None
     try:
-        return moments(context, curated, item)
+        return moments(context, item)
     except DataError:
         return None
 
 
-def moments(context: ReportContext, curated: Path, item: Refusal) -> Picture:
+def moments(context: ReportContext, item: Refusal) -> Picture:
     """A row of moments of a curated episode.
+
+    Where calibration or clocks are at fault, the projected tools are drawn: that is where the fault shows.
 
     Raises:
         DataError: the set does not hold the episode, or cannot decode it.
     """
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-
-    episodes = EpisodeSet.open(curated)
+    episodes = EpisodeSet.open(context.inputs["curate"])
     index = episodes.position(item.episode_id)
     row = episodes.rows[index]
     view = item.view if item.view in row.views else row.primary_view
     chosen = evenly_spaced(row.video_frames, MOMENTS)
     frames = np.asarray(episodes.frames(index, view, chosen))
-    if item.effect == NOT_STAGE2:
-        frames = with_tools(context, item.episode_id, view, frames, chosen)
+    if item.effect == NOT_STAGE2 and "render_actions" in context.inputs:
+        tracks = ActionTracks.open(context.inputs["render_actions"])
+        if item.episode_id in tracks:
+            found = tracks.tracks(item.episode_id)
+            if view in found.views and max(chosen) < found.num_frames:
+                drawn = zip(frames, chosen, strict=True)
+                frames = np.stack([draw_overlay(f, found, n, view, tile_height=SHOWN_HEIGHT) for f, n in drawn])
     return contact_sheet([SheetRow("", frames)], tile_height=SHOWN_HEIGHT, column_titles=[f"frame {i}" for i in chosen])
-
-
-def with_tools(
-    context: ReportContext, episode_id: str, view: str, frames: np.ndarray, chosen: Sequence[int]
-) -> np.ndarray:
-    """The frames with projected tools, enlarged; unchanged where there are no tracks of the episode."""
-    from worldline_core.actions.episode_tracks import ActionTracks
-
-    folder = context.inputs.get("render_actions")
-    tracks = ActionTracks.open(folder) if folder is not None else None
-    if tracks is None or episode_id not in tracks:
-        return frames
-    found = tracks.tracks(episode_id)
-    if view not in found.views or max(chosen) >= found.num_frames:
-        return frames
-    drawn = [
-        draw_overlay(frame, found, n, view, tile_height=SHOWN_HEIGHT) for frame, n in zip(frames, chosen, strict=True)
-    ]
-    return np.stack(drawn)
-
-
-def numbers_of(item: Refusal) -> str:
-    """The first numbers of the evidence."""
-    facts = [
-        with_unit(key, value)
-        for key, value in sorted(item.numbers.items())
-        if isinstance(value, (int, float)) and not isinstance(value, bool)
-    ]
-    return " · ".join(facts[:NUMBERS_SHOWN])
-
-
-def with_unit(key: str, value: float) -> str:
-    """`longest_still_s: 2.1` as `longest still 2.1 s`: names end in their unit."""
-    suffix, unit = next(((end, unit) for end, unit in UNITS.items() if key.endswith(end)), ("", ""))
-    shown = f"{value:.3g}" if isinstance(value, float) else str(value)
-    return f"{key.removesuffix(suffix).replace('_', ' ')} {shown}{unit}"

@@ -7,13 +7,22 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from worldline_core.store.artifact_files import kind_of, read_json, read_rows
+from worldline_core.errors import ConfigError
+from worldline_core.report.inspect_pictures import PICTURED, write_pictures
+from worldline_core.store.artifact_files import JsonObject, kind_of, read_json, read_rows
+
+COUNTED = {
+    "EpisodeSet": ("embodiment", "task_family", "outcome", "split", "source"),
+    "ActionTracks": ("embodiment", "controls"),
+    "Latents": ("embodiment", "controls"),
+    "RolloutSet": ("method", "view", "seed"),
+}
+"""Columns of an index whose values are counted, by kind of artifact."""
 
 
 @dataclass(frozen=True)
@@ -52,27 +61,20 @@ def inspect(
         page: also write `page/index.html`, to browse so many episodes (0: all) with their videos.
 
     Raises:
-        ArtifactError: the folder is of no known kind.
+        ArtifactError: the folder is of no known kind, or the EpisodeSet that it belongs to is not known.
         DataError: there is no such episode, or its controls cannot be projected.
         ConfigError: a picture was asked for of a kind that has none.
     """
-    from worldline_core.report.inspect_pictures import PicturesWanted, write_pictures
-
     kind = kind_of(folder)
-    describe: dict[str, Callable[[Path], list[str]]] = {
-        "EpisodeSet": describe_episodes,
-        "Quarantine": describe_quarantine,
-        "ActionTracks": describe_index,
-        "Latents": describe_index,
-        "RolloutSet": describe_rollouts,
-        "Scores": describe_scores,
-        "Checkpoint": describe_checkpoint,
-        "Report": describe_report,
-    }
-    lines = [*describe_manifest(folder), *describe[kind](folder)]
-    wanted = PicturesWanted(episode_id, video, rerun, page)
-    written, notes = write_pictures(kind, folder, output or folder / "run", episodes, wanted)
-    return Inspection(kind, [*lines, *notes], written)
+    lines = [*describe_manifest(folder), *describe(kind, folder)]
+    if kind in PICTURED:
+        written, notes = write_pictures(
+            kind, folder, output or folder / "run", episodes, episode_id, video=video, rerun=rerun, page=page
+        )
+        return Inspection(kind, [*lines, *notes], written)
+    if video or rerun or episode_id is not None or page is not None:
+        raise ConfigError("There are no pictures of this kind of artifact", expected=" | ".join(PICTURED), got=kind)
+    return Inspection(kind, lines)
 
 
 def describe_manifest(folder: Path) -> list[str]:
@@ -80,54 +82,39 @@ def describe_manifest(folder: Path) -> list[str]:
     manifest = read_json(folder / "manifest.json")
     if not manifest:
         return []
-    seconds = manifest.get("wall_seconds")
+    step, version, digest, seconds = (manifest.get(key) for key in ("step", "version", "digest", "wall_seconds"))
     took = f", {seconds:.1f} s" if isinstance(seconds, (int, float)) else ""
-    return [
-        f"step {manifest.get('step')}, version {manifest.get('version')}, digest {str(manifest.get('digest'))[:16]}{took}"
-    ]
+    return [f"step {step}, version {version}, digest {str(digest)[:16]}{took}"]
 
 
-def counted(rows: list[dict[str, object]], key: str) -> str:
-    """`key: a 3, b 2`, the most frequent first."""
-    found = Counter(str(row.get(key)) for row in rows)
-    return f"{key}: " + ", ".join(
-        f"{name} {count}" for name, count in sorted(found.items(), key=lambda i: (-i[1], i[0]))
-    )
-
-
-def describe_episodes(folder: Path) -> list[str]:
-    """Counts of an EpisodeSet and of its quarantine."""
-    rows = read_rows(folder / "index.parquet")
-    lines = [f"{len(rows)} episodes, {sum(row['num_frames'] for row in rows)} time steps"]
-    lines += [counted(rows, key) for key in ("embodiment", "task_family", "outcome", "split", "source")]
-    return lines + describe_quarantine(folder)
-
-
-def describe_quarantine(folder: Path) -> list[str]:
-    """Reasons and their counts."""
-    rows = read_rows(folder / "quarantine.parquet")
-    return [f"quarantine: {len(rows)}", *([counted(rows, "reason")] if rows else [])]
-
-
-def describe_index(folder: Path) -> list[str]:
-    """Counts of an index by episode."""
-    rows = read_rows(folder / "index.parquet")
-    keys = [key for key in ("embodiment", "controls") if rows and key in rows[0]]
-    return [
-        f"{len({row['episode_id'] for row in rows})} episodes",
-        *[counted(rows, key) for key in keys],
-        *describe_quarantine(folder),
-    ]
-
-
-def describe_rollouts(folder: Path) -> list[str]:
-    """Method, episodes, seeds and views of predicted videos."""
-    rows = read_rows(folder / "index.parquet")
+def describe(kind: str, folder: Path) -> list[str]:
+    """What an artifact holds, in a few lines."""
+    if kind == "Scores":
+        return describe_scores(folder)
+    if kind == "Checkpoint":
+        content = read_json(folder / "checkpoint.json")
+        size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
+        known = [key for key in ("action_contract", "metadata", "model") if key in content]
+        facts = [f"{key}: {json.dumps(content[key], sort_keys=True)}" for key in known]
+        return [f"kind {content.get('kind')}, {size / 1e6:.1f} MB of tensors", *facts]
+    if kind == "Report":
+        media = len(list((folder / "media").glob("*")))
+        return [f"open {folder / 'index.html'} in a browser", f"{media} pictures and videos"]
+    rows, refused = read_rows(folder / "index.parquet"), read_rows(folder / "quarantine.parquet")
+    lines = [counted(rows, key) for key in COUNTED.get(kind, ()) if rows and key in rows[0]]
+    quarantine = [f"quarantine: {len(refused)}", *([counted(refused, "reason")] if refused else [])]
     episodes = len({row["episode_id"] for row in rows})
-    return [
-        f"{len(rows)} predicted videos of {episodes} episodes",
-        *[counted(rows, key) for key in ("method", "view", "seed")],
-    ]
+    if kind == "EpisodeSet":
+        return [f"{len(rows)} episodes, {sum(row['num_frames'] for row in rows)} time steps", *lines, *quarantine]
+    if kind == "RolloutSet":
+        return [f"{len(rows)} predicted videos of {episodes} episodes", *lines]
+    return quarantine if kind == "Quarantine" else [f"{episodes} episodes", *lines, *quarantine]
+
+
+def counted(rows: list[JsonObject], key: str) -> str:
+    """`key: a 3, b 2`, the most frequent first."""
+    found = sorted(Counter(str(row[key]) for row in rows).items(), key=lambda item: (-item[1], item[0]))
+    return f"{key}: " + ", ".join(f"{name} {count}" for name, count in found)
 
 
 def describe_scores(folder: Path) -> list[str]:
@@ -141,21 +128,3 @@ def describe_scores(folder: Path) -> list[str]:
         for (split, metric, method), v in sorted(values.items())
     ]
     return [f"{len(rows)} scores of {len({row['episode_id'] for row in rows})} trajectories", *lines]
-
-
-def describe_checkpoint(folder: Path) -> list[str]:
-    """Kind, size and contract of a checkpoint."""
-    content = read_json(folder / "checkpoint.json")
-    size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
-    lines = [f"kind {content.get('kind')}, {size / 1e6:.1f} MB of tensors"]
-    return lines + [
-        f"{key}: {json.dumps(content[key], sort_keys=True)}"
-        for key in ("action_contract", "metadata", "model")
-        if key in content
-    ]
-
-
-def describe_report(folder: Path) -> list[str]:
-    """Where to look."""
-    media = list((folder / "media").iterdir()) if (folder / "media").is_dir() else []
-    return [f"open {folder / 'index.html'} in a browser", f"{len(media)} pictures and videos"]

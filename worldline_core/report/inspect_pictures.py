@@ -2,67 +2,59 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
+from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
+from worldline_core.actions.overlay_views import write_overlay_video
+from worldline_core.actions.overlays import OverlayStyle
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
+from worldline_core.errors import ArtifactError, DataError, WorldLineError
+from worldline_core.exports.rollout import export_rollout, recording_content
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.pages.page import render, words
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import Picture, png_bytes
-from worldline_core.report.actions import episode_overlay
-from worldline_core.report.episode_sheet import MOMENTS, episode_rows, one_of_each
+from worldline_core.report.episode_sheet import MOMENTS, episode_overlay, episode_rows, one_of_each
 from worldline_core.report.filters import episode_of
+from worldline_core.report.inspect_filters import FilteredSet, write_episode, write_filter_page
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import linked_folder, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
-
-if TYPE_CHECKING:
-    from worldline_core.actions.episode_tracks import EpisodeTracks
-    from worldline_core.data.episodes.episode_set import EpisodeSet
-    from worldline_core.rollout.rollout_set import RolloutSet
 
 PICTURED = ("EpisodeSet", "ActionTracks", "RolloutSet")
 SHEET_ROWS = 8
 
 
-@dataclass(frozen=True)
-class PicturesWanted:
-    """What was asked for besides the sheet; the episode is the first one unless it is named.
-
-    Attributes:
-        page: how many episodes a page to browse shows; 0 all, None no page.
-    """
-
-    episode_id: str | None = None
-    video: bool = False
-    rerun: bool = False
-    page: int | None = None
-
-
 def write_pictures(
-    kind: str, folder: Path, output: Path, episodes: Path | None, wanted: PicturesWanted
+    kind: str,
+    folder: Path,
+    output: Path,
+    episodes: Path | None,
+    episode_id: str | None,
+    *,
+    video: bool,
+    rerun: bool,
+    page: int | None,
 ) -> tuple[list[Path], list[str]]:
-    """Writes what was asked for; returns the files, and notes on what could not be shown.
+    """Writes what `worldline inspect` was asked for; returns the files, and notes on what could not be shown.
 
     Raises:
-        ConfigError: pictures were asked for of a kind that has none.
         ArtifactError: the EpisodeSet that the artifact belongs to is not known.
         DataError: there is no such episode, or its controls cannot be projected.
     """
-    asked = wanted.video or wanted.rerun or wanted.episode_id is not None or wanted.page is not None
-    if kind not in PICTURED:
-        if asked:
-            raise ConfigError("There are no pictures of this kind of artifact", expected=" | ".join(PICTURED), got=kind)
-        return [], []
     subject = Subject(kind, folder, episodes)
-    moving = wanted.video or wanted.rerun or wanted.page is not None
+    moving = video or rerun or page is not None
     if subject.episodes_folder is None and (kind == "ActionTracks" or moving):
-        if not asked:
+        if not moving and episode_id is None:
             return [], ["no pictures: the episodes of these tracks are not known (--episodes FOLDER names them)"]
         raise ArtifactError(
             "The episodes that this artifact belongs to are not known",
@@ -70,38 +62,37 @@ def write_pictures(
             expected="a manifest that names a folder which is still there",
             next_step="name the EpisodeSet with --episodes FOLDER",
         )
-    notes: list[str] = []
-    written = subject.write_filters(output, wanted, notes)
-    if written and wanted.episode_id is not None and wanted.episode_id not in subject.kept_ids:
-        if wanted.video:
+    written = subject.write_filters(output, episode_id, rerun=rerun)
+    if written and episode_id is not None and episode_id not in {row.episode_id for row in subject.episodes.rows}:
+        if video:
             raise DataError(
                 "There is no such kept episode to make a video of",
                 where=folder,
-                got=wanted.episode_id,
+                got=episode_id,
                 next_step="name one of its segments, or inspect the EpisodeSet that was filtered",
             )
-        return written, notes
-    picture = subject.sheet(wanted.episode_id, notes)
+        return written, subject.notes
+    picture = subject.sheet(episode_id)
     if picture is not None:
-        path = output / "contact_sheet.png"
-        write_bytes_atomic(path, png_bytes(picture))
-        written.append(path)
-    if wanted.video:
-        written += subject.write_video(output, wanted.episode_id or subject.first_episode)
-    if wanted.rerun:
-        written.append(subject.write_recording(output, wanted.episode_id or subject.first_episode, notes))
-    if wanted.page is not None:
-        written.append(subject.write_page(output / "page", wanted.page))
-    return written, notes
+        written.append(output / "contact_sheet.png")
+        write_bytes_atomic(written[-1], png_bytes(picture))
+    if video:
+        written += subject.write_video(output, episode_id or subject.first_episode)
+    if rerun:
+        written.append(subject.write_recording(output, episode_id or subject.first_episode))
+    if page is not None:
+        written.append(subject.write_page(output / "page", page))
+    return written, subject.notes
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An artifact with pictures, and the artifacts that it belongs to."""
+    """An artifact with pictures, the artifacts that it belongs to, and notes on what could not be shown."""
 
     kind: str
     folder: Path
     given_episodes: Path | None
+    notes: list[str] = field(default_factory=list)
 
     @cached_property
     def episodes_folder(self) -> Path | None:
@@ -111,36 +102,27 @@ class Subject:
 
     @cached_property
     def episodes(self) -> EpisodeSet:
-        from worldline_core.data.episodes.episode_set import EpisodeSet
-
         if self.episodes_folder is None:
             raise ArtifactError("The episodes that this artifact belongs to are not known", where=self.folder)
         return EpisodeSet.open(self.episodes_folder)
 
-    @property
-    def kept_ids(self) -> set[str]:
-        """Ids of the episodes, or segments of episodes, in the artifact."""
-        return {row.episode_id for row in self.episodes.rows}
-
-    def write_filters(self, output: Path, wanted: PicturesWanted, notes: list[str]) -> list[Path]:
+    def write_filters(self, output: Path, episode_id: str | None, *, rerun: bool) -> list[Path]:
         """What the filters did, where the artifact is a filter step's: a page with a sheet for every reason, or one
         episode's strip and recording."""
         if self.kind != "EpisodeSet" or not (self.folder / "findings.parquet").is_file():
             return []
         curated = self.given_episodes or linked_folder(self.folder, "episodes")
         if curated is None:
-            notes.append(
+            self.notes.append(
                 "dropped clips are not shown: the EpisodeSet that was filtered is not known (--episodes FOLDER)"
             )
             return []
-        from worldline_core.report.inspect_filters import FilteredSet, write_episode, write_filter_page
-
         filtered = FilteredSet(self.folder, curated)
-        if wanted.episode_id is None:
+        if episode_id is None:
             return write_filter_page(filtered, output / "filters")
         # A segment is shown with the episode that it was cut from.
-        whole = wanted.episode_id if wanted.episode_id in filtered.clips else episode_of(wanted.episode_id)
-        return write_episode(filtered, whole, output, rerun=wanted.rerun) if whole in filtered.clips else []
+        whole = episode_id if episode_id in filtered.outcomes else episode_of(episode_id)
+        return write_episode(filtered, whole, output, rerun=rerun) if whole in filtered.outcomes else []
 
     @cached_property
     def tracks_folder(self) -> Path | None:
@@ -148,16 +130,11 @@ class Subject:
 
     @cached_property
     def rollouts(self) -> RolloutSet:
-        from worldline_core.rollout.rollout_set import RolloutSet
-
         return RolloutSet.open(self.folder)
 
     @cached_property
     def sigma_px_ref(self) -> float:
         """Of the heat, as the tracks' own previews were drawn with."""
-        from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
-        from worldline_core.actions.episode_tracks import ActionTracks
-
         folder = self.tracks_folder
         return SIGMA_PX_REFERENCE if folder is None else ActionTracks.open(folder).sigma_px_ref
 
@@ -180,18 +157,13 @@ class Subject:
         Raises:
             DataError, ConfigError, UnavailableError: they cannot be computed.
         """
-        from worldline_core.actions.action_tracks import compute_tracks
-        from worldline_core.actions.episode_tracks import ActionTracks
-        from worldline_core.geometry.embodiment import load_embodiment
-        from worldline_core.geometry.kinematics import ArmKinematics
-
         if self.tracks_folder is not None:
             return ActionTracks.open(self.tracks_folder).tracks(episode_id)
         episode = self.episodes.episode(self.episodes.position(episode_id))
         kinematics = None if episode.T_base_ee is not None else ArmKinematics(load_embodiment(episode.embodiment))
         return compute_tracks(episode, kinematics)[0]
 
-    def sheet(self, episode_id: str | None, notes: list[str]) -> Picture | None:
+    def sheet(self, episode_id: str | None) -> Picture | None:
         """Moments of one episode with its controls, or of several episodes (of one, for ActionTracks)."""
         if episode_id is None and self.kind == "EpisodeSet":
             rows, _ = episode_rows(self.episodes, one_of_each(self.episodes.rows, SHEET_ROWS))
@@ -206,7 +178,7 @@ class Subject:
         except WorldLineError as error:
             if self.kind == "ActionTracks":
                 raise
-            notes.append(f"no controls are drawn: {error.what}")
+            self.notes.append(f"no controls are drawn: {error.what}")
             moments = evenly_spaced(row.video_frames, MOMENTS)
             rows = [SheetRow(view, np.asarray(self.episodes.frames(position, view, moments))) for view in row.views]
             return contact_sheet(rows, title=f"{row.embodiment}  ·  {row.instruction}")
@@ -215,8 +187,6 @@ class Subject:
 
     def write_video(self, output: Path, episode_id: str) -> list[Path]:
         """All views side by side with the controls drawn over them, `<episode>.mp4`; truth beside a prediction."""
-        from worldline_core.exports.rollout import export_rollout
-
         if self.kind == "RolloutSet":
             return export_rollout(self.rollouts, self.episodes, None, episode_id, output, ("mp4",))
         path = output / f"{safe_stem(episode_id)}.mp4"
@@ -252,24 +222,20 @@ class Subject:
         return output / "index.html"
 
     def _write_overlay(self, path: Path, position: int, tracks: EpisodeTracks) -> None:
-        from worldline_core.actions.overlay_views import write_overlay_video
-        from worldline_core.actions.overlays import OverlayStyle
-
         row = self.episodes.rows[position]
         frames = {view: np.asarray(self.episodes.frames(position, view)) for view in row.views}
         title = f"{row.embodiment}  ·  {row.instruction}"
         write_overlay_video(path, frames, tracks, row.fps, style=OverlayStyle(self.sigma_px_ref), title=title)
 
-    def write_recording(self, output: Path, episode_id: str, notes: list[str]) -> Path:
+    def write_recording(self, output: Path, episode_id: str) -> Path:
         """A Rerun recording: frames, controls, cameras, signals, and predictions where the artifact has them."""
-        from worldline_core.exports.rerun_recording import write_rerun_recording
-        from worldline_core.exports.rollout import recording_content
+        from worldline_core.exports.rerun_recording import write_rerun_recording  # imports Rerun
 
         tracks = None
         try:
             tracks = self.tracks(episode_id)
         except WorldLineError as error:
-            notes.append(f"the recording has no controls in 3-D: {error.what}")
+            self.notes.append(f"the recording has no controls in 3-D: {error.what}")
         rollouts = {self.rollouts.method: self.rollouts} if self.kind == "RolloutSet" else {}
         path = output / f"{safe_stem(episode_id)}.rrd"
         content = recording_content(rollouts, self.episodes, tracks, episode_id, sigma_px_ref=self.sigma_px_ref)

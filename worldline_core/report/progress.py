@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from worldline_core.pages.page import number, render
+from worldline_core.pages.page import duration, number, render
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic
 
@@ -116,13 +116,10 @@ def write_progress_page(
     Args:
         failed: the error that ended the run, which the page then shows instead of reloading.
     """
-    steps = [_shown(folder, node) for node in done]
-    total = len(done) + len(running) + len(to_come)
     page = render(
-        "report/progress.html", title="WorldLine: this run", done=steps, running=list(running), to_come=list(to_come),
-        share=round(100 * len(done) / total) if total else 0, elapsed=duration(seconds_so_far),
-        left=None if estimate is None else duration(estimate.seconds), basis="" if estimate is None else estimate.basis,
-        failed=failed, reload=0 if failed else RELOAD_SECONDS,
+        "report/progress.html", title="WorldLine: this run", done=[_shown(folder, node) for node in done],
+        running=list(running), to_come=list(to_come), elapsed=seconds_so_far, estimate=estimate, failed=failed,
+        reload=0 if failed else RELOAD_SECONDS,
     )  # fmt: skip
     write_bytes_atomic(folder / "index.html", page.encode())
     return folder / "index.html"
@@ -130,44 +127,27 @@ def write_progress_page(
 
 def write_finished_page(folder: Path, report: Path) -> Path:
     """Let `folder/index.html` lead to a finished report: a page that redirects, which works from any file system."""
-    page = render(
-        "report/redirect.html",
-        title="WorldLine: the report",
-        target=_address(folder, report / "index.html"),
-        key=report.name,
-    )
+    target = _address(folder, report / "index.html")
+    page = render("report/redirect.html", title="WorldLine: the report", target=target, key=report.name)
     write_bytes_atomic(folder / "index.html", page.encode())
     return folder / "index.html"
-
-
-def duration(seconds: float) -> str:
-    """Seconds in words that a reader takes in at once."""
-    if seconds < 100:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
 
 
 def _shown(folder: Path, node: DoneNode) -> dict[str, Any]:
     pictures = [path for pattern in PICTURES for path in sorted(node.folder.glob(pattern))]
     metrics = read_json(node.folder / "manifest.json").get("metrics") or {}
-    return {
-        "name": node.name,
-        "time": "found in the store" if node.cached else duration(node.seconds),
-        "folder": _address(folder, node.folder),
-        "facts": _facts(metrics),
-        "picture": _address(folder, pictures[0]) if pictures else None,
-    }
-
-
-def _facts(metrics: Mapping[str, Any]) -> str:
-    """The first numbers that the step measured, in words."""
-    shown = [
+    numbers = [
         f"{name.replace('_', ' ')} {number(value, 3)}"
         for name, value in metrics.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     ]
-    return " · ".join(shown[:MOST_FACTS])
+    return {
+        "name": node.name,
+        "time": "found in the store" if node.cached else duration(node.seconds),
+        "folder": _address(folder, node.folder),
+        "facts": " · ".join(numbers[:MOST_FACTS]),
+        "picture": _address(folder, pictures[0]) if pictures else None,
+    }
 
 
 def _address(folder: Path, target: Path) -> str:

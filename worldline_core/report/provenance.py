@@ -14,7 +14,7 @@ CARD = "MODEL_CARD.md"
 
 def models_section(context: ReportContext) -> Section:
     """A table of checkpoints and every model card."""
-    folders = {name: path for name, path in context.inputs.variants("models").items() if name}
+    folders = {name: path for name, path in context.variants("models").items() if name}
     if not folders:
         return Section("models", "Models", missing="no model folders were given (inputs models.<name>).")
     cards = {
@@ -49,10 +49,10 @@ def size_of(folder: Path) -> int:
 
 def provenance_section(context: ReportContext) -> Section:
     """What each artifact was made from; times and versions come from the run and are filled in when the page opens."""
-    names = sorted(context.inputs.folders)
+    names = sorted(context.inputs)
     if not names:
         return Section("provenance", "Provenance", missing="no artifact was given.")
-    manifests = {name: context.inputs.manifest(name) for name in names}
+    manifests = {name: context.manifest(name) for name in names}
     rows: list[list[object]] = []
     for name, manifest in manifests.items():
         seeds = ", ".join(f"{key} {json.dumps(value)}" for key, value in sorted((manifest.get("seeds") or {}).items()))
@@ -71,7 +71,7 @@ def provenance_section(context: ReportContext) -> Section:
         "Provenance",
         lead,
         artifacts=Table(("Artifact", "Digest", "Version", "Seeds"), rows, caption="Artifacts that this report shows"),
-        machine=context.slot("machine", render("report/machine.html", **machine_facts(manifests))),
+        machine=context.slot("machine", render("report/machine.html", **machine_facts(manifests)), "See run/run.js."),
         configs=configs,
     )
 

@@ -12,12 +12,30 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from worldline_core.report.report_config import ReportConfig
+from tqdm import tqdm
+
+from worldline_core.report.actions import actions_section
+from worldline_core.report.context import ReportConfig, ReportContext
+from worldline_core.report.cost import cost_section
+from worldline_core.report.data import data_section
+from worldline_core.report.decisions import planning_section, policy_section
+from worldline_core.report.filters import filters_section
+from worldline_core.report.nightly import nights_section
+from worldline_core.report.provenance import models_section, provenance_section
+from worldline_core.report.quality import quality_section
+from worldline_core.report.summary import overview
+from worldline_core.report.training import training_section
+from worldline_core.report.videos import videos_section
 from worldline_core.store.atomic import remove_unfinished
 
 __all__ = ["ReportConfig", "report"]
 
 logger = logging.getLogger(__name__)
+
+SECTIONS = (
+    videos_section, quality_section, policy_section, planning_section, cost_section, data_section, filters_section,
+    actions_section, training_section, models_section, provenance_section,
+)  # fmt: skip
 
 
 def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -29,36 +47,14 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     Raises:
         WorldLineError: an artifact that is there cannot be read.
     """
-    from tqdm import tqdm
-
-    from worldline_core.report.actions import actions_section
-    from worldline_core.report.context import ReportContext, ReportInputs
-    from worldline_core.report.cost import cost_section
-    from worldline_core.report.data import data_section
-    from worldline_core.report.filters import filters_section
-    from worldline_core.report.nightly import nights_section
-    from worldline_core.report.planning import planning_section
-    from worldline_core.report.policy import policy_section
-    from worldline_core.report.provenance import models_section, provenance_section
-    from worldline_core.report.quality import quality_section
-    from worldline_core.report.summary import overview
-    from worldline_core.report.training import training_section
-    from worldline_core.report.videos import videos_section
-
     # The pages are made anew: nothing that an earlier, killed call left behind may enter the digest.
     shutil.rmtree(output / "media", ignore_errors=True)
     remove_unfinished(output)
-    makers = [
-        videos_section, quality_section, policy_section, planning_section, cost_section, data_section, filters_section,
-        actions_section, training_section, models_section, provenance_section,
-    ]  # fmt: skip
-    context = ReportContext(config, ReportInputs({name: Path(path) for name, path in inputs.items()}), output)
-    if context.inputs.get("history") is not None:
-        makers.insert(0, nights_section)
+    context = ReportContext(config, dict(inputs), output)
+    makers = [nights_section, *SECTIONS] if "history" in inputs else SECTIONS
     sections = [make(context) for make in tqdm(makers, desc="report", unit="section", disable=None)]
     context.write_pages(overview(context, sections), sections)
     missing = [section.anchor for section in sections if section.missing]
     pages = len(sections) + 1 - len(missing)
     logger.info("report: %d pages, missing: %s", pages, ", ".join(missing) or "none")
-    media = sorted(path.name for path in (output / "media").iterdir()) if (output / "media").is_dir() else []
-    return {"sections": pages, "missing": missing, "media": len(media)}
+    return {"sections": pages, "missing": missing, "media": len(list((output / "media").glob("*")))}

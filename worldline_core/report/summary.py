@@ -8,12 +8,11 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
-from worldline_core.pages.page import NARROW_SPACE, Table, number, percent, render
+from worldline_core.pages.page import NARROW_SPACE, Table, duration, number, percent, render
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.cost import constant_cost
-from worldline_core.report.methods import TRUE_METHOD, Method, without_truth
-from worldline_core.report.planning import most_candidates
-from worldline_core.report.video_scores import SPLIT_LABELS, VideoScores
+from worldline_core.report.decisions import most_candidates
+from worldline_core.report.video_scores import SPLIT_LABELS, TRUE_METHOD, Method, VideoScores, predicting
 from worldline_core.report.videos import overview_video
 from worldline_core.store.artifact_files import JsonObject, read_rows
 
@@ -39,32 +38,29 @@ class Figure:
     """One number in plain words beside its reference.
 
     Attributes:
-        difference: of the value to its reference, with its 95 % interval (None where none was measured).
+        bounds: 95 % interval of the difference to the reference; None where none was measured.
     """
 
     value: str
-    what: str
+    what: Markup | str
     mean: float
     reference: float
     reference_text: str
-    difference: tuple[float, float] | None
+    bounds: tuple[float, float] | None
     how: str
 
     @property
     def verdict(self) -> str:
-        """`better` or `worse` than the reference, or `same`."""
-        return "better" if self.mean > self.reference else "worse" if self.mean < self.reference else "same"
-
-    @property
-    def certain(self) -> bool:
-        """Whether the interval of the difference leaves out zero."""
-        return self.difference is not None and (self.difference[0] > 0 or self.difference[1] < 0)
+        """`better` or `worse` where the interval leaves the reference out, else `unclear`: within chance."""
+        if self.bounds is not None and self.bounds[0] > 0:
+            return "better"
+        return "worse" if self.bounds is not None and self.bounds[1] < 0 else "unclear"
 
     @property
     def comparison(self) -> str:
-        words = {"better": "better than", "worse": "worse than", "same": "the same as"}[self.verdict]
-        doubt = "" if self.certain or self.verdict == "same" else ", within chance"
-        return f"{words} {self.reference_text}{doubt}"
+        order = "better than" if self.mean > self.reference else "worse than" if self.mean < self.reference else "as"
+        doubt = ", within chance" if self.verdict == "unclear" else ""
+        return f"{order} {self.reference_text}{doubt}"
 
 
 @dataclass(frozen=True)
@@ -92,10 +88,10 @@ class HeadView:
         return None if method is None else self.scores.value(self.group, method.name, f"{self.metric}@head")
 
     def difference(self, first: Method, second: Method | None) -> JsonObject | None:
-        found = None if second is None else second.name
-        return None if found is None else self.scores.difference(self.group, first.name, found, f"{self.metric}@head")
+        name = f"{self.metric}@head"
+        return None if second is None else self.scores.difference(self.group, first.name, second.name, name)
 
-    def beside_copy(self, method: Method | None, what: str, how: str) -> Figure | None:
+    def beside_copy(self, method: Method | None, what: Markup | str, how: str = "") -> Figure | None:
         """A method's IoU beside that of copying the first frame."""
         copy = self.method("copy", "baseline")
         mean, reference = self.value(method), self.value(copy)
@@ -105,16 +101,15 @@ class HeadView:
         bounds = (difference["low"], difference["high"]) if difference else None
         text = f"copying the first frame: {number(float(reference['mean']))}"
         how = f"{how}{mean['count']} recordings{interval_words(bounds)}"
-        value = number(float(mean["mean"]))
-        return Figure(value, what, float(mean["mean"]), float(reference["mean"]), text, bounds, how)
+        return Figure(number(float(mean["mean"])), what, mean["mean"], reference["mean"], text, bounds, how)
 
 
 def interval_words(bounds: tuple[float, float] | None, *, points: bool = False) -> str:
     """The interval of a difference in words; `points` writes shares as percentage points."""
     if bounds is None:
         return ""
-    shown = [number(100 * v if points else float(v), 0 if points else 2, signed=True) for v in bounds]
-    return f"; difference, 95{NARROW_SPACE}% interval: {shown[0]} to {shown[1]}{' points' if points else ''}"
+    low, high = (number(100 * v if points else float(v), 0 if points else 3, signed=True) for v in bounds)
+    return f"; difference, 95{NARROW_SPACE}% interval: {low} to {high}{' points' if points else ''}"
 
 
 def overview(context: ReportContext, sections: Sequence[Section]) -> Markup:
@@ -124,7 +119,7 @@ def overview(context: ReportContext, sections: Sequence[Section]) -> Markup:
         "controls": None if view is None else follows(view),
         "planning": planning_figure(context),
         "policy": policy_figure(context),
-        "own": None if view is None else own_model(view),
+        "own": None if view is None else own_model(context, view),
     }
     return render(
         "report/overview.html",
@@ -139,7 +134,7 @@ def overview(context: ReportContext, sections: Sequence[Section]) -> Markup:
         video=overview_video(context),
         about=ABOUT,
         further=Table(("Number", "What it is", "How it was measured"), further_numbers(context, view)),
-        constant_cost=context.slot("efficiency_tile", constant_cost(context), fallback=""),
+        constant_cost=context.slot("efficiency_tile", cost, inline=True) if (cost := constant_cost(context)) else None,
     )
 
 
@@ -150,18 +145,28 @@ def follows(view: HeadView) -> Figure | None:
     return view.beside_copy(view.primary, what, f"{view.primary.long_label}; {where}, head view, ")
 
 
-def own_model(view: HeadView) -> Figure | None:
+def own_model(context: ReportContext, view: HeadView) -> Figure | None:
     """What this run trained for itself beside a copy of the first frame; None where it is the main method."""
     own = view.method(view.primary.kind, "run")
     if own is None or own.name == view.primary.name:
         return None
-    return view.beside_copy(own, f"the same for this run's own {own.label}, trained briefly", "")
+    what = Markup("the same for the {} that this run trained itself{}").format(own.label, training_time(context))
+    return view.beside_copy(own, what)
+
+
+def training_time(context: ReportContext) -> Markup:
+    """` in 38 s`: what Stages I and II took in this run, filled in when the page opens; nothing where it is not known."""
+    manifests = [context.manifest(step) for step in ("train_stage1", "train_stage2")]
+    times = [m.get("wall_seconds") for m in manifests if not m.get("resumed")]
+    known = [seconds for seconds in times if isinstance(seconds, (int, float))]
+    content = f" in {duration(sum(known))}" if len(known) == len(manifests) else ""
+    return context.slot("training_time", content, inline=True)
 
 
 def planning_figure(context: ReportContext) -> Figure | None:
     """Success of the choice among the most candidates beside a blind choice."""
     for summary in context.summaries("evaluate_planning")[:1]:
-        order = without_truth(summary["methods"])
+        order = predicting(summary["methods"])
         if not order:
             return None
         values = summary["methods"][order[0].name]
@@ -170,8 +175,7 @@ def planning_figure(context: ReportContext) -> Figure | None:
         bounds = (float(found["gain"]["low"]), float(found["gain"]["high"]))
         what = f"of the plans chosen among {budget} by their predicted videos succeed"
         how = f"{order[0].long_label}; {len(summary['banks'])} banks{interval_words(bounds, points=True)}"
-        ceiling = summary["methods"].get(TRUE_METHOD)
-        if ceiling:
+        if ceiling := summary["methods"].get(TRUE_METHOD):
             how += f"; by recorded videos {percent(most_candidates(ceiling)['success']['mean'])}"
         return Figure(percent(mean), what, mean, direct, f"a blind choice: {percent(direct)}", bounds, how)
     return None
@@ -181,70 +185,57 @@ def policy_figure(context: ReportContext) -> Figure | None:
     """Outcomes judged from predicted videos beside guessing: as many successes as failures are judged."""
     for summary in context.summaries("evaluate_policy")[:1]:
         methods = summary["methods"]
-        order = without_truth(methods)
+        order = predicting(methods)
         first = next((m for m in order if m.kind == "stage2"), order[0] if order else None)
         found = methods[first.name].get("all", {}).get("accuracy") if first else None
         if first is None or found is None:
             return None
         bounds = (float(found["low"]) - 0.5, float(found["high"]) - 0.5)
-        ceiling = methods.get(TRUE_METHOD, {}).get("all", {}).get("accuracy")
-        beside = f"; from recorded videos {percent(ceiling['mean'])}" if ceiling else ""
-        how = f"{first.long_label}; {found['count']} recordings{interval_words(bounds, points=True)}{beside}"
+        how = f"{first.long_label}; {found['count']} recordings{interval_words(bounds, points=True)}"
+        if ceiling := methods.get(TRUE_METHOD, {}).get("all", {}).get("accuracy"):
+            how += f"; from recorded videos {percent(ceiling['mean'])}"
         mean = float(found["mean"])
         what = "of the outcomes judged from predicted videos are right"
         return Figure(percent(mean), what, mean, 0.5, f"guessing: {percent(0.5)}", bounds, how)
     return None
 
 
-def sentence(context: ReportContext, view: HeadView | None, figures: dict[str, Figure | None]) -> str:
+def sentence(context: ReportContext, view: HeadView | None, figures: dict[str, Figure | None]) -> Markup | str:
     """What happened, in one sentence, from the numbers alone."""
     controls, planning, own = figures["controls"], figures["planning"], figures["own"]
     clauses: list[tuple[bool, str]] = []
     if view is not None and controls is not None:
         clauses.append(controls_clause(view, controls))
     if planning is not None:
-        beside = f"({planning.value} against {percent(planning.reference)})"
-        if planning.certain:
-            good = planning.verdict == "better"
-            clauses.append((good, f"chooses {'better' if good else 'worse'} than a blind choice {beside}"))
-        else:
-            doubt = (
-                "does not yet choose clearly better than"
-                if planning.verdict == "better"
-                else "does not choose better than"
-            )
-            clauses.append((False, f"{doubt} a blind choice {beside}"))
+        doubt = "yet choose clearly" if planning.mean > planning.reference else "choose"
+        verb = {"better": "chooses better", "worse": "chooses worse", "unclear": f"does not {doubt} better"}
+        beside = f"than a blind choice ({planning.value} against {percent(planning.reference)})"
+        clauses.append((planning.verdict == "better", f"{verb[planning.verdict]} {beside}"))
     if not clauses:
-        return counts_sentence(context)
-    subject = "The shipped simulator" if view is None or view.primary.group == "shipped" else "This run's simulator"
-    text = f"{subject} {clauses[0][1]}"
+        counts = episode_counts(context)
+        kept = f"{number(counts[1])} of {number(counts[0])} episodes were kept; no prediction" if counts else "Nothing"
+        return f"{kept} was measured yet."
+    text = "The shipped simulator" if view is None or view.primary.group == "shipped" else "This run's simulator"
+    text += f" {clauses[0][1]}"
     for (before, _), (good, clause) in pairwise(clauses):
         text += f"{' and' if good == before else ' but'} {clause}"
-    if own is not None:
-        beside = f"({own.value} against {number(own.reference)})"
-        beats = "already beats" if own.verdict == "better" and own.certain else "does not yet beat"
-        text += f"; the model that this run trained briefly {beats} copying the first frame {beside}"
-    return text + "."
+    if own is None:
+        return text + "."
+    beats = "already beats" if own.verdict == "better" else "does not yet beat"
+    return Markup("{}; the model that this run trained itself{} {} copying the first frame ({} against {}).").format(
+        text, training_time(context), beats, own.value, number(own.reference)
+    )
 
 
 def controls_clause(view: HeadView, found: Figure) -> tuple[bool, str]:
     """Whether the main method follows the controls: better than a copy, and than with the controls of another episode."""
     beside = f"(robot IoU {found.value} against {number(found.reference)} for copying the first frame)"
-    if found.verdict != "better" or not found.certain:
+    if found.verdict != "better":
         return False, f"does not yet predict better than a copy of the first frame {beside}"
     shuffled = view.difference(view.primary, view.method(f"{view.primary.kind}_shuffled", view.primary.group))
     if shuffled is not None and shuffled["low"] <= 0:
         return False, f"predicts no better with the right controls than with shuffled ones {beside}"
     return True, f"follows the controls {beside}"
-
-
-def counts_sentence(context: ReportContext) -> str:
-    """What there is where nothing predicted was measured."""
-    counts = episode_counts(context)
-    if counts is None:
-        return "Nothing was measured yet."
-    found, kept = counts
-    return f"{number(kept)} of {number(found)} episodes were kept; no prediction was measured yet."
 
 
 def episode_counts(context: ReportContext) -> tuple[int, int] | None:

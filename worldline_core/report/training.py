@@ -24,12 +24,11 @@ OPTIONAL_STAGES = frozenset({"train_tokenizer"})
 PHASES = ("teacher_forcing", "trajectory_regression", "distribution_matching")
 METRICS_FILE = "metrics.jsonl"
 LOSSES = {
-    "loss": "training",
-    "validation/loss": "held-out scenes",
-    "validation/loss_shuffled_actions": "held-out, shuffled actions",
-    "validation/loss_no_actions": "held-out, no actions",
+    "loss": ("training", "c0"),
+    "validation/loss": ("held-out scenes", "c1"),
+    "validation/loss_shuffled_actions": ("held-out, shuffled actions", "c3"),
+    "validation/loss_no_actions": ("held-out, no actions", "c4"),
 }
-LOSS_COLOURS = ("c0", "c1", "c3", "c4")
 ERRORS = {
     "validation/sample_error": "squared error of the clean latents",
     "validation/rollout_error": "squared latent error of four-step rollouts",
@@ -52,7 +51,7 @@ def training_section(context: ReportContext) -> Section:
     missing: list[str] = []
     rows: list[list[object]] = []
     for step, title in STAGES.items():
-        variants = context.inputs.variants(step)
+        variants = context.variants(step)
         if not variants and step not in OPTIONAL_STAGES:
             missing.append(title)
         for variant, folder in variants.items():
@@ -69,7 +68,7 @@ def training_section(context: ReportContext) -> Section:
             "training", TITLE, missing="no training stage was given (inputs train_stage1, train_stage2, distill)."
         )
     lead = (
-        "What this run's own short training did, starting from the base model. Pale: every logged mean; strong: running mean."
+        "What this run's own training did, starting from the base model. Pale: every logged mean; strong: running mean."
         " Held-out losses always use the same clips, noise and noise levels, with the averaged weights."
     )
     table = Table(("Stage", "Steps", "First loss", "Last loss", "Last held-out loss"), rows, range(1, 5))
@@ -100,7 +99,7 @@ def read_curves(rows: Sequence[JsonObject]) -> dict[str, Curve]:
 def stage_charts(title: str, curves: Mapping[str, Curve]) -> list[Markup]:
     """Loss; held-out error of the clean latents; the other parts of the loss."""
     series: list[Series] = []
-    for (name, label), colour in zip(LOSSES.items(), LOSS_COLOURS, strict=True):
+    for name, (label, colour) in LOSSES.items():
         if name in curves:
             series += smooth(label, curves[name]) if name == "loss" else [marked(label, curves[name], colour)]
     errors = [error_chart(f"{title}: held-out error", what, name, curves) for name, what in ERRORS.items()]

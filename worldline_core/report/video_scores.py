@@ -1,19 +1,37 @@
-"""Video scores of one or several evaluations, and the episodes that they choose for the report's videos.
-
-Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
-"""
+"""Video scores of one or several evaluations by method, and how the methods are shown, coloured and ordered."""
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from worldline_core.report.methods import Method, in_order
 from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
+
+TRUE_METHOD = "true"
+"""Stands for the recorded videos among the methods of an evaluation: what is judged from them is a ceiling."""
+
+KINDS = {
+    TRUE_METHOD: ("recorded videos (ceiling)", "c2"),
+    "stage2": ("Stage II", "c0"),
+    "causal": ("causal, 4 steps", "c1"),
+    "stage2_zero": ("Stage II, no actions", "c4"),
+    "stage2_shuffled": ("Stage II, shuffled actions", "c3"),
+    "causal_zero": ("causal, no actions", "c4"),
+    "causal_shuffled": ("causal, shuffled actions", "c3"),
+    "copy": ("copy first frame", "c5"),
+    "other": ("", "c6"),
+}
+"""Label and colour of each kind of method, in the report's order."""
+GROUPS = {TRUE_METHOD: "", "shipped": "long-trained", "run": "this run", "baseline": ""}
+"""Whose weights a method has, in the report's order."""
+STEPS_NAME = re.compile(r"(?:shipped_)?(?P<base>stage2|causal)_(?P<steps>\d+)_steps")
+ZERO_WORDS = frozenset({"zero", "zeroed", "none", "noaction", "noactions", "no"})
+SHUFFLED_WORDS = frozenset({"shuffled", "shuffle"})
 
 SPLIT_ORDER = ("test", "ood_test", "validation", "train", "bank")
 SPLIT_LABELS = {
@@ -28,6 +46,59 @@ IOU_METRICS = ("robot_iou_exact", "robot_iou")
 
 
 @dataclass(frozen=True)
+class Method:
+    """A method as the report shows it: the model and its controls (`kind`) and whose weights they are (`group`)."""
+
+    name: str
+    kind: str
+    group: str
+
+    @property
+    def label(self) -> str:
+        found = STEPS_NAME.fullmatch(self.name)
+        if found:
+            return f"{KINDS[found['base']][0].split(',')[0]}, {found['steps']} steps"
+        return KINDS[self.kind][0] or self.name.replace("_", " ")
+
+    @property
+    def long_label(self) -> str:
+        """Label with the group, for tables that mix weights of several origins."""
+        return f"{self.label} ({GROUPS[self.group]})" if GROUPS[self.group] else self.label
+
+    @property
+    def colour(self) -> str:
+        return KINDS[self.kind][1]
+
+    @property
+    def rank(self) -> tuple[int, int, str]:
+        return [*GROUPS].index(self.group), [*KINDS].index(self.kind), self.name
+
+
+def method(name: str) -> Method:
+    """Reads a method's name: `shipped_stage2_shuffled`, `causal`, `stage2.zero`, `copy_first_frame`, `true`, ..."""
+    words = set(re.split(r"[._\-\s]+", name.lower()))
+    if name == TRUE_METHOD:
+        return Method(name, TRUE_METHOD, TRUE_METHOD)
+    if "copy" in words:
+        return Method(name, "copy", "baseline")
+    base = "causal" if "causal" in words else "stage2" if words & {"stage2", "stageii"} else ""
+    control = "_zero" if words & ZERO_WORDS else "_shuffled" if words & SHUFFLED_WORDS else ""
+    # Another number of steps is another method: it must not stand under the label of the usual one.
+    kind = f"{base}{control}" if base and "steps" not in words else "other"
+    return Method(name, kind, "shipped" if "shipped" in words else "run")
+
+
+def in_order(names: Iterable[str]) -> list[Method]:
+    """Methods of several names: recorded videos, long-trained weights, this run's, then baselines without weights."""
+    return sorted((method(name) for name in names), key=lambda m: m.rank)
+
+
+def predicting(names: Iterable[str]) -> list[Method]:
+    """Those of several methods that predicted, in the report's order."""
+    return [m for m in in_order(names) if m.name != TRUE_METHOD]
+
+
+@dataclass(frozen=True)
 class VideoScores:
     """Summaries and tidy rows of `evaluate_video` artifacts, merged. Rows of the method `true` rate the segmenter."""
 
@@ -36,9 +107,9 @@ class VideoScores:
     by_frame: Sequence[JsonObject]
 
     @classmethod
-    def read(cls, folders: Mapping[str, Path]) -> VideoScores:
+    def read(cls, folders: Iterable[Path]) -> VideoScores:
         """Reads every folder's summary.json, scores.parquet and by_frame.parquet (absent files count as empty)."""
-        paths = list(folders.values())
+        paths = list(folders)
         return cls(
             [summary for path in paths if (summary := read_json(path / "summary.json"))],
             [row for path in paths for row in read_rows(path / "scores.parquet")],
@@ -57,7 +128,7 @@ class VideoScores:
 
     def methods(self, group: str) -> list[Method]:
         """Methods scored in a group, in the report's order."""
-        return in_order(sorted({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})}))
+        return in_order({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})})
 
     def value(self, group: str, method: str, metric: str) -> JsonObject | None:
         """`{"mean", "low", "high", "count"}` of a metric (`psnr`, `psnr@head`, ...), or None."""
@@ -110,56 +181,3 @@ class VideoScores:
         methods = self.methods(group)
         named = next((m for m in methods if m.name == configured), None)
         return named or next((m for m in methods if m.kind == "stage2"), methods[0] if methods else None)
-
-
-@dataclass(frozen=True)
-class ChosenEpisode:
-    """An episode and why it is shown."""
-
-    episode_id: str
-    reason: str
-    score: float | None = None
-    split: str = ""
-
-
-def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float]]:
-    """(label, episode, value) of the median, best and worst of a score where higher is better; ties by name."""
-    ranked = sorted(values.items(), key=lambda item: (item[1], item[0]))
-    if not ranked:
-        return []
-    places = [("median", (len(ranked) - 1) // 2), ("best", len(ranked) - 1), ("worst", 0)]
-    chosen: list[tuple[str, str, float]] = []
-    for label, place in places:
-        name, value = ranked[place]
-        if name not in {episode for _, episode, _ in chosen}:
-            chosen.append((label, name, value))
-    return chosen
-
-
-def choose_episodes(scores: VideoScores, primary: str | None, available: Sequence[str]) -> list[ChosenEpisode]:
-    """Median, best and worst of the first held-out group, and the median of every further one.
-
-    Args:
-        primary: the method whose robot IoU ranks the episodes.
-        available: episodes that have predicted videos; without scores the first, middle and last of them are taken.
-    """
-    known = set(available)
-    chosen: list[ChosenEpisode] = []
-    for group in scores.groups:
-        first = scores.primary(group, primary)
-        metric = scores.iou_metric(group, first.name) if first is not None else None
-        if first is None or metric is None or group == "train":
-            continue
-        values = {k: v for k, v in scores.per_episode(first.name, metric, "head", group).items() if k in known}
-        ranked = best_median_worst(values)
-        where = SPLIT_LABELS.get(group, group)
-        for label, episode, value in ranked if not chosen else ranked[:1]:
-            reason = f"{label} of {len(values)} on {where}"
-            chosen.append(ChosenEpisode(episode, reason, value, group))
-    if chosen or not available:
-        return chosen
-    ordered = sorted(known)
-    places = sorted({0, len(ordered) // 2, len(ordered) - 1})
-    return [
-        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores were given)") for i in places
-    ]

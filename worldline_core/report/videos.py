@@ -1,28 +1,86 @@
-"""Page "Predicted videos": truth and predictions side by side, in each view, with recordings to open in 3-D."""
+"""Page "Predicted videos": truth and predictions side by side, in each view, with recordings to open in 3-D.
+
+Episodes are never picked by hand: shown are the best, the median and the worst by a stated score.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.exports.rollout import export_rollout
 from worldline_core.pages.page import words
 from worldline_core.pictures.labels import draw_tag
 from worldline_core.pictures.side_by_side import compose_side_by_side, write_side_by_side, write_video
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.report.methods import Method, in_order
-from worldline_core.report.video_scores import ChosenEpisode, choose_episodes
+from worldline_core.report.video_scores import SPLIT_LABELS, Method, VideoScores, in_order
 
 TITLE = "Predicted videos"
-GROUPS = {
+GROUP_CAPTIONS = {
     "shipped": "Long-trained: the checkpoints that ship with the project",
-    "run": "This run: what its own short training reached",
+    "run": "This run: what its own training reached",
 }
+
+
+@dataclass(frozen=True)
+class ChosenEpisode:
+    """An episode and why it is shown."""
+
+    episode_id: str
+    reason: str
+    score: float | None = None
+
+
+def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float]]:
+    """(label, episode, value) of the median, best and worst of a score where higher is better; ties by name."""
+    ranked = sorted(values.items(), key=lambda item: (item[1], item[0]))
+    if not ranked:
+        return []
+    places = [("median", (len(ranked) - 1) // 2), ("best", len(ranked) - 1), ("worst", 0)]
+    chosen: list[tuple[str, str, float]] = []
+    for label, place in places:
+        name, value = ranked[place]
+        if name not in {episode for _, episode, _ in chosen}:
+            chosen.append((label, name, value))
+    return chosen
+
+
+def choose_episodes(scores: VideoScores, primary: str | None, available: Sequence[str]) -> list[ChosenEpisode]:
+    """Median, best and worst of the first held-out group, and the median of every further one.
+
+    Args:
+        primary: the method whose robot IoU ranks the episodes.
+        available: episodes that have predicted videos; without scores the first, middle and last of them are taken.
+    """
+    known = set(available)
+    chosen: list[ChosenEpisode] = []
+    for group in scores.groups:
+        first = scores.primary(group, primary)
+        metric = scores.iou_metric(group, first.name) if first is not None else None
+        if first is None or metric is None or group == "train":
+            continue
+        values = {k: v for k, v in scores.per_episode(first.name, metric, "head", group).items() if k in known}
+        ranked = best_median_worst(values)
+        where = SPLIT_LABELS.get(group, group)
+        for label, episode, value in ranked if not chosen else ranked[:1]:
+            reason = f"{label} of {len(values)} on {where}"
+            chosen.append(ChosenEpisode(episode, reason, value))
+    if chosen or not available:
+        return chosen
+    ordered = sorted(known)
+    places = sorted({0, len(ordered) // 2, len(ordered) - 1})
+    return [
+        ChosenEpisode(ordered[i], f"number {i + 1} of {len(ordered)} by name (no scores were given)") for i in places
+    ]
 
 
 def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
@@ -36,7 +94,7 @@ def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
 
 def videos_section(context: ReportContext) -> Section:
     """A card for each chosen episode."""
-    if not context.inputs.variants("rollout"):
+    if not context.variants("rollout"):
         return Section("videos", TITLE, missing="no RolloutSet was given (inputs rollout.<method>).")
     if context.episodes is None:
         return Section("videos", TITLE, missing="the recorded episodes were not given (inputs filter or curate).")
@@ -58,7 +116,7 @@ def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, numb
     """One episode: what it is, its videos by view, and the recordings beside it."""
     row = episodes.rows[episodes.position(item.episode_id)]
     views = [view for view in VIEWS if view in row.views]
-    wanted = [(view, group) for view in views for group in GROUPS]
+    wanted = [(view, group) for view in views for group in GROUP_CAPTIONS]
     # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         videos = list(pool.map(lambda place: video(context, item, place[0], place[1], number), wanted))
@@ -105,17 +163,14 @@ def video(context: ReportContext, item: ChosenEpisode, view: str, group: str, nu
         context.media / f"episode{number}_{group}_{view}.mp4", columns, episodes.rows[index].fps,
         tile_height=context.config.tile_height, upscale=context.config.upscale,
     )  # fmt: skip
-    caption = f"{GROUPS[group]} ({words(view)} view, {made.num_frames} frames). Columns: {', '.join(columns)}."
+    caption = f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames). Columns: {', '.join(columns)}."
     return {"video": made, "caption": caption, "unreadable": unreadable}
 
 
 def recordings(context: ReportContext, item: ChosenEpisode, number: int) -> list[str]:
     """Names of the Rerun and MCAP files written below run/recordings (a Rerun recording's bytes are not reproducible)."""
-    from worldline_core.actions.episode_tracks import ActionTracks
-    from worldline_core.exports.rollout import export_rollout
-
     formats = [name for name, wanted in (("rrd", context.config.rerun), ("mcap", context.config.mcap)) if wanted]
-    shown = {m.name for group in GROUPS for m in methods_of_group(context, item.episode_id, group)}
+    shown = {m.name for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)}
     if context.episodes is None or not formats:
         return []
     folder = context.inputs.get("render_actions")
@@ -129,26 +184,23 @@ def recordings(context: ReportContext, item: ChosenEpisode, number: int) -> list
 
 def overview_video(context: ReportContext) -> dict[str, Any] | None:
     """Truth beside the first model's prediction, one row per view, of the first chosen episode; None without one."""
-    episodes = context.episodes
-    if episodes is None or not context.inputs.variants("rollout"):
+    episodes, chosen = context.episodes, chosen_episodes(context)
+    if episodes is None or not chosen:
         return None
-    for item in chosen_episodes(context)[:1]:
-        methods = [m for group in GROUPS for m in methods_of_group(context, item.episode_id, group)]
-        if not methods:
-            return None
-        method = next((m for m in methods if m.name == context.config.primary_method), methods[0])
-        index = episodes.position(item.episode_id)
-        row = episodes.rows[index]
-        rows = []
-        for view in [v for v in VIEWS if v in row.views]:
-            true = np.asarray(episodes.frames(index, view))
-            predicted = predicted_frames(context, method.name, item.episode_id, view)
-            columns = (
-                {"recorded": true, f"predicted, {method.label}": predicted} if not rows else {"": true, " ": predicted}
-            )
-            frames = compose_side_by_side(columns, tile_height=192, labels=not rows)
-            rows.append(np.stack([draw_tag(frame, words(view), corner="bottom-left") for frame in frames]))
-        count = min(len(frames) for frames in rows)
-        made = write_video(context.media / "overview.mp4", np.concatenate([f[:count] for f in rows], axis=1), row.fps)
-        return {"video": made, "item": item, "row": row, "method": method}
-    return None
+    item = chosen[0]
+    methods = [m for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)]
+    if not methods:
+        return None
+    method = next((m for m in methods if m.name == context.config.primary_method), methods[0])
+    index = episodes.position(item.episode_id)
+    row = episodes.rows[index]
+    rows: list[np.ndarray] = []
+    for view in [v for v in VIEWS if v in row.views]:
+        true = np.asarray(episodes.frames(index, view))
+        predicted = predicted_frames(context, method.name, item.episode_id, view)
+        columns = {"recorded": true, f"predicted, {method.label}": predicted}
+        frames = compose_side_by_side(columns, tile_height=192, labels=not rows)
+        rows.append(np.stack([draw_tag(frame, words(view)) for frame in frames]))
+    count = min(len(frames) for frames in rows)
+    made = write_video(context.media / "overview.mp4", np.concatenate([f[:count] for f in rows], axis=1), row.fps)
+    return {"video": made, "item": item, "row": row, "method": method}
