@@ -6,17 +6,22 @@ import numpy as np
 import pytest
 
 from tests.evaluation.conftest import make_film
-from worldline_core.evaluation.policy.measured_judge import score
+from worldline_core.evaluation.policy.evidence import establishes_success, route
+from worldline_core.evaluation.policy.measured_judge import facts, measure, score
 from worldline_core.evaluation.policy.measurements import (
     LATE_COUNT,
     ColouredThing,
     OwnColour,
+    PressMeasurement,
     colour_share,
     likeness,
     measure_lift,
+    measure_press,
+    measure_push,
     named_things,
     own_colour,
 )
+from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 
 CUBE = ColouredThing("red", "cube")
 
@@ -68,3 +73,49 @@ def test_a_table_with_a_tint_of_the_hue_is_not_the_thing() -> None:
     assert own is not None
     share = likeness(frames, own)
     assert share[0].sum() == pytest.approx(49, rel=0.02)
+
+
+def painted(*boxes: tuple[slice, slice]) -> np.ndarray:
+    """A frame of a grey table with red boxes."""
+    frame = np.full((48, 72, 3), 120, np.uint8)
+    for box in boxes:
+        frame[box] = (220, 20, 20)
+    return frame
+
+
+def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it() -> None:
+    cap, plate = (slice(20, 27), slice(30, 37)), (slice(18, 30), slice(27, 40))
+    pressed = np.stack([painted(cap)] * 5 + [painted(plate)] * 3)
+    pressed[-2, 18:24] = 120
+    left = np.stack([painted(cap)] * 8)
+    instruction = "press the red button"
+    for frames, growth, done in ((pressed, 156 / 49, True), (left, 1.0, False)):
+        measured = measure(ColourSegmenter(), instruction, route(instruction), {"head": frames}, None)
+        assert isinstance(measured, PressMeasurement)
+        assert measured.growth == pytest.approx(growth, rel=0.02)
+        assert establishes_success(facts(measured, instruction, "state_change")) is done
+        assert (score(measured) > 0.5) is done
+
+
+def test_a_button_that_is_never_seen_proves_nothing() -> None:
+    measured = measure_press({"head": np.stack([painted()] * 8)}, ColouredThing("red", "button"))
+    assert measured == PressMeasurement(None)
+    assert not establishes_success(facts(measured, "press the red button", "state_change"))
+
+
+@pytest.mark.parametrize("towards_the_camera", [True, False])
+def test_a_drawer_closes_away_from_the_camera_or_towards_it(towards_the_camera: bool) -> None:
+    rows = (slice(28, 30), slice(10, 30)) if towards_the_camera else (slice(10, 12), slice(10, 30))
+    columns = slice(30, 45)
+    frames = np.stack([painted((rows[1], columns))] * 5 + [painted((rows[0], columns))] * 3)
+    measured = measure_push({"head": frames}, ColouredThing("red", "drawer"), np.zeros((3, 48, 72), bool))
+    assert measured.remaining == pytest.approx(0.1, abs=0.02)
+    assert measured.retreat is not None
+    assert measured.retreat > 0.8
+
+
+def test_a_wide_thing_rises_in_units_of_its_height() -> None:
+    low, high = (slice(34, 38), slice(10, 60)), (slice(24, 28), slice(10, 60))
+    frames = np.stack([painted(low)] * 5 + [painted(high)] * 3)
+    measured = measure_lift({"head": frames}, ColouredThing("red", "tray"), np.zeros((3, 48, 72), bool))
+    assert measured.rise == pytest.approx(10 / 4, rel=0.35)

@@ -227,7 +227,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_policy",
-        2,
+        3,
         "worldline_core.evaluation.policy.evaluate_policy",
         "evaluate_policy",
         "PolicyEvaluationConfig",
@@ -237,7 +237,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_planning",
-        2,
+        3,
         "worldline_core.evaluation.planning.evaluate_planning",
         "evaluate_planning",
         "PlanningConfig",

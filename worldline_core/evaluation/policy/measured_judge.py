@@ -29,27 +29,31 @@ from worldline_core.evaluation.policy.measurements import (
     LATE_COUNT,
     LiftMeasurement,
     PlaceMeasurement,
+    PressMeasurement,
     PushMeasurement,
     measure_lift,
     measure_place,
+    measure_press,
     measure_push,
     named_things,
 )
 from worldline_core.evaluation.recordings import HEAD, Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 
-Measurement = LiftMeasurement | PlaceMeasurement | PushMeasurement
+Measurement = LiftMeasurement | PlaceMeasurement | PushMeasurement | PressMeasurement
 
-MIN_RISE, RISE_WIDTH = 0.5, 0.25
+MIN_RISE, RISE_WIDTH = 0.3, 0.25
 MIN_VACATED = 0.6
 DROP_PEAK = 1.0
 MIN_HELD = 0.6
 MAX_DISTANCE, DISTANCE_WIDTH = 0.5, 0.12
 MAX_REMAINING, REMAINING_WIDTH = 0.56, 0.12
 MIN_RETREAT, RETREAT_WIDTH = 0.53, 0.12
+MIN_GROWTH, GROWTH_WIDTH = 1.7, 0.2
 UNSEEN_SCORE = 0.25
 
-# What is to be pushed in or closed.
+# What is to be pressed; what is to be pushed in or closed.
+_PRESSING = re.compile(r"\bpress(es|ed|ing)?\b")
 _CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
 
 
@@ -85,6 +89,8 @@ def score(measured: Measurement) -> float:
         if measured.distance is None:
             return UNSEEN_SCORE
         return _above(-measured.distance, -MAX_DISTANCE, DISTANCE_WIDTH)
+    if isinstance(measured, PressMeasurement):
+        return UNSEEN_SCORE if measured.growth is None else _above(measured.growth, MIN_GROWTH, GROWTH_WIDTH)
     if measured.remaining is None:
         return UNSEEN_SCORE
     retreat = 1.0 if measured.retreat is None else _above(measured.retreat, MIN_RETREAT, RETREAT_WIDTH)
@@ -109,7 +115,7 @@ def measure(
     """Measure what the family's facts need, on chosen frames (n, h, w, 3) of each view.
 
     None when the instruction does not name what to follow by a colour, or asks for an effect that this cannot measure
-    (it measures holding, lifting, placing one thing on another, and closing).
+    (it measures holding, lifting, placing one thing on another, closing, and pressing what then lights up).
     """
     things = named_things(instruction)
     if len(things) == 0 or len(frames[HEAD]) < LATE_COUNT:
@@ -118,6 +124,8 @@ def measure(
         return measure_lift(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
     if len(things) > 1:
         return measure_place(frames, things[0], things[1])
+    if _PRESSING.search(instruction.lower()):
+        return measure_press(frames, things[0])
     if _CLOSING.search(instruction.lower()):
         return measure_push(frames, things[0], _robot_late(segmenter, frames[HEAD], points))
     return None
@@ -126,7 +134,8 @@ def measure(
 def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily) -> Evidence:
     """The family's evidence from a measurement.
 
-    Placed is what lies at its destination; closed is what little is left of, and whose near edge has retreated.
+    Placed is what lies at its destination; closed is what little is left of, and whose edge has retreated; pressed is
+    what has lit up.
     """
     if measured is None:
         return SCHEMAS[family](observations="nothing in the instruction can be followed by its colour")
@@ -138,6 +147,10 @@ def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily
         if measured.distance is not None:
             done = measured.distance < MAX_DISTANCE
         words = f"{names[0]}: {_text(measured.distance)} destination sizes from the {names[1]} in the end"
+    elif isinstance(measured, PressMeasurement):
+        if measured.growth is not None:
+            done = measured.growth > MIN_GROWTH
+        words = f"{names[0]}: its colour fills {_text(measured.growth)} times its first area in the end"
     else:
         if measured.remaining is not None:
             retreated = measured.retreat is None or measured.retreat > MIN_RETREAT

@@ -134,6 +134,12 @@ class Sighting:
     def size(self) -> float:
         return max(1.0, float(np.sqrt(self.full_area)))
 
+    @property
+    def height(self) -> float:
+        """Its size [px], or for a wide thing how high it is in the picture."""
+        far, near = _edges(self.shares[int(np.argmax(self.area))])
+        return max(1.0, min(self.size, (near - far) / 0.8))
+
     def seen(self, fraction: float) -> np.ndarray:
         """Frames (n,) in which at least this fraction of it is visible."""
         least = _MIN_AREA_FRACTION * self.shares[0].size
@@ -143,7 +149,8 @@ class Sighting:
 @dataclass(frozen=True)
 class LiftMeasurement:
     """Attributes:
-    rise: the least of the late heights against the resting height, in sizes (up is positive).
+    rise: the least of the late heights against the resting height, in sizes or, of a wide thing, in its heights (up is
+        positive).
     peak: the most it ever rose.
     held: share of the late frames in which it is held.
     vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
@@ -164,11 +171,19 @@ class PlaceMeasurement:
 
 @dataclass(frozen=True)
 class PushMeasurement:
-    """remaining: late share of the visible area that no robot covers; retreat: how far its near edge moved up, in sizes
-    (None when nothing of it is visible any more)."""
+    """remaining: late share of the visible area that no robot covers; retreat: how far its near edge moved up or its far
+    edge down (whichever is more, for a drawer closes away from the camera or towards it), in sizes; None when nothing
+    of it is visible any more."""
 
     remaining: float | None
     retreat: float | None
+
+
+@dataclass(frozen=True)
+class PressMeasurement:
+    """growth: late area of the colour against its first, for a button that lights up while it is down."""
+
+    growth: float | None
 
 
 def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
@@ -195,9 +210,9 @@ def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
     rise = peak = vacated = None
     if clear.any():
         resting = float(np.quantile(head.v[clear], 0.85))
-        peak = (resting - float(head.v[clear].min())) / head.size
+        peak = (resting - float(head.v[clear].min())) / head.height
         if (late & visible).any():
-            rise = (resting - float(head.v[late & visible].max())) / head.size
+            rise = (resting - float(head.v[late & visible].max())) / head.height
         early = np.where(clear, head.area, 0.0)[: max(1, len(head.area) // 2)]
         if early.max() > 0:
             spot = head.shares[int(np.argmax(early))]
@@ -217,9 +232,10 @@ def measure_place(
         return PlaceMeasurement(None)
     best = int(np.argmax(place.area))
     size = max(1.0, float(np.sqrt(place.area[best])))
-    # The centre of a thing that stands on a spot is seen a little above the spot.
     du = float(item.u[late].mean()) - float(place.u[best])
-    dv = float(item.v[late].mean()) + 0.1 * item.size - float(place.v[best])
+    # A thing's foot, not its centre, stands on the spot: lower by half of its height, less its depth.
+    far, near = _edges(item.shares[int(np.argmax(item.area))])
+    dv = float(item.v[late].mean()) + 0.6 * (near - far) - 0.4 * item.size - float(place.v[best])
     return PlaceMeasurement(float(np.hypot(du, dv)) / size)
 
 
@@ -232,11 +248,23 @@ def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
     late = head.area[-LATE_COUNT:]
     covered = float((head.shares[best] * robot_late).sum(axis=(1, 2)).mean()) / float(head.area[best])
     remaining = float(late.mean()) / float(head.area[best]) / max(1.0 - covered, 0.05)
-    edges = [_near_edge(share) for share in head.shares[-LATE_COUNT:][late > _MIN_AREA_FRACTION * head.shares[0].size]]
+    shown = head.shares[-LATE_COUNT:][late > _MIN_AREA_FRACTION * head.shares[0].size]
     retreat = None
-    if edges:
-        retreat = (_near_edge(head.shares[best]) - float(np.mean(edges))) / float(np.sqrt(head.area[best]))
+    if len(shown):
+        far, near = _edges(head.shares[best])
+        late_far, late_near = np.mean([_edges(share) for share in shown], axis=0)
+        retreat = float(max(near - late_near, late_far - far) / np.sqrt(head.area[best]))
     return PushMeasurement(remaining, retreat)
+
+
+def measure_press(frames: Mapping[str, np.ndarray], thing: ColouredThing) -> PressMeasurement:
+    """How much larger a button's colour has become."""
+    head = sight(frames[HEAD], thing)
+    first = float(head.area[:LATE_COUNT].max())
+    if first < _MIN_AREA_FRACTION * head.shares[0].size:
+        return PressMeasurement(None)
+    # What covers it for a moment hides a part of it, so the largest late area counts.
+    return PressMeasurement(float(head.area[-LATE_COUNT:].max()) / first)
 
 
 def _held(
@@ -271,7 +299,7 @@ def _held(
     return float(holds.mean()) if holds[-1] else 0.0
 
 
-def _near_edge(share: np.ndarray) -> float:
-    """Row below which a tenth of the area lies."""
+def _edges(share: np.ndarray) -> tuple[float, float]:
+    """Rows above and below which a tenth of the area lies: the far and the near edge."""
     rows = np.cumsum(share.sum(axis=1))
-    return float(np.searchsorted(rows, 0.9 * rows[-1]))
+    return float(np.searchsorted(rows, 0.1 * rows[-1])), float(np.searchsorted(rows, 0.9 * rows[-1]))
