@@ -23,6 +23,10 @@ def build_parser() -> argparse.ArgumentParser:
     pipeline.set_defaults(run=_pipeline)
     nightly = commands.add_parser("nightly", help="evaluate the shipped checkpoints and compare with earlier nights")
     nightly.set_defaults(run=_nightly)
+    nightly.add_argument("--night", metavar="NAME", help="its name in the history (default: the date)")
+    nightly.add_argument(
+        "--accept", metavar="NAME", help="evaluate nothing: hold later nights against this one, though it became worse"
+    )
     for parser_with_config in (pipeline, nightly):
         _add_config_arguments(parser_with_config)
     task = commands.add_parser("task", help="run one step alone", formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,11 +173,20 @@ def _pipeline(arguments: argparse.Namespace) -> None:
 
 
 def _nightly(arguments: argparse.Namespace) -> None:
+    if arguments.accept is not None:
+        from worldline_core.report.nightly import accept_night
+
+        accept_night(arguments.artifacts / "nightly", arguments.accept)
+        print(f"later nights are held against {arguments.accept}")
+        return
     preset = _checked_preset(arguments)
     _use_local_prefect_storage(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
 
-    print(f"nightly: {nightly_evaluation(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)}")
+    history = nightly_evaluation(
+        preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
+    )
+    print(f"nightly: {history / 'index.html'}")
 
 
 def _task(arguments: argparse.Namespace) -> None:

@@ -11,13 +11,13 @@ from tasks.run_nodes import run_nodes
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
-from worldline_core.report.nightly import compare_with_history
+from worldline_core.report.nightly import NightlyComparison, compare_with_history, refuse_regressions
 
 
 @task(name="compare_nights", persist_result=False)
-def compare_nights(scores: dict[str, Path], history: Path) -> Path:
+def compare_nights(scores: dict[str, Path], history: Path, night: str | None) -> NightlyComparison:
     """Append this night's scores to the history and write the comparison."""
-    return compare_with_history(scores, history)
+    return compare_with_history(scores, history, night)
 
 
 @flow(name="nightly-evaluation")
@@ -26,11 +26,17 @@ def nightly_evaluation(
     config: Path | None = None,
     overrides: tuple[str, ...] = (),
     artifacts: Path = Path("artifacts"),
+    night: str | None = None,
 ) -> Path:
-    """Rollouts and evaluations of the shipped checkpoints; returns the folder of the comparison."""
+    """Rollouts and evaluations of the shipped checkpoints; returns the folder of the comparison.
+
+    A night that became worse than the last good one ends in the state Failed, with the metrics named.
+    """
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
     done = run_nodes(without_training(plan(settings, Path.cwd())), artifacts.resolve(), settings.runner)
     scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
-    comparison = compare_nights(scores, artifacts.resolve() / "nightly")
-    show_in_prefect(comparison, done)
-    return comparison
+    history = artifacts.resolve() / "nightly"
+    compared = compare_nights(scores, history, night)
+    show_in_prefect(history, done)
+    refuse_regressions(compared, history)
+    return history

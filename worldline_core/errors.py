@@ -66,5 +66,9 @@ class TrainingError(WorldLineError):
     """Training cannot go on (for example, a loss that is not finite)."""
 
 
+class RegressionError(WorldLineError):
+    """An evaluation found models worse than they were."""
+
+
 class UnavailableError(WorldLineError):
     """Something optional (weights, an extra, a device, a server) is needed but not there."""

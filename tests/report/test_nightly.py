@@ -7,9 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.scores import Interval
-from worldline_core.report.nightly import compare_with_history, read_history, record_night, verdict
+from worldline_core.report.nightly import (
+    Change,
+    accept_night,
+    compare_with_history,
+    read_history,
+    record_night,
+    refuse_regressions,
+)
 
 
 def scores(folder: Path, mean: float) -> dict[str, Path]:
@@ -39,7 +46,7 @@ def test_a_drop_beyond_the_interval_is_a_regression(tmp_path: Path) -> None:
     history = tmp_path / "history"
     record_night(history, "2026-11-20", scores(tmp_path / "a", 0.6))
     same = record_night(history, "2026-11-21", scores(tmp_path / "b", 0.59))
-    assert [c.metric for c in same.regressions] == []
+    assert same.regressions == []
     worse = record_night(history, "2026-11-22", scores(tmp_path / "c", 0.5))
     assert len(worse.regressions) == 2  # IoU fell, and the error in pixels rose
     assert worse.previous == "2026-11-21"
@@ -56,30 +63,74 @@ def test_a_drop_beyond_the_interval_is_a_regression(tmp_path: Path) -> None:
     ],
 )
 def test_verdicts(metric: str, mean: float, expected: str) -> None:
-    assert verdict(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)) == expected
+    assert Change(metric, Interval(mean, mean, mean, 9), Interval(0.5, 0.4, 0.6, 9)).verdict == expected
 
 
-def test_the_same_night_is_replaced(tmp_path: Path) -> None:
+IOU, ERROR = "video/test/shipped_stage2/robot_iou@head", "video/test/shipped_stage2/end_effector_error_px@head"
+
+
+def test_a_regression_stays_one_until_it_is_repaired_or_accepted(tmp_path: Path) -> None:
     history = tmp_path / "history"
-    for mean in (0.5, 0.6):
-        record_night(history, "2026-11-20", scores(tmp_path / "a", mean))
-    nights = read_history(history)
-    assert [night.night for night in nights] == ["2026-11-20"]
-    assert nights[0].metrics["video/test/shipped_stage2/robot_iou@head"].mean == 0.6
+    record_night(history, "2026-11-20", scores(tmp_path / "a", 0.6))
+    for night in ("2026-11-21", "2026-11-22"):
+        worse = record_night(history, night, scores(tmp_path / night, 0.5))
+        assert (worse.previous, worse.regressions) == ("2026-11-20", [ERROR, IOU])
+    accept_night(history, "2026-11-22")
+    again = record_night(history, "2026-11-23", scores(tmp_path / "d", 0.5))
+    assert (again.previous, again.regressions) == ("2026-11-22", [])
+
+
+def test_a_second_run_of_a_day_is_compared_with_the_first(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    first = record_night(history, None, scores(tmp_path / "a", 0.6))
+    assert record_night(history, None, scores(tmp_path / "a", 0.6)) == first  # the same scores: the same night
+    second = record_night(history, None, scores(tmp_path / "b", 0.5))
+    assert second.previous == first.night
+    assert second.regressions == [ERROR, IOU]
+    assert [night.night for night in read_history(history)] == [first.night, second.night]
+
+
+def test_a_named_night_is_not_replaced(tmp_path: Path) -> None:
+    record_night(tmp_path / "history", "release", scores(tmp_path / "a", 0.6))
+    with pytest.raises(ArtifactError, match="recorded with other scores"):
+        record_night(tmp_path / "history", "release", scores(tmp_path / "b", 0.5))
+
+
+def test_a_metric_that_is_gone_is_a_regression(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    record_night(history, "1", scores(tmp_path / "a", 0.6))
+    found = scores(tmp_path / "b", 0.6)
+    summary = json.loads((tmp_path / "b" / "summary.json").read_text())
+    del summary["metrics"]["test"]["shipped_stage2"]["robot_iou@head"]
+    (tmp_path / "b" / "summary.json").write_text(json.dumps(summary))
+    assert record_night(history, "2", found).regressions == [IOU]
+
+
+def test_a_night_that_became_worse_ends_in_an_error_that_names_the_metrics(tmp_path: Path) -> None:
+    history = tmp_path / "history"
+    refuse_regressions(record_night(history, "1", scores(tmp_path / "a", 0.6)), history)
+    with pytest.raises(RegressionError, match=f"(?s)2 of 2 metrics.*{IOU}.*worldline nightly --accept 2"):
+        refuse_regressions(record_night(history, "2", scores(tmp_path / "b", 0.5)), history)
+
+
+def test_an_unknown_night_is_not_accepted(tmp_path: Path) -> None:
+    record_night(tmp_path / "history", "1", scores(tmp_path / "a", 0.6))
+    with pytest.raises(ArtifactError, match="No such night"):
+        accept_night(tmp_path / "history", "2")
 
 
 def test_page_shows_trends_and_regressions(tmp_path: Path, run_artifacts: dict[str, Path]) -> None:
     history = tmp_path / "history"
     record_night(history, "2026-11-20", scores(tmp_path / "a", 0.99))
-    folder = compare_with_history(
+    compare_with_history(
         {name: run_artifacts[name] for name in ("evaluate_video", "evaluate_policy", "evaluate_planning")},
         history,
         "2026-11-21",
     )
-    page = (folder / "index.html").read_text()
+    page = (history / "index.html").read_text()
     assert "video/test/shipped_stage2/robot_iou@head" in page
     assert "became worse" in page
-    comparison = json.loads((folder / "comparison.json").read_text())
+    comparison = json.loads((history / "comparison.json").read_text())
     assert "video/test/shipped_stage2/robot_iou@head" in comparison["regressions"]
     assert {c["metric"] for c in comparison["changes"]} >= {"policy/all/true/accuracy", "planning/N=32/true/success"}
 
@@ -103,8 +154,8 @@ def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifact
         summary["metrics"]["test"][name] = summary["metrics"]["test"]["shipped_stage2"]
         (tmp_path / str(number) / "summary.json").write_text(json.dumps(summary))
         found["evaluate_planning"] = run_artifacts["evaluate_planning"]  # its instructions are hostile, too
-        folder = compare_with_history(found, tmp_path / "history", f"{number} {hostile_text}")
-    pages = {path.name: path.read_text() for path in sorted(folder.glob("*.html"))}
+        compare_with_history(found, tmp_path / "history", f"{number} {hostile_text}")
+    pages = {path.name: path.read_text() for path in sorted((tmp_path / "history").glob("*.html"))}
     assert {"index.html", "quality.html", "planning.html"} <= set(pages)
     for text in pages.values():
         assert "<script>alert" not in text

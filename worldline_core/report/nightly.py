@@ -1,13 +1,14 @@
 """Comparison with earlier nights: a history of summaries, and a flag on what became worse than chance explains.
 
-The history is one JSON object a line: `{"night": "2026-11-21", "metrics": {name: {mean, low, high, count}}}`. Metrics
-are named `<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`, `planning/N=32/true/success`.
+The history is one JSON object a line, oldest first: `{"night": "2026-11-21", "good": true, "metrics": {name: {mean, low,
+high, count}}}`. Metrics are named `<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`,
+`planning/N=32/true/success`. A night is compared with the last good one before it. A night with regressions is not good:
+the next one is held against the same reference, until the loss is repaired or accepted.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ from typing import Any, Literal
 
 from markupsafe import Markup
 
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.scores import Interval
 from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, interval, render, words
@@ -26,8 +27,6 @@ from worldline_core.report.decisions import planning_section, policy_section
 from worldline_core.report.quality import quality_section
 from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-
-logger = logging.getLogger(__name__)
 
 HISTORY_FILE = "history.jsonl"
 EVALUATIONS = ("evaluate_video", "evaluate_policy", "evaluate_planning")
@@ -39,74 +38,96 @@ HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", 
 
 @dataclass(frozen=True)
 class Night:
-    """What one night measured: means with 95 % intervals over trajectories, by metric."""
+    """What one night measured: means with 95 % intervals over trajectories, by metric; and whether later ones may be
+    held against it."""
 
     night: str
     metrics: Mapping[str, Interval]
+    good: bool = True
 
 
 @dataclass(frozen=True)
 class Change:
-    """One metric beside the night before."""
+    """One metric beside the last good night; None where one of the two did not measure it."""
 
     metric: str
-    present: Interval
+    present: Interval | None
     previous: Interval | None
-    verdict: Literal["better", "worse", "same", "new"]
+
+    @property
+    def verdict(self) -> Literal["better", "worse", "same", "new", "missing"]:
+        """Better or worse only where the mean left the interval of the good night."""
+        if self.previous is None:
+            return "new"
+        if self.present is None:
+            return "missing"
+        if self.previous.low <= self.present.mean <= self.previous.high:
+            return "same"
+        fell = self.present.mean < self.previous.low
+        return "better" if fell == any(word in self.metric for word in LOWER_IS_BETTER) else "worse"
 
 
 @dataclass(frozen=True)
 class NightlyComparison:
-    """The present night against the one before it."""
+    """The present night against the last good one before it."""
 
     night: str
     previous: str | None
     changes: Sequence[Change]
 
     @property
-    def regressions(self) -> list[Change]:
-        """What became worse beyond the interval."""
-        return [change for change in self.changes if change.verdict == "worse"]
+    def regressions(self) -> list[str]:
+        """Metrics that became worse beyond the interval, or are not measured any more."""
+        return [change.metric for change in self.changes if change.verdict in ("worse", "missing")]
 
 
-def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> Path:
-    """Record a night, write `comparison.json` and pages with trends into the history's folder, and return it.
+def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> NightlyComparison:
+    """Record a night, and write `comparison.json` and pages with trends into the history's folder.
 
     Args:
         scores: finished Scores by step name.
         history: folder of the history.
-        night: name of the night (default: today's date, UTC).
+        night: as `record_night` has it.
 
     Raises:
-        ArtifactError: nothing was measured, or the history is damaged.
+        ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
     """
-    compared = record_night(history, night or time.strftime("%Y-%m-%d", time.gmtime()), scores)
-    for change in compared.regressions:
-        logger.warning(
-            "worse than %s: %s %s, was %s", compared.previous, change.metric, change.present, change.previous
-        )
-    regressions = [change.metric for change in compared.regressions]
-    write_json_atomic(history / "comparison.json", asdict(compared) | {"regressions": regressions})
+    compared = record_night(history, night, scores)
+    changes = [asdict(change) | {"verdict": change.verdict} for change in compared.changes]
+    content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
+    write_json_atomic(history / "comparison.json", content)
     context = ReportContext(ReportConfig(), {**scores, "history": history}, history)
     nights = nights_section(context)
     sections = [make(context) for make in (quality_section, policy_section, planning_section)]
-    text = f"Night {compared.night}: {len(regressions)} of {len(compared.changes)} metrics became worse."
+    text = f"Night {compared.night}: {len(compared.regressions)} of {len(compared.changes)} metrics became worse."
     first = replace(nights, title="WorldLine nightly evaluation", lead=f"{text} {nights.lead}")
     home = render("report/page.html", title=first.title, section=first, sections=sections, next=None)
     context.write_pages(home, sections)
-    return history
+    return compared
 
 
-def record_night(history: Path, night: str, inputs: Mapping[str, Path]) -> NightlyComparison:
-    """Appends a night's scores to the history and compares them with the night before.
+def refuse_regressions(compared: NightlyComparison, history: Path) -> None:
+    """Raises RegressionError, which names the metrics, for a night that became worse."""
+    if compared.regressions:
+        raise RegressionError(
+            f"{len(compared.regressions)} of {len(compared.changes)} metrics became worse than in {compared.previous}",
+            where=history / "index.html",
+            got=", ".join(compared.regressions),
+            next_step=f"find the cause; if this is the new normal: worldline nightly --accept {compared.night}",
+        )
+
+
+def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -> NightlyComparison:
+    """Appends a night's scores to the history and compares them with the last good night.
 
     Args:
-        history: folder of `history.jsonl`; made when absent. The same night is replaced, not repeated.
-        night: name of the night, sortable (an ISO date).
+        history: folder of `history.jsonl`; made when absent.
+        night: its name. Default: today's date (UTC), and the time if today has other scores already. The same scores
+            under the same name are the same night, measured again.
         inputs: finished Scores by step name (`evaluate_video`, `evaluate_policy`, `evaluate_planning`, variants with a dot).
 
     Raises:
-        ArtifactError: nothing was measured, or the history is damaged.
+        ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
     """
     metrics = collect_metrics(inputs)
     if not metrics:
@@ -116,11 +137,38 @@ def record_night(history: Path, night: str, inputs: Mapping[str, Path]) -> Night
             expected=f"inputs named {', '.join(EVALUATIONS)}",
             got=", ".join(sorted(inputs)) or "none",
         )
-    others = [n for n in read_history(history) if n.night != night]
-    nights = sorted([*others, Night(night, metrics)], key=lambda n: n.night)
-    lines = [json.dumps(asdict(item), sort_keys=True, allow_nan=False) for item in nights]
+    nights = read_history(history)
+    known = {found.night: index for index, found in enumerate(nights)}
+    name = night or time.strftime("%Y-%m-%d", time.gmtime())
+    if name in known and nights[known[name]].metrics == metrics:
+        return compare_nights(nights[: known[name] + 1])
+    if name in known and night is not None:
+        raise ArtifactError(
+            "This night is recorded with other scores", where=history / HISTORY_FILE, got=name,
+            next_step="give another name with --night, or none",
+        )  # fmt: skip
+    if name in known:
+        name = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime())
+    compared = compare_nights([*nights, Night(name, metrics)])
+    _write_history(history, [*nights, Night(name, metrics, good=not compared.regressions)])
+    return compared
+
+
+def accept_night(history: Path, night: str) -> None:
+    """Make a night good: later ones are held against it.
+
+    Raises:
+        ArtifactError: there is no such night, or the history is damaged.
+    """
+    nights = read_history(history)
+    if night not in (names := [found.night for found in nights]):
+        raise ArtifactError("No such night", where=history / HISTORY_FILE, expected=", ".join(names), got=night)
+    _write_history(history, [replace(found, good=found.good or found.night == night) for found in nights])
+
+
+def _write_history(history: Path, nights: Sequence[Night]) -> None:
+    lines = [json.dumps(asdict(night), sort_keys=True, allow_nan=False) for night in nights]
     write_bytes_atomic(history / HISTORY_FILE, ("\n".join(lines) + "\n").encode())
-    return compare_nights([n for n in nights if n.night <= night])
 
 
 def read_history(history: Path) -> list[Night]:
@@ -134,7 +182,7 @@ def read_history(history: Path) -> list[Night]:
     for row in read_json_lines(path) if path.is_file() else ():
         try:
             metrics = {name: Interval(**value) for name, value in row["metrics"].items()}
-            nights.append(Night(str(row["night"]), metrics))
+            nights.append(Night(str(row["night"]), metrics, bool(row.get("good", True))))
         except (KeyError, TypeError, AttributeError) as error:
             raise ArtifactError(
                 "A line of the history is not a night",
@@ -142,7 +190,7 @@ def read_history(history: Path) -> list[Night]:
                 expected="night, metrics of mean, low, high, count",
                 got=str(error),
             ) from error
-    return sorted(nights, key=lambda n: n.night)
+    return nights
 
 
 def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
@@ -179,25 +227,13 @@ def intervals(step: str, summary: JsonObject) -> Iterator[tuple[str, str, str, A
 
 
 def compare_nights(nights: Sequence[Night]) -> NightlyComparison:
-    """The last of several nights against the one before it."""
+    """The last of several nights against the last good one before it."""
     present = nights[-1]
-    previous = nights[-2] if len(nights) > 1 else None
+    previous = next((night for night in reversed(nights[:-1]) if night.good), None)
     before = previous.metrics if previous else {}
-    changes = [
-        Change(name, value, before.get(name), verdict(name, value, before.get(name)))
-        for name, value in sorted(present.metrics.items())
-    ]
+    names = sorted({*present.metrics, *before})
+    changes = [Change(name, present.metrics.get(name), before.get(name)) for name in names]
     return NightlyComparison(present.night, previous.night if previous else None, changes)
-
-
-def verdict(metric: str, present: Interval, previous: Interval | None) -> Literal["better", "worse", "same", "new"]:
-    """Better or worse only where the mean left the previous night's interval."""
-    if previous is None:
-        return "new"
-    if previous.low <= present.mean <= previous.high:
-        return "same"
-    fell = present.mean < previous.low
-    return "better" if fell == any(word in metric for word in LOWER_IS_BETTER) else "worse"
 
 
 def nights_section(context: ReportContext) -> Section:
@@ -210,25 +246,24 @@ def nights_section(context: ReportContext) -> Section:
         lead = f"The first night, {compared.night}: there is nothing to compare it with yet."
     else:
         lead = (
-            f"Night {compared.night} beside {compared.previous}. A metric is flagged when its mean left the interval of the"
-            " night before."
+            f"Night {compared.night} beside {compared.previous}, the last good one. A metric is flagged when its mean left"
+            " the interval of that night, or when it is not measured any more."
         )
-    tables = [change_table(compared, name) for name in ("worse", "better")]
+    tables = [change_table(compared, name) for name in ("worse", "missing", "better")]
     return context.section("nights", TITLE, lead, compared=compared, tables=tables, charts=trend_charts(nights))
 
 
 def change_table(compared: NightlyComparison, verdict: str) -> Table | None:
-    """Metrics that became better or worse, before and now."""
+    """Metrics with this verdict, before and now."""
     rows = [
         [
             code(c.metric),
-            interval(None if c.previous is None else asdict(c.previous), 3),
-            interval(asdict(c.present), 3),
+            *(interval(None if value is None else asdict(value), 3) for value in (c.previous, c.present)),
         ]
         for c in compared.changes
         if c.verdict == verdict
     ]
-    return Table(("Metric", "Night before", "This night"), rows, [1, 2], verdict.capitalize()) if rows else None
+    return Table(("Metric", "Last good night", "This night"), rows, [1, 2], verdict.capitalize()) if rows else None
 
 
 def trend_charts(nights: Sequence[Night]) -> list[Markup]:
