@@ -21,9 +21,9 @@ RELOAD_SECONDS = 5
 MOST_FACTS = 6
 PICTURES = ("previews/*.png", "previews/*.jpg", "media/*.jpg")
 SHARES: Mapping[str, float] = {
-    "curate": 22, "curate.banks": 40, "filter": 30, "render_actions": 9, "encode_latents": 6, "train_stage1": 4,
-    "train_stage2": 14, "distill": 24, "rollout": 4, "rollout.shipped_causal": 9, "rollout.shipped_stage2_35_steps": 41,
-    "rollout.banks_shipped_stage2": 77, "rollout.banks_shipped_causal": 133, "evaluate_video": 68, "evaluate_policy": 8,
+    "curate": 22, "curate.banks": 44, "filter": 23, "render_actions": 9, "encode_latents": 5, "train_stage1": 8,
+    "train_stage2": 15, "distill": 33, "rollout": 5, "rollout.shipped_causal": 13, "rollout.shipped_stage2_35_steps": 44,
+    "rollout.banks_shipped_stage2": 98, "rollout.banks_shipped_causal": 165, "evaluate_video": 68, "evaluate_policy": 8,
     "evaluate_planning": 55, "report": 18,
 }  # fmt: skip
 """Seconds of each step's nodes in the demo on one of two busy cores, and of those that take longer than the others of
