@@ -126,8 +126,7 @@ def main() -> None:
     arms = len(embodiment.arms)
     batched = FRAMES * arms / seconds(lambda: kinematics.tool_poses(states))
     rows = [
-        ("batched, tools only", batched),
-        ("batched, all links", FRAMES * arms / seconds(lambda: kinematics.tools_of(kinematics.link_poses(states)))),
+        ("batched", batched),
         (
             "the same, one frame a call",
             len(few) * arms / seconds(lambda: [kinematics.tool_poses(s[None]) for s in few]),

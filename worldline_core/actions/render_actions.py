@@ -29,7 +29,7 @@ from worldline_core.actions.tool_projection import TrackCounts, add_counts
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
@@ -62,12 +62,7 @@ class RenderActionsConfig(StrictModel):
     episodes_per_shard: int = Field(256, ge=1)
 
 
-def _reason(error: WorldLineError) -> str:
-    if isinstance(error, CalibrationError):
-        return "no_calibration"
-    if isinstance(error, UnavailableError):
-        return "kinematics_unavailable"
-    return "unknown_embodiment" if isinstance(error, ConfigError) else "invalid_controls"
+_ACCOUNT = ("episode_id", "source", "status", "reason", "stored_bytes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +122,16 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
             if is_transient(error):
                 raise
             evidence = {"expected": str(error.expected), "got": str(error.got)}
-            return self._reject(episode, _reason(error), error.what, evidence)
+            match error:
+                case CalibrationError():
+                    reason = "no_calibration"
+                case UnavailableError():
+                    reason = "kinematics_unavailable"
+                case ConfigError():
+                    reason = "unknown_embodiment"
+                case _:
+                    reason = "invalid_controls"
+            return self._reject(episode, reason, error.what, evidence)
         row = self.episodes.rows[episode]
         return ProjectedEpisode(
             episode_id=row.episode_id,
@@ -153,12 +157,12 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
             "rows": rows,
             "rejected": [asdict(result.rejection) for result in results if result.rejection is not None],
             "counts": {name: add_counts(parts) for name, parts in counts.items()},
-            "stored_bytes": {result.episode_id: result.stored_bytes for result in results},
+            "account": [{name: getattr(result, name) for name in _ACCOUNT} for result in results],
         }
         write_json_atomic(self._summary_path(number), summary)
 
     def summary(self, number: int) -> dict[str, Any]:
-        """Index rows, rejections, counts by embodiment and stored bytes by episode of a finished shard."""
+        """Index rows, rejections, counts by embodiment and account of a finished shard."""
         return json.loads(self._summary_path(number).read_text(encoding="utf-8"))
 
     def _summary_path(self, number: int) -> Path:
@@ -205,15 +209,16 @@ def render_actions(
     rows: list[dict[str, Any]] = []
     rejected: list[QuarantineRow] = []
     counts: dict[str, list[TrackCounts]] = {}
-    stored: dict[str, int] = {}
+    account: list[InputRow] = []
     for number in range(len(pieces)):
         shard = work.summary(number)
         rows += shard["rows"]
         rejected += [QuarantineRow(**row) for row in shard["rejected"]]
-        stored |= shard["stored_bytes"]
+        account += [InputRow(**row) for row in shard["account"]]
         for embodiment, numbers in shard["counts"].items():
             counts.setdefault(embodiment, []).append(numbers)
-    _account(episodes, rows, rejected, stored, output)
+    write_account(output, account)
+    check_account(output, len(episodes), {row["episode_id"] for row in rows}, {row.episode_id for row in rejected})
     write_index(output, rows, sigma_px_ref=config.sigma_px_ref)
     write_quarantine(output, rejected)
     _previews(config, episodes, ActionTracks.open(output), output)
@@ -229,31 +234,6 @@ def render_actions(
     }
     write_json_atomic(output / "summary.json", summary)
     return summary
-
-
-def _account(
-    episodes: EpisodeSet,
-    rows: Sequence[Mapping[str, Any]],
-    rejected: Sequence[QuarantineRow],
-    stored: Mapping[str, int],
-    output: Path,
-) -> None:
-    """Raises: DataError unless every episode has tracks or is quarantined."""
-    reasons = {row.episode_id: row.reason for row in rejected}
-    write_account(
-        output,
-        [
-            InputRow(
-                episode_id=row.episode_id,
-                source=row.source,
-                status="quarantined" if row.episode_id in reasons else "kept",
-                reason=reasons.get(row.episode_id),
-                stored_bytes=stored[row.episode_id],
-            )
-            for row in episodes.rows
-        ],
-    )
-    check_account(output, len(episodes), {row["episode_id"] for row in rows}, set(reasons))
 
 
 def _camera_motion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TypedDict
+from typing import TypedDict, cast
 
 import torch
 from einops import rearrange
@@ -183,14 +183,6 @@ def add_counts(parts: Sequence[TrackCounts]) -> TrackCounts:
             before = overshoot.get(arm, {"clipped": 0, "largest": 0.0})
             clipped, largest = before["clipped"] + one["clipped"], max(before["largest"], one["largest"])
             overshoot[arm] = {"clipped": clipped, "largest": largest}
-    return {
-        "episodes": sum(part["episodes"] for part in parts),
-        "samples": sum(part["samples"] for part in parts),
-        "valid": sum(part["valid"] for part in parts),
-        "behind_camera": sum(part["behind_camera"] for part in parts),
-        "outside_image": sum(part["outside_image"] for part in parts),
-        "invalid_calibration": sum(part["invalid_calibration"] for part in parts),
-        "outside_joint_limits": sum(part["outside_joint_limits"] for part in parts),
-        "gripper_clipped": sum(part["gripper_clipped"] for part in parts),
-        "gripper_overshoot": dict(sorted(overshoot.items())),
-    }
+    names = [name for name in TrackCounts.__annotations__ if name != "gripper_overshoot"]
+    numbers = {name: sum(part[name] for part in parts) for name in names}
+    return cast("TrackCounts", {**numbers, "gripper_overshoot": dict(sorted(overshoot.items()))})

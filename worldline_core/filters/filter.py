@@ -15,7 +15,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import batched
 from pathlib import Path
@@ -39,20 +39,29 @@ from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding, Verdict, runs
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
+from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
 FINDINGS_FILE = "findings.parquet"
-_FINDINGS = pa.schema(
-    [
-        ("episode_id", pa.string()),
-        ("detector", pa.string()),
-        ("view", pa.string()),
-        ("stage", pa.int64()),
-        ("passed", pa.bool_()),
-        ("cut_frames", pa.int64()),
-        ("numbers", pa.string()),
-    ]
-)
+
+
+@dataclass(frozen=True)
+class FindingRow:
+    """One row of findings.parquet.
+
+    Attributes:
+        numbers: JSON: what was measured, its thresholds, whose thresholds these are, and "cut", the (start, stop) of cut
+            frames.
+    """
+
+    episode_id: str
+    detector: str
+    view: str | None
+    stage: int
+    passed: bool
+    cut_frames: int
+    numbers: str
+
 
 type Detector = Callable[[Signals, FilterConfig, Sequence[Finding]], list[Finding]]
 
@@ -114,7 +123,7 @@ class EpisodeVerdict(StrictModel):
     segments: tuple[tuple[int, int], ...] = ()
     stage1_ok: bool = True
     stage2_reason: str | None = None
-    findings: tuple[dict[str, Any], ...] = ()
+    findings: tuple[FindingRow, ...] = ()
 
 
 def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> EpisodeVerdict:
@@ -163,21 +172,21 @@ def _cut_frames(finding: Finding) -> np.ndarray | None:
     return finding.verdict.bad_frames if finding.stage == 1 or finding.verdict.passed else None
 
 
-def _finding_row(episode_id: str, finding: Finding, thresholds: str) -> dict[str, Any]:
-    """`thresholds`: the source whose own thresholds were used, or "default"; "cut" lists (start, stop) of cut frames."""
+def _finding_row(episode_id: str, finding: Finding, thresholds: str) -> FindingRow:
+    """`thresholds`: the source whose own thresholds were used, or "default"."""
     verdict, cut = finding.verdict, _cut_frames(finding)
     numbers: dict[str, Any] = {**verdict.numbers, "thresholds": thresholds}
     if cut is not None and cut.any():
         numbers["cut"] = runs(cut)
-    return {
-        "episode_id": episode_id,
-        "detector": finding.detector,
-        "view": finding.view,
-        "stage": finding.stage,
-        "passed": bool(verdict.passed),
-        "cut_frames": 0 if cut is None else int(cut.sum()),
-        "numbers": json.dumps(numbers, sort_keys=True),
-    }
+    return FindingRow(
+        episode_id,
+        finding.detector,
+        finding.view,
+        finding.stage,
+        passed=bool(verdict.passed),
+        cut_frames=0 if cut is None else int(cut.sum()),
+        numbers=json.dumps(numbers, sort_keys=True),
+    )
 
 
 def filter_episodes(
@@ -210,7 +219,7 @@ def filter_episodes(
     for i, row in enumerate(episodes.rows):
         result = work.verdict(i)
         account.append(work.row(i, result))
-        findings += result.findings
+        findings += [asdict(row) for row in result.findings]
         if result.reason is not None:
             evidence = json.dumps(result.evidence, sort_keys=True)
             rejected.append(QuarantineRow(row.episode_id, row.source, result.reason, result.detail, evidence))
@@ -228,7 +237,7 @@ def filter_episodes(
             got=", ".join(sorted({r.reason for r in rejected})),
             next_step="look at the numbers in quarantine.parquet and at the thresholds in filter",
         )
-    write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=_FINDINGS))
+    write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=row_schema(FindingRow)))
     write_quarantine(output, rejected)
     write_index(output, rows)
     return {

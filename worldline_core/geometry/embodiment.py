@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import difflib
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,24 +26,6 @@ LIMIT_TOLERANCE_RAD = 0.02
 
 Bound = Annotated[float, Field(allow_inf_nan=True)]
 Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
-
-
-@dataclass(frozen=True)
-class LimitViolation:
-    """A joint that leaves its limits: frames outside, and the furthest value with its frame, in `unit` (or metres)."""
-
-    joint: str
-    frames: int
-    worst: float
-    worst_frame: int
-    lower: float
-    upper: float
-    unit: str
-
-    @property
-    def excess(self) -> float:
-        """How far the worst value is beyond its limit."""
-        return max(self.lower - self.worst, self.worst - self.upper)
 
 
 class FingerJoint(StrictModel):
@@ -207,35 +188,25 @@ class Embodiment(StrictModel):
             outside[:, columns] = (joints < limits[:, 0] - tolerance) | (joints > limits[:, 1] + tolerance)
         return outside
 
-    def limit_violations(self, state: np.ndarray, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> list[LimitViolation]:
-        """For each joint that leaves its limits: frames, the worst value and where; the worst joint first."""
-        outside = self.outside_limits(state, tolerance_rad)
-        found: list[LimitViolation] = []
-        for arm in self.arms:
-            for column, (lower, upper) in enumerate(arm.limits, self.joint_columns(arm).start):
-                if frames := int(outside[:, column].sum()):
-                    values = state[:, column].astype(np.float64)
-                    worst = int(np.argmax(np.maximum(lower - values, values - upper)))
-                    name = self.state_names[column]
-                    found.append(
-                        LimitViolation(name, frames, float(values[worst]), worst, lower, upper, self.joint_units)
-                    )
-        return sorted(found, key=lambda violation: -violation.excess)
-
     def check_limits(self, state: np.ndarray, where: object, tolerance_rad: float = LIMIT_TOLERANCE_RAD) -> None:
         """Raises: DataError naming the joint that is furthest out, its value, its limits and the frames outside."""
         self.check_state(state, where)
-        violations = self.limit_violations(state, tolerance_rad)
-        if violations:
-            worst = violations[0]
-            raise DataError(
-                "Joint position is beyond its limit",
-                where=f"{where}, embodiment {self.name}, frame {worst.worst_frame}, {worst.joint}",
-                expected=f"{worst.lower:g} to {worst.upper:g} {worst.unit}",
-                got=f"{worst.worst:g} {worst.unit}; {worst.frames} of {len(state)} frames are outside"
-                + (f", and {len(violations) - 1} more joints" if len(violations) > 1 else ""),
-                next_step="check the joint order, the units and the sign of this joint",
-            )
+        outside = self.outside_limits(state, tolerance_rad)
+        if not outside.any():
+            return
+        free = (-math.inf, math.inf)
+        lower, upper = np.array([limits for arm in self.arms for limits in (*arm.limits, free)]).T
+        beyond = np.where(outside, np.maximum(lower - state, state - upper), -math.inf)
+        frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
+        others = int(outside.any(axis=0).sum()) - 1
+        raise DataError(
+            "Joint position is beyond its limit",
+            where=f"{where}, embodiment {self.name}, frame {frame}, {self.state_names[joint]}",
+            expected=f"{lower[joint]:g} to {upper[joint]:g} {self.joint_units}",
+            got=f"{state[frame, joint]:g} {self.joint_units}; {int(outside[:, joint].sum())} of {len(state)} frames are "
+            "outside" + (f", and {others} more joints" if others else ""),
+            next_step="check the joint order, the units and the sign of this joint",
+        )
 
 
 def embodiment_names() -> list[str]:

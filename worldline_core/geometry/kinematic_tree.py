@@ -61,11 +61,6 @@ class TreeBody:
         for child in self.children:
             yield from child.walk()
 
-    def pruned(self, wanted: set[str]) -> TreeBody | None:
-        """The part of the tree that decides the poses of some bodies: they and what lies between them and the root."""
-        children = [kept for child in self.children if (kept := child.pruned(wanted)) is not None]
-        return replace(self, children=children) if children or self.name in wanted else None
-
     def prefixed(self, prefix: str) -> TreeBody:
         """A copy in which every body and joint is named `prefix/name`."""
         joints = [replace(joint, name=f"{prefix}/{joint.name}") for joint in self.joints]

@@ -1,14 +1,13 @@
 """Forward kinematics: from `observation.state` (or `action`) to tool, link and wrist camera poses, in batches.
 
 The chains are `pytorch_kinematics` chains in float64, built from the trees that `kinematic_tree` reads; all poses are
-float64. Tools and wrist cameras need the arms only: they come from a chain without the other links, which gives the
-same bits and is faster. Axis legend: n frames, a arms, j state columns, l links.
+float64. Axis legend: n frames, a arms, j state columns, l links.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -88,10 +87,8 @@ class ArmKinematics:
             )
         self._revolute = {name for name, kind in kinds.items() if kind == "revolute"}
 
-    def _joint_positions(
-        self, names: Iterable[str], state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None
-    ) -> Tensor:
-        """Positions [rad or m] of joints (n, joints): state, posture, fingers; anything else at zero.
+    def _joint_positions(self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None) -> Tensor:
+        """Positions [rad or m] of the chain's joints (n, joints): state, posture, fingers; anything else at zero.
 
         This is the one place where degrees become radians.
         """
@@ -116,7 +113,7 @@ class ArmKinematics:
         if embodiment.joint_units == "deg":
             columns.update({n: c * (math.pi / 180) for n, c in columns.items() if n in self._revolute})
         zero = torch.zeros_like(values[:, 0])
-        return torch.stack([columns.get(name, zero) for name in names], dim=-1)
+        return torch.stack([columns.get(name, zero) for name in self.joints], dim=-1)
 
     def link_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
@@ -131,28 +128,12 @@ class ArmKinematics:
         Raises:
             DataError: the joint vector has a wrong length or is not finite.
         """
-        return self._poses(self.chain, self.links, state, posture)
-
-    def arm_poses(
-        self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
-    ) -> dict[str, Float[Tensor, "n 4 4"]]:
-        """T_base_link of the end-effector and camera links only: what `tools_of` and `wrist_cameras_of` need."""
-        return self._poses(self._arm_chain, self._arm_links, state, posture)
-
-    def _poses(
-        self,
-        chain: Chain,
-        links: tuple[str, ...],
-        state: np.ndarray | Tensor,
-        posture: Mapping[str, np.ndarray] | None,
-    ) -> dict[str, Tensor]:
-        positions = self._joint_positions(chain.get_joint_parameter_names(), state, posture)
-        T_root_link = chain.forward_kinematics_tensor(positions)
+        positions = self._joint_positions(state, posture)
+        T_root_link = self.chain.forward_kinematics_tensor(positions)
         if self._base_is_root:
-            return {name: T_root_link[chain.frame_to_idx[name]] for name in links}
-        T_root_base = T_root_link[chain.frame_to_idx[self.embodiment.base_link]]
-        T_base_root = invert(T_root_base)
-        return {name: T_base_root @ T_root_link[chain.frame_to_idx[name]] for name in links}
+            return {name: T_root_link[self.chain.frame_to_idx[name]] for name in self.links}
+        T_base_root = invert(T_root_link[self.chain.frame_to_idx[self.embodiment.base_link]])
+        return {name: T_base_root @ T_root_link[self.chain.frame_to_idx[name]] for name in self.links}
 
     @cached_property
     def _base_is_root(self) -> bool:
@@ -162,28 +143,14 @@ class ArmKinematics:
             self.embodiment.base_link == root.name and not root.joints and bool((root.T_parent_body == np.eye(4)).all())
         )
 
-    @cached_property
-    def _arm_links(self) -> tuple[str, ...]:
-        links: dict[str, None] = {}
-        for arm in self.embodiment.arms:
-            links[arm.end_effector_link] = None
-            if arm.wrist_camera is not None:
-                links[arm.wrist_camera.link] = None
-        return tuple(links)
-
-    @cached_property
-    def _arm_chain(self) -> Chain:
-        tree = self.tree.pruned({self.embodiment.base_link, *self._arm_links})
-        return self.chain if tree is None else chain_from_tree(tree)
-
     def tool_poses(
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
     ) -> Float[Tensor, "n a 4 4"]:
         """T_base_tool: frame between the fingertips, +z out of the gripper."""
-        return self.tools_of(self.arm_poses(state, posture))
+        return self.tools_of(self.link_poses(state, posture))
 
     def tools_of(self, links: Mapping[str, Tensor]) -> Float[Tensor, "n a 4 4"]:
-        """T_base_tool from what `link_poses` or `arm_poses` gave."""
+        """T_base_tool from what `link_poses` gave."""
         tools = [
             links[arm.end_effector_link] @ torch.from_numpy(arm.T_link_tool.matrix()).to(links[arm.end_effector_link])
             for arm in self.embodiment.arms
@@ -194,10 +161,10 @@ class ArmKinematics:
         self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray] | None = None
     ) -> dict[str, Float[Tensor, "n 4 4"]]:
         """T_base_camera by view, for the arms whose camera mount is known: from controls, never from a recording."""
-        return self.wrist_cameras_of(self.arm_poses(state, posture))
+        return self.wrist_cameras_of(self.link_poses(state, posture))
 
     def wrist_cameras_of(self, links: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n 4 4"]]:
-        """T_base_camera by view from what `link_poses` or `arm_poses` gave."""
+        """T_base_camera by view from what `link_poses` gave."""
         return {
             arm.camera_view: links[mount.link]
             @ torch.tensor(mount.T_link_camera, dtype=torch.float64).to(links[mount.link])
