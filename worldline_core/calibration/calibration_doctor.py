@@ -1,13 +1,14 @@
 """The calibration doctor: reads an episode under every usual mistake and names the one that explains what it shows.
 
-From top to bottom: an episode is observed, read as it was recorded and under one mistake at a time (`read`), every
-reading is scored by its evidence (`_explain`), and the scores decide (`_decide`); `diagnose_set` adds episodes up.
+From top to bottom: an episode is observed, read as it was recorded and under one mistake at a time, every reading is
+scored by its evidence (`_Search`), and the scores decide (`_decide`); `diagnose_set` adds episodes up.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -69,21 +70,17 @@ def diagnose(
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
         note = f"The recording has no {missing}: nothing can be compared"
         return Diagnosis(episode.episode_id, "too_little_evidence", _NOTHING, (_NOTHING,), (), (note,))
-    poses = pose_terms(observation, recorded, config)
-    if config.search == "when_suspicious":
-        quick = _unsuspicious(observation, recorded, poses, config)
-        if quick is not None:
-            return Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
-    none = _explain(recorded, _terms(observation, recorded, config, poses), config)
+    search = _Search(observation, recorded, config)
+    if config.search == "when_suspicious" and (quick := search.unsuspicious()) is not None:
+        return Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
+    none = search.none
     moves = float(np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max())
     measures = view_measures(observation, recorded, config)
     notes = notes_on(observation, recorded, measures, config)
-    singles = _singles(observation, recorded, poses, none, config)
-    ranked = sorted([none, *singles], key=lambda e: -e.score)
+    ranked = sorted([none, *search.singles()], key=lambda e: -e.score)
     best = ranked[0]
     if not _healthy(best, config) and not _healthy(none, config):
-        pairs = _pairs(observation, ranked, config)
-        beating = [pair for pair in pairs if pair.score > best.score + config.min_margin]
+        beating = [pair for pair in search.pairs(ranked) if pair.score > best.score + config.min_margin]
         ranked = sorted([*ranked, *beating], key=lambda e: -e.score)
         best = ranked[0]
     verdict, best = _decide(none, best, config)
@@ -156,82 +153,90 @@ def _summed(members: list[Explanation], score: float) -> Explanation:
     return Explanation(conventions, score, dict(evidence))
 
 
-def _explain(reading: Reading, terms: dict[str, float], config: CalibrationDoctorConfig) -> Explanation:
-    """A reading with its score: the sum of its terms, less what departing from the contract costs."""
-    conventions = reading.conventions
-    cost = config.complexity * (len(conventions.departures) + (conventions.views is not None) / 2)
-    return Explanation(conventions, float(sum(terms.values())) - cost, terms)
+class _Search:
+    """One episode, read under the usual mistakes; every reading is scored."""
 
+    def __init__(self, observation: Observation, recorded: Reading, config: CalibrationDoctorConfig) -> None:
+        self.observation, self.recorded, self.config = observation, recorded, config
+        self.recorded_poses = pose_terms(observation, recorded, config)
 
-def _terms(
-    observation: Observation,
-    reading: Reading,
-    config: CalibrationDoctorConfig,
-    poses: Mapping[str, float] | None = None,
-) -> dict[str, float]:
-    """All evidence of a reading; `poses` where its pose terms are known, since lags of images do not change them."""
-    return {
-        **(pose_terms(observation, reading, config) if poses is None else poses),
-        **image_terms(observation, reading, config),
-        **gripper_terms(observation, reading, config),
-    }
+    def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
+        """All evidence of a reading; `poses` where its pose terms are known, since lags of images do not change them."""
+        return {
+            **(pose_terms(self.observation, reading, self.config) if poses is None else poses),
+            **image_terms(self.observation, reading, self.config),
+            **gripper_terms(self.observation, reading, self.config),
+        }
 
+    def explain(self, reading: Reading, terms: dict[str, float]) -> Explanation:
+        """A reading with its score: the sum of its terms, less what departing from the contract costs."""
+        conventions = reading.conventions
+        cost = self.config.complexity * (len(conventions.departures) + (conventions.views is not None) / 2)
+        return Explanation(conventions, float(sum(terms.values())) - cost, terms)
 
-def _unsuspicious(
-    observation: Observation, recorded: Reading, poses: Mapping[str, float], config: CalibrationDoctorConfig
-) -> Explanation | None:
-    """The recording as written where nothing speaks against it, from what is quick to compute; else None."""
-    images = image_terms(observation, recorded, config, wrist_flow=False)
-    found = _explain(recorded, {**poses, **images}, config)
-    if min(poses.values(), default=0.0) < config.suspicion or not _healthy(found, config):
-        return None
-    if inversion_gain(observation, recorded, config) > 0:
-        return None
-    score = sum(images.values())
-    for lag in image_lags(observation, config):
-        other = image_terms(observation, recorded.with_image_lag(lag), config, wrist_flow=False)
-        if sum(other.values()) > score:
+    @cached_property
+    def none(self) -> Explanation:
+        """The recording as written."""
+        return self.explain(self.recorded, self.terms(self.recorded, self.recorded_poses))
+
+    def unsuspicious(self) -> Explanation | None:
+        """The recording as written where nothing speaks against it, from what is quick to compute; else None."""
+        observation, config = self.observation, self.config
+        images = image_terms(observation, self.recorded, config, wrist_flow=False)
+        found = self.explain(self.recorded, {**self.recorded_poses, **images})
+        if min(self.recorded_poses.values(), default=0.0) < config.suspicion or not _healthy(found, config):
             return None
-    return found
+        if inversion_gain(observation, self.recorded, config) > 0:
+            return None
+        score = sum(images.values())
+        for lag in image_lags(observation, config):
+            other = image_terms(observation, self.recorded.with_image_lag(lag), config, wrist_flow=False)
+            if sum(other.values()) > score:
+                return None
+        return found
 
+    def read(self, conventions: RecordedConventions) -> Reading | None:
+        """The episode under these conventions; None where they do not apply, or a lag leaves nothing of it."""
+        try:
+            return read(self.observation, conventions)
+        except RejectedInputError:
+            return None
 
-def _singles(
-    observation: Observation,
-    recorded: Reading,
-    poses: Mapping[str, float],
-    none: Explanation,
-    config: CalibrationDoctorConfig,
-) -> list[Explanation]:
-    """Every usual mistake, one at a time."""
-    readings = [_read_or_none(observation, c) for c in conventions_to_try(observation, recorded, config)]
-    found = [_in_views_that_improve(observation, reading, none, config) for reading in readings if reading is not None]
-    lagging = [recorded.with_image_lag(lag) for lag in image_lags(observation, config)]
-    return found + [_explain(late, _terms(observation, late, config, poses), config) for late in lagging]
+    def singles(self) -> list[Explanation]:
+        """Every usual mistake, one at a time."""
+        tried = map(self.read, conventions_to_try(self.observation, self.recorded, self.config))
+        found = [self.in_views_that_improve(reading) for reading in tried if reading is not None]
+        lagging = [self.recorded.with_image_lag(lag) for lag in image_lags(self.observation, self.config)]
+        return found + [self.explain(late, self.terms(late, self.recorded_poses)) for late in lagging]
 
+    def in_views_that_improve(self, reading: Reading) -> Explanation:
+        """The mistake in those views which it improves: one camera of a rig may be written unlike the others."""
+        terms, none = self.terms(reading), self.none.evidence
+        if reading.conventions.departures[0] not in _CAMERA_FIELDS:
+            return self.explain(reading, terms)
+        views = list(reading.cameras)
+        better = [view for view in views if _of_view(terms, view) > _of_view(none, view) + 1.0]
+        if not better or len(better) == len(views):
+            return self.explain(reading, terms)
+        others = [view for view in views if view not in better]
+        merged = {name: none[name] if _view_of(name, others) else value for name, value in terms.items()}
+        partial = self.read(reading.conventions.model_copy(update={"views": tuple(better)}))
+        return self.explain(reading if partial is None else partial, merged)
 
-def _read_or_none(observation: Observation, conventions: RecordedConventions) -> Reading | None:
-    try:
-        return read(observation, conventions)
-    except RejectedInputError:  # does not apply to this recording, or a lag leaves nothing of it
-        return None
-
-
-def _in_views_that_improve(
-    observation: Observation, reading: Reading, none: Explanation, config: CalibrationDoctorConfig
-) -> Explanation:
-    """The mistake in those views which it improves: one camera of a rig may be written unlike the others."""
-    terms = _terms(observation, reading, config)
-    if reading.conventions.departures[0] not in _CAMERA_FIELDS:
-        return _explain(reading, terms, config)
-    views = list(reading.cameras)
-    better = [view for view in views if _of_view(terms, view) > _of_view(none.evidence, view) + 1.0]
-    if not better or len(better) == len(views):
-        return _explain(reading, terms, config)
-    others = [view for view in views if view not in better]
-    merged = {name: none.evidence[name] if _view_of(name, others) else value for name, value in terms.items()}
-    conventions = reading.conventions.model_copy(update={"views": tuple(better)})
-    partial = _read_or_none(observation, conventions)
-    return _explain(reading if partial is None else partial, merged, config)
+    def pairs(self, ranked: list[Explanation]) -> list[Explanation]:
+        """Two mistakes at once, of those that explain most alone."""
+        first: dict[str, Explanation] = {}
+        for explanation in ranked:
+            if explanation.mistake != "none":
+                first.setdefault(explanation.mistake, explanation)
+        found = []
+        for one, two in combinations(list(first.values())[:PAIRED_MISTAKES], 2):
+            changed = {field: getattr(two.conventions, field) for field in two.conventions.departures}
+            views = one.conventions.views if one.conventions.views == two.conventions.views else None
+            reading = self.read(one.conventions.model_copy(update=changed | {"views": views}))
+            if reading is not None:
+                found.append(self.explain(reading, self.terms(reading)))
+        return found
 
 
 def _of_view(terms: Mapping[str, float], view: str) -> float:
@@ -240,23 +245,6 @@ def _of_view(terms: Mapping[str, float], view: str) -> float:
 
 def _view_of(name: str, views: list[str]) -> bool:
     return any(name.endswith(f" {view}") for view in views)
-
-
-def _pairs(observation: Observation, ranked: list[Explanation], config: CalibrationDoctorConfig) -> list[Explanation]:
-    """Two mistakes at once, of those that explain most alone."""
-    first: dict[str, Explanation] = {}
-    for explanation in ranked:
-        if explanation.mistake != "none":
-            first.setdefault(explanation.mistake, explanation)
-    found = []
-    for one, two in combinations(list(first.values())[:PAIRED_MISTAKES], 2):
-        changed = {field: getattr(two.conventions, field) for field in two.conventions.departures}
-        views = one.conventions.views if one.conventions.views == two.conventions.views else None
-        conventions = one.conventions.model_copy(update=changed | {"views": views})
-        reading = _read_or_none(observation, conventions)
-        if reading is not None:
-            found.append(_explain(reading, _terms(observation, reading, config), config))
-    return found
 
 
 def _healthy(explanation: Explanation, config: CalibrationDoctorConfig) -> bool:
