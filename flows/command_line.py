@@ -202,7 +202,7 @@ def _record(arguments: argparse.Namespace) -> None:
     from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
 
     path, overrides, output = arguments.config, arguments.overrides, arguments.output
-    if "banks" in read_yaml(path):
+    if {"banks", "grid"} & set(read_yaml(path)):
         config = load_config(RecordBanksConfig, path=path, overrides=overrides)
         print(record_with_manifest("record_banks", record_banks, config, output))
     else:

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError
 from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
@@ -115,6 +116,14 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
     _record_job((plan_jobs(config)[-1], config, tmp_path / "resumed"))
     record(config, tmp_path / "resumed")
     assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
+    # And one between the last file of the set and the account of it.
+    (tmp_path / "whole" / "recording.json").unlink()
+    assert record(config, tmp_path / "whole") == counts
+    assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
+    with pytest.raises(
+        DataError, match=r"(?s)other episodes than the configuration plans.*2 of them missing, 2 others"
+    ):
+        record(config.model_copy(update={"seed": 6}), tmp_path / "whole")
     rows = EpisodeSet.open(tmp_path / "whole").rows
     assert [row.embodiment for row in rows] == ["so101", "so101"]
     assert rows[0].scene in {f"scene_{n:02d}" for n in range(12)}

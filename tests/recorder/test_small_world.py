@@ -15,7 +15,9 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.recorder.banks import BankSpec, RecordBanksConfig, draw_bank
 from worldline_core.recorder.record import FAILURES_FILE, RecordConfig, RecordGroup, record
+from worldline_core.recorder.rendering import TEST_SCENES
 from worldline_core.recorder.small_bodies import BODIES
 from worldline_core.recorder.small_things import (
     BUTTON_TRAVEL,
@@ -192,6 +194,32 @@ def test_the_committed_configurations_train_on_six_bodies_and_hold_one_and_a_cam
     assert {group.embodiment for group in test.groups} - trained == {"panda_ivory"}
     assert {group.split for group in test.groups if group.held_out_camera} == {"ood_test"}
     assert all(group.families == TASKS for group in (*training.groups, *test.groups))
+
+
+def test_a_grid_of_banks_has_five_of_every_task_and_body_in_several_test_scenes() -> None:
+    config = load_config(RecordBanksConfig, path=CONFIG_ROOT / "recording" / "small_world_banks.yaml")
+    specs = config.specs()
+    cells = Counter((spec.embodiment, spec.family) for spec in specs)
+    assert len(cells) == 30
+    assert set(cells.values()) == {5}
+    assert len({spec.name for spec in specs}) == len({spec.layout for spec in specs}) == 150
+    assert {spec.scene for spec in specs} == set(TEST_SCENES)
+    for cell in cells:
+        assert len({spec.scene for spec in specs if (spec.embodiment, spec.family) == cell}) >= 4
+
+
+def test_banks_are_given_one_way() -> None:
+    with pytest.raises(ValidationError, match="give either banks or a grid; got neither"):
+        RecordBanksConfig()
+
+
+def test_a_bank_mixes_successes_and_failures_of_one_initial_state(recorder: SmallWorldRecorder) -> None:
+    spec = BankSpec(name="b", embodiment="ur5e_slate", family="carry", scene="scene_12", layout=3)
+    layout, motions = draw_bank(recorder, spec, RecordBanksConfig(banks=(spec,), candidates=8))
+    assert layout.family == "carry"
+    assert 0.25 <= np.mean([motion.outcome == "success" for motion in motions]) <= 0.75
+    for motion in motions[1:]:
+        np.testing.assert_array_equal(motion.qpos[0], motions[0].qpos[0])
 
 
 def test_families_of_another_world_are_refused() -> None:

@@ -6,6 +6,7 @@ among candidates cannot read it from the index.
 
 from __future__ import annotations
 
+import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import Field
+from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import DataError
-from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment, open_recorder
+from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, Embodiment, check_recorded, open_recorder
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import Motion, TaskLayout, WorldRecorder
@@ -38,20 +39,60 @@ class BankSpec(StrictModel):
     layout: int = Field(ge=0)
 
 
+class BankGrid(StrictModel):
+    """``count`` banks of every task with every embodiment, each from an initial state of its own; scenes take turns."""
+
+    embodiments: tuple[Embodiment, ...] = Field(min_length=1)
+    families: tuple[str, ...] = Field(min_length=1)
+    scenes: tuple[str, ...] = Field(min_length=1)
+    count: int = Field(default=5, ge=1)
+
+    def specs(self) -> list[BankSpec]:
+        """One spec per bank, named ``bank_<family>_<embodiment>_<number>``."""
+        cells: list[tuple[str, Embodiment, int]] = [
+            (f, e, number) for number in range(self.count) for e in self.embodiments for f in self.families
+        ]
+        return [
+            BankSpec(
+                name=f"bank_{family}_{embodiment}_{number}",
+                embodiment=embodiment,
+                family=family,
+                # Shifted from one number to the next, so that each cell sees several scenes.
+                scene=self.scenes[(layout + number) % len(self.scenes)],
+                layout=layout,
+            )
+            for layout, (family, embodiment, number) in enumerate(cells)
+        ]
+
+
 class RecordBanksConfig(StrictModel):
     """Banks of ``candidates`` control sequences each.
 
     Attributes:
+        banks, grid: which banks; one of the two.
+        workers: processes, each of which records whole banks.
         success_range: the share of a bank's candidates that succeed must lie in this range; otherwise the next initial
             state is tried (at most 20).
     """
 
-    banks: tuple[BankSpec, ...] = Field(min_length=1)
+    banks: tuple[BankSpec, ...] = ()
+    grid: BankGrid | None = None
+    workers: int = Field(default=1, ge=1, le=64)
     candidates: int = Field(default=32, ge=2, le=512)
     seed: int = Field(default=0, ge=0)
     num_frames: int = Field(default=33, ge=17, le=400)
     video_crf: int = Field(default=22, ge=0, le=51)
     success_range: tuple[float, float] = (0.25, 0.75)
+
+    @model_validator(mode="after")
+    def _banks_or_grid(self) -> RecordBanksConfig:
+        if bool(self.banks) == (self.grid is not None):
+            raise ValueError(f"give either banks or a grid; got {'both' if self.banks else 'neither'}")
+        return self
+
+    def specs(self) -> list[BankSpec]:
+        """Every bank to record."""
+        return list(self.banks) if self.grid is None else self.grid.specs()
 
 
 def draw_bank[L: TaskLayout](
@@ -80,48 +121,69 @@ def draw_bank[L: TaskLayout](
     )
 
 
+def _record_bank(task: tuple[BankSpec, RecordBanksConfig, Path, bool]) -> list[dict[str, str]]:
+    """Record a bank's missing candidates; the outcomes of all of them. Runs in a worker process."""
+    spec, config, output, finished = task
+    recorder = open_recorder(spec.embodiment)
+    layout, motions = draw_bank(recorder, spec, config)
+    sealed = [
+        {"episode_id": f"{spec.name}-{candidate:03d}", "outcome": motion.outcome}
+        for candidate, motion in enumerate(motions)
+    ]
+    if not finished:
+        writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
+        for candidate, (motion, row) in enumerate(zip(motions, sealed, strict=True)):
+            if writer.has(row["episode_id"]):
+                continue
+            recording = recorder.film(
+                layout,
+                replace(motion, outcome="unknown"),
+                episode_id=row["episode_id"],
+                scene_id=spec.scene,
+                split="bank",
+                # The same small camera shift for all candidates: they share the first picture.
+                jitter=np.random.default_rng((config.seed, spec.layout)),
+                bank=spec.name,
+                candidate=candidate,
+            )
+            writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
+    recorder.close()
+    return sealed
+
+
 def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
     """Record candidate banks into ``output`` (an EpisodeSet with sealed outcomes); finished episodes survive a kill.
 
     Returns the number of candidates and successes per bank.
 
-    Raises: UnavailableError without MuJoCo; DataError when a bank cannot be drawn.
+    Raises: UnavailableError without MuJoCo; DataError when a bank cannot be drawn, or the folder holds other episodes.
     """
     prepare_rendering()
-    writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
-    sealed: list[dict[str, str]] = []
-    counts: dict[str, dict[str, int]] = {}
-    total = len(config.banks) * config.candidates
-    with tqdm(total=total, desc="record banks", unit="candidate", disable=None) as progress:
-        for spec in config.banks:
-            recorder = open_recorder(spec.embodiment)
-            layout, motions = draw_bank(recorder, spec, config)
-            for candidate, motion in enumerate(motions):
-                episode_id = f"{spec.name}-{candidate:03d}"
-                sealed.append({"episode_id": episode_id, "outcome": motion.outcome})
-                if not writer.has(episode_id):
-                    recording = recorder.film(
-                        layout,
-                        replace(motion, outcome="unknown"),
-                        episode_id=episode_id,
-                        scene_id=spec.scene,
-                        split="bank",
-                        # The same small camera shift for all candidates: they share the first picture.
-                        jitter=np.random.default_rng((config.seed, spec.layout)),
-                        bank=spec.name,
-                        candidate=candidate,
-                    )
-                    writer.add(
-                        recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels
-                    )
+    specs, finished = config.specs(), EpisodeSetWriter.finished(output)
+    tasks = [(spec, config, output, finished) for spec in specs]
+    with tqdm(total=len(specs), desc="record banks", unit="bank", disable=None) as progress:
+        sealed: list[list[dict[str, str]]] = []
+        if config.workers == 1:
+            for task in tasks:
+                sealed.append(_record_bank(task))
                 progress.update()
-            recorder.close()
-            wins = sum(motion.outcome == "success" for motion in motions)
-            counts[spec.name] = {"candidates": len(motions), "successes": wins}
-    writer.close()
-    table = pa.Table.from_pylist(sorted(sealed, key=lambda row: row["episode_id"]))
+        else:
+            # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
+            with multiprocessing.get_context("spawn").Pool(config.workers) as pool:
+                for rows in pool.imap(_record_bank, tasks):
+                    sealed.append(rows)
+                    progress.update()
+    if not finished:
+        EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf).close()
+    rows = sorted((row for bank in sealed for row in bank), key=lambda row: row["episode_id"])
+    recorded = {row.episode_id for row in EpisodeSet.open(output).rows}
+    check_recorded(output, recorded, {row["episode_id"] for row in rows})
     with atomic_path(output / SEALED_FILE) as path:
-        pq.write_table(table, path)
-    summary = {"banks": len(counts), "candidates": sum(c["candidates"] for c in counts.values())}
+        pq.write_table(pa.Table.from_pylist(rows), path)
+    summary = {"banks": len(specs), "candidates": len(rows)}
     write_json_atomic(output / "recording.json", summary)
+    counts = {
+        spec.name: {"candidates": len(bank), "successes": sum(row["outcome"] == "success" for row in bank)}
+        for spec, bank in zip(specs, sealed, strict=True)
+    }
     return {**summary, "successes": counts}

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.errors import DataError
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
@@ -225,19 +226,24 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
 
     Returns counts: episodes, and outcomes per embodiment and family.
 
-    Raises: UnavailableError without MuJoCo; DataError when a task cannot be reached by an arm.
+    Raises: UnavailableError without MuJoCo; DataError when a task cannot be reached by an arm, or the folder holds other
+        episodes than these.
     """
-    prepare_rendering()
-    writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
     jobs = plan_jobs(config)
-    missing = [job for job in jobs if not writer.has(job.episode_id)]
-    done = len(jobs) - len(missing)
-    with tqdm(total=len(jobs), initial=done, desc="record", unit="episode", disable=None) as progress:
-        for _ in _run_jobs(missing, config, output):
-            progress.update()
-    writer.close()
+    # A kill may come between the set's last file and the account of it.
+    if not EpisodeSetWriter.finished(output):
+        prepare_rendering()
+        writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
+        missing = [job for job in jobs if not writer.has(job.episode_id)]
+        done = len(jobs) - len(missing)
+        with tqdm(total=len(jobs), initial=done, desc="record", unit="episode", disable=None) as progress:
+            for _ in _run_jobs(missing, config, output):
+                progress.update()
+        writer.close()
     table: dict[str, dict[str, dict[str, int]]] = {}
-    for row in EpisodeSet.open(output).rows:
+    rows = EpisodeSet.open(output).rows
+    check_recorded(output, {row.episode_id for row in rows}, {job.episode_id for job in jobs})
+    for row in rows:
         cell = table.setdefault(row.embodiment, {}).setdefault(row.task_family, {})
         cell[row.outcome] = cell.get(row.outcome, 0) + 1
     defects = {job.episode_id: job.defect for job in sorted(jobs, key=lambda job: job.episode_id) if job.defect}
@@ -254,6 +260,21 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     return counts
 
 
+def check_recorded(output: Path, recorded: set[str], planned: set[str]) -> None:
+    """Every episode is accounted for.
+
+    Raises: DataError where the set holds other episodes than were planned.
+    """
+    if recorded != planned:
+        raise DataError(
+            "The folder holds other episodes than the configuration plans",
+            where=output,
+            expected=f"{len(planned)} episodes",
+            got=f"{len(planned - recorded)} of them missing, {len(recorded - planned)} others",
+            next_step="record into a new folder",
+        )
+
+
 def record_with_manifest[C: StrictModel](
     step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
 ) -> dict[str, Any]:
@@ -263,8 +284,10 @@ def record_with_manifest[C: StrictModel](
         step: ``record_episodes`` or ``record_banks``.
         config: has a ``seed``.
 
-    Raises: what ``run`` raises.
+    Raises: DataError when the folder holds a finished recording; what ``run`` raises.
     """
+    if (output / MANIFEST_NAME).exists():
+        raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
     if output.exists():
         remove_unfinished(output)
     counts = run(config, output)
