@@ -102,6 +102,20 @@ def test_a_success_shows_throughout_the_last_quarter(recorder: SmallWorldRecorde
     assert shown > 0
 
 
+def test_in_a_long_recording_arms_go_on_after_the_task(recorder: SmallWorldRecorder) -> None:
+    held = 0
+    for number in range(10):
+        random = np.random.default_rng([6, number])
+        layout = recorder.layout(TASKS[number % 5], random)
+        motion = recorder.move(layout, random, 129)
+        if motion is None:
+            continue
+        acting = motion.state[:, recorder.scene.arms[0].qpos.size + 1 :] if layout.arm else motion.state
+        assert np.abs(np.diff(acting[60:], axis=0)).max() > 0.005
+        held += layout.family in ("lift", "carry") and motion.outcome == "success"
+    assert held > 0
+
+
 def test_outcomes_are_read_from_the_things(recorder: SmallWorldRecorder) -> None:
     random = np.random.default_rng(0)
     layouts = {task: recorder.layout(task, random) for task in TASKS}

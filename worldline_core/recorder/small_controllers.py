@@ -22,6 +22,8 @@ from worldline_core.recorder.small_things import (
 )
 from worldline_core.recorder.task_layout import side
 
+# A task takes less than this [s]; what is left of a longer recording, arms move on.
+TASK_SECONDS = 5.0
 # A hand's width [m]: how far a plan that goes wrong passes beside its thing.
 BESIDE = (0.085, 0.12)
 GRASP_HEIGHT, HANDLE_HEIGHT, DRAWER_HEIGHT = 0.088, 0.084, 0.052
@@ -230,10 +232,32 @@ def plan_small_waypoints(
 ) -> list[list[Waypoint]]:
     """Waypoints per arm for ``duration`` seconds."""
     if layout.family == "carry":
-        return _carry(robot, layout, random)
-    return [
-        _TASKS[layout.family](robot, layout, random)
-        if arm == layout.arm
-        else _idle(robot, layout, arm, random, duration)
-        for arm in range(len(robot.arms))
-    ]
+        plans = _carry(robot, layout, random)
+    else:
+        plans = [
+            _TASKS[layout.family](robot, layout, random)
+            if arm == layout.arm
+            else _idle(robot, layout, arm, random, duration)
+            for arm in range(len(robot.arms))
+        ]
+    if duration > TASK_SECONDS:
+        _go_on(robot, layout, plans, random, duration)
+    return plans
+
+
+def _go_on(
+    robot: Robot, layout: SmallLayout, plans: list[list[Waypoint]], random: np.random.Generator, duration: float
+) -> None:
+    """Let the arms that are done move slowly above the things, with whatever they hold; two that carry move alike."""
+    time = max(plans[arm][-1].time for arm in layout.acting())
+    first = {arm: plans[arm][-1] for arm in layout.acting()}
+    while time < duration:
+        time += float(random.uniform(1.3, 2.2))
+        shift = random.uniform((-0.05, -0.03, -0.02), (0.05, 0.03, 0.03))
+        for arm, start in first.items():
+            if len(first) > 1:
+                xy, z, yaw = np.array(start.position[:2]) + shift[:2], start.position[2] + shift[2], start.yaw
+            else:
+                x, y, z, yaw = free_tool(robot, arm, random) + np.array([0.0, 0.0, 0.03, 0.0])
+                xy = np.array([x, y])
+            plans[arm].append(_at(time, xy, z, yaw, plans[arm][-1].opening))
