@@ -17,7 +17,7 @@ import pytest
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode_index import read_index, write_index
+from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
@@ -191,8 +191,12 @@ def test_an_escaping_path_in_the_metadata_is_refused(tmp_path: Path, sample: Mak
     write_index(raw, [replace(rows[0], dataset="../../elsewhere"), rows[1]])
     info["video_path"] = "{video_key.__class__}/x.mp4"
     path.write_text(json.dumps(info))
-    with pytest.raises(DataError, match="No episode was kept"):
+    said = (
+        r"(?s)No episode was kept.*out2/quarantine\.parquet.*2 quarantined \(2 path_traversal\).*the first, episode-000"
+    )
+    with pytest.raises(DataError, match=said):
         curate(config(raw), {}, tmp_path / "out2")
+    assert len(read_quarantine(tmp_path / "out2")) == 2  # where a user looks first, though there is no set
 
 
 def test_equal_content_is_kept_once(tmp_path: Path, sample: Make) -> None:

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
@@ -217,8 +218,9 @@ def test_a_restart_gives_the_same_bytes(filtered: tuple[Path, Path, dict[str, An
 
 def test_nothing_left_is_an_error(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:
     curated, _, _ = filtered
-    with pytest.raises(DataError, match=r"(?s)No episode passed.*too_short"):
+    with pytest.raises(DataError, match=r"(?s)No episode passed.*out/quarantine\.parquet.*too_short.*the first, "):
         filter_episodes(FilterConfig(min_segment_frames=200), {"episodes": curated}, tmp_path / "out")
+    assert "too_short" in {row.reason for row in read_quarantine(tmp_path / "out")}
 
 
 def test_a_source_has_its_own_thresholds(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:

@@ -26,7 +26,13 @@ import pyarrow as pa
 from pydantic import Field
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, write_index, write_quarantine
+from worldline_core.data.episodes.episode_index import (
+    EpisodeRow,
+    QuarantineRow,
+    nothing_kept,
+    write_index,
+    write_quarantine,
+)
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
@@ -231,12 +237,8 @@ def filter_episodes(
     write_account(output, account)
     check_account(output, len(episodes), kept, {row.episode_id for row in rejected})
     if not rows:
-        raise DataError(
-            "No episode passed the filters",
-            where=str(inputs["episodes"]),
-            got=", ".join(sorted({r.reason for r in rejected})),
-            next_step="look at the numbers in quarantine.parquet and at the thresholds in filter",
-        )
+        next_step = "look at the numbers in the table and at the thresholds in filter"
+        raise nothing_kept("No episode passed the filters", output, rejected, next_step)
     write_table_atomic(output / FINDINGS_FILE, pa.Table.from_pylist(findings, schema=row_schema(FindingRow)))
     write_quarantine(output, rejected)
     write_index(output, rows)

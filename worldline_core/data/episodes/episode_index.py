@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from worldline_core.data.episodes.episode import EpisodeLabels
 from worldline_core.data.guards.plain_files import read_table
 from worldline_core.data.guards.rejection import RejectedInputError, unreadable
 from worldline_core.data.guards.source_paths import is_file
+from worldline_core.errors import DataError
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_table_atomic
 
@@ -128,6 +130,22 @@ def write_quarantine(root: Path, rows: Iterable[QuarantineRow]) -> None:
     ordered = sorted(rows, key=lambda row: (row.episode_id, row.source, row.reason))
     write_table_atomic(
         root / QUARANTINE_FILE, pa.Table.from_pylist([asdict(row) for row in ordered], schema=_QUARANTINE)
+    )
+
+
+def nothing_kept(what: str, root: Path, rows: Sequence[QuarantineRow], next_step: str) -> DataError:
+    """The error of a step that keeps no episode: counts by reason, and one case in full. Writes quarantine.parquet."""
+    write_quarantine(root, rows)
+    if not rows:
+        return DataError(what, where=root, got="no episodes at all", next_step=next_step)
+    counts = ", ".join(f"{count} {reason}" for reason, count in Counter(row.reason for row in rows).most_common())
+    first = min(rows, key=lambda row: row.episode_id)
+    detail = first.detail.replace("\n", "\n    ")
+    return DataError(
+        what,
+        where=root / QUARANTINE_FILE,
+        got=f"{len(rows)} quarantined ({counts})\n    the first, {first.episode_id} ({first.reason}): {detail}",
+        next_step=next_step,
     )
 
 

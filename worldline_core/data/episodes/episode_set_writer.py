@@ -23,6 +23,7 @@ from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
     EpisodeRow,
     QuarantineRow,
+    nothing_kept,
     write_index,
     write_quarantine,
 )
@@ -181,14 +182,12 @@ class EpisodeSetWriter:
     def close(self) -> dict[str, Any]:
         """Assemble datasets, index and quarantine; returns the counts {"kept", "quarantined", "reasons"}.
 
-        Raises: DataError when nothing was kept.
+        Raises: DataError when nothing was kept; the quarantine is written all the same.
         """
         parts, rejected = self.kept(), self.rejected()
         if not parts:
-            named = sorted({row.reason for row in rejected})
-            raise DataError(
-                "No episode was kept", where=self.root, got=f"{len(rejected)} quarantined: {', '.join(named) or 'none'}"
-            )
+            next_step = "repair the recordings or the source's configuration; the table has the reason of each episode"
+            raise nothing_kept("No episode was kept", self.root, rejected, next_step)
         groups: dict[tuple[Any, ...], list[Part]] = {}
         for part in parts:
             groups.setdefault(part.signature, []).append(part)
