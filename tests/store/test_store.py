@@ -48,6 +48,15 @@ def test_second_run_is_cached(tmp_path: Path) -> None:
     assert digest_folder(second.path) == second.digest
 
 
+def test_a_finished_step_says_what_became_of_its_episodes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def keep(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        return {"found": 5, "kept": 3, "quarantined": 2, "reasons": {"static": 2}}
+
+    with caplog.at_level("INFO", "worldline_core"):
+        ArtifactStore(tmp_path).run("keep", 1, keep, CountConfig(), {})
+    assert caplog.messages[-1].endswith("done in 0 s; found 5, kept 3, quarantined 2 (2 static)")
+
+
 @pytest.mark.parametrize("change", ["config", "version", "step", "input"])
 def test_key_depends_on_everything_that_matters(tmp_path: Path, change: str) -> None:
     store = ArtifactStore(tmp_path)

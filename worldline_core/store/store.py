@@ -212,7 +212,18 @@ class ArtifactStore:
             }
             write_json_atomic(partial / MANIFEST_NAME, manifest)
             partial.replace(folder)
+            logger.info("%s %s: done in %.0f s%s", step, key, manifest["wall_seconds"], _account(metrics))
         return Artifact(step, folder, digest, cached=False)
+
+
+def _account(metrics: Mapping[str, Any]) -> str:
+    """What became of a step's episodes, where it says so."""
+    if not {"found", "kept", "quarantined"} <= metrics.keys():
+        return ""
+    reasons = metrics.get("reasons", metrics.get("quarantine_reasons", {}))
+    named = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+    text = f"; found {metrics['found']}, kept {metrics['kept']}, quarantined {metrics['quarantined']}"
+    return f"{text} ({named})" if named else text
 
 
 def _portable(path: Path, root: Path) -> str:
