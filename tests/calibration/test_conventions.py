@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -120,6 +121,13 @@ def test_a_mistake_is_undone_and_changes_something(name: str, source_offset: flo
     assert_same(apply_conventions(spoiled, conventions), episode)
     with pytest.raises(AssertionError):
         assert_same(spoiled, episode)
+
+
+def test_exchanged_arms_can_be_drawn() -> None:
+    exchanged = apply_conventions(two_arms(), RecordedConventions(arms="exchanged"))
+    for poses in (exchanged.T_base_ee, exchanged.gripper):
+        assert poses is not None
+        torch.from_numpy(poses)  # refuses an array that is read backwards; the doctor's pictures ended so
 
 
 def test_degrees_of_joints() -> None:

@@ -280,8 +280,9 @@ def exchange_arms(episode: Episode) -> Episode:
         episode,
         state=episode.state[:, order],
         action=episode.action[:, order],
-        T_base_ee=None if episode.T_base_ee is None else episode.T_base_ee[:, ::-1],
-        gripper=None if episode.gripper is None else episode.gripper[:, ::-1],
+        # Copies: torch takes no array that is read backwards.
+        T_base_ee=None if episode.T_base_ee is None else episode.T_base_ee[:, ::-1].copy(),
+        gripper=None if episode.gripper is None else episode.gripper[:, ::-1].copy(),
     )
 
 
