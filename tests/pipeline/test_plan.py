@@ -49,6 +49,15 @@ def test_nightly_leaves_training_out_but_keeps_the_shipped_models(nodes: list[No
     assert "rollouts.shipped_stage2" in evaluation.inputs
 
 
+@pytest.mark.parametrize("preset", ["demo", "tiny", "smoke"])
+def test_nodes_without_training_have_the_inputs_that_they_need(preset: str, project_root: Path) -> None:
+    """The smoke preset predicts banks by its own model only: nothing is left to plan with."""
+    kept = without_training(plan(load_config(PipelineConfig, preset=preset), project_root))
+    assert "evaluate_video" in {node.name for node in kept}
+    for node in kept:
+        STEPS[node.step].check_inputs(node.inputs)
+
+
 def test_labels_of_the_banks_are_not_an_input_of_curation(nodes: list[Node]) -> None:
     (planning,) = [node for node in nodes if node.name == "evaluate_planning"]
     assert isinstance(planning.inputs["sealed"], Path)

@@ -207,8 +207,10 @@ def without_training(nodes: list[Node]) -> list[Node]:
     kept: list[Node] = []
     for node in nodes:
         needed = {name: source for name, source in node.inputs.items() if source not in dropped}
-        collects = node.step in ("report", "evaluate_video", "evaluate_policy", "evaluate_planning")
-        if node.name in dropped or (len(needed) < len(node.inputs) and not collects):
+        evaluates = node.step in ("evaluate_video", "evaluate_policy", "evaluate_planning")
+        without_videos = evaluates and not any(name.startswith("rollouts.") for name in needed)
+        without_input = len(needed) < len(node.inputs) and not evaluates and node.step != "report"
+        if node.name in dropped or without_videos or without_input:
             dropped.add(node.name)
             continue
         kept.append(Node(node.name, node.step, node.config, needed))
