@@ -39,9 +39,9 @@ def run_nodes(
 ) -> dict[str, ArtifactReference]:
     """Run every node, or find its artifact; returns the artifacts by the nodes' names.
 
-    With ``runner.nodes_at_once`` of 1 everything happens in this process. Otherwise nodes that wait for nothing run side
-    by side in processes that share the cores, first those that the longest work waits for. When a node fails, nothing more is started, what runs is let finish, and
-    its error is raised.
+    With ``runner.nodes_at_once`` of 1 everything happens in this process. Otherwise nodes that wait for nothing run
+    side by side in processes that share the cores, first those that the longest work waits for. When a node fails,
+    nothing more is started, what runs is let finish, and its error is raised.
     """
     with ExitStack() as stack:
         run = _Run(store_root, runner, watcher, _pool(runner, stack))

@@ -28,8 +28,6 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip, sigmas_causal
 from worldline_core.rollout.speed import timed
 
-HEAD_VIEW = "head"
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -340,7 +338,7 @@ def _poses(cameras: Mapping[str, Camera], mounted: set[str], frames: int) -> tup
             raise DataError(
                 "A camera pose has a wrong shape", where=view, expected=f"(4, 4) or ({frames}, 4, 4)", got=pose.shape
             )
-        wrist = view != HEAD_VIEW and view not in mounted
+        wrist = view != "head" and view not in mounted
         if wrist:
             forms[view] = pose.ndim
         poses[view] = np.repeat(pose[None], frames, axis=0) if wrist and pose.ndim == 2 else pose.reshape(-1, 4, 4)
