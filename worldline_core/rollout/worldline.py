@@ -16,7 +16,7 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, collate_tracks
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -338,7 +338,7 @@ def _poses(cameras: Mapping[str, Camera], mounted: set[str], frames: int) -> tup
             raise DataError(
                 "A camera pose has a wrong shape", where=view, expected=f"(4, 4) or ({frames}, 4, 4)", got=pose.shape
             )
-        wrist = view != "head" and view not in mounted
+        wrist = view != HEAD_VIEW and view not in mounted
         if wrist:
             forms[view] = pose.ndim
         poses[view] = np.repeat(pose[None], frames, axis=0) if wrist and pose.ndim == 2 else pose.reshape(-1, 4, 4)
