@@ -151,6 +151,8 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(
     assert min(long["block_seconds"]) > 0
     assert digests(tmp_path) == digests(output)
     assert digest_folder(tmp_path) == digest_folder(output)
+    with pytest.raises(ValidationError, match="shift needs the sampler full_clip"):
+        RolloutConfig(shift=5.0)
     with pytest.raises(ValidationError, match="timed_blocks needs the sampler block_causal"):
         RolloutConfig(sampler="full_clip", timed_blocks=2)
 

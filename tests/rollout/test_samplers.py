@@ -78,6 +78,20 @@ def test_whole_clip_sampler_finds_what_the_velocity_points_to() -> None:
     torch.testing.assert_close(predicted, clean, rtol=1e-4, atol=1e-4)
 
 
+def test_shifted_steps_stand_at_higher_noise(model: WorldModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, maps = observation(1)
+    seen: list[float] = []
+    forward = model.forward
+
+    def watched(state: torch.Tensor, sigma: torch.Tensor, **given: object) -> WorldModelOutput:
+        seen.append(float(sigma[0]))
+        return forward(state, sigma, **given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(model, "forward", watched)
+    rollout_full_clip(model, first, maps, noise=Noise([42]), steps=4, shift=5.0)
+    assert seen == pytest.approx([1.0, 15 / 16, 5 / 6, 5 / 8])
+
+
 def test_a_clip_is_predicted_alike_alone_and_in_a_batch(model: WorldModel) -> None:
     first, maps = observation()
     both = rollout_full_clip(model, first, maps, noise=Noise([42, 42]), steps=3)

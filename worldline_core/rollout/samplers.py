@@ -84,6 +84,7 @@ def rollout_full_clip(
     *,
     noise: Noise,
     steps: int = FULL_STEPS,
+    shift: float = 1.0,
     frames: int | None = None,
     views: Sequence[str] = VIEWS,
     text: TextContext | None = None,
@@ -94,6 +95,7 @@ def rollout_full_clip(
     Args:
         action_maps: controls of every latent frame; None for a model without actions (then give ``frames``).
         noise: one source per clip.
+        shift: moves the noise levels of the steps towards noise.
 
     Raises:
         ConfigError: fewer than one step.
@@ -112,7 +114,7 @@ def rollout_full_clip(
         return model(state, levels, action_maps=action_maps, text=text, views=views).velocity
 
     with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
-        return integrate(velocity, latents, shifted_sigmas(steps))
+        return integrate(velocity, latents, shifted_sigmas(steps, shift))
 
 
 class BlockCausalSimulator:

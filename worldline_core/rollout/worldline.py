@@ -68,6 +68,7 @@ class WorldLine:
         device: str = "cpu",
         bfloat16: bool = True,
         steps: int | None = None,
+        shift: float = 1.0,
         sink_blocks: int | None = None,
         recent_blocks: int | None = None,
     ) -> None:
@@ -84,6 +85,7 @@ class WorldLine:
             changes = {name: value for name, value in window.items() if value is not None}
             self.causal = self.causal.model_copy(update={"sigmas": sigmas_causal(self.causal, steps), **changes})
         self.steps = (steps or FULL_STEPS) if self.causal is None else self.causal.steps
+        self.shift = shift
         block = 1 if self.causal is None else self.causal.block_size
         self.frames_per_unit = tokenizer.temporal_compression * block
         rows, columns = self.contract.grid_size
@@ -100,6 +102,7 @@ class WorldLine:
         device: str = "cpu",
         bfloat16: bool = True,
         steps: int | None = None,
+        shift: float = 1.0,
         sink_blocks: int | None = None,
         recent_blocks: int | None = None,
     ) -> WorldLine:
@@ -110,6 +113,7 @@ class WorldLine:
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder.
             steps: Euler steps; by default those of the causal model, 35 for a Stage II model.
+            shift: of a Stage II model's noise levels towards noise (1: even steps, as in the paper).
             sink_blocks, recent_blocks: the causal model's window, by default the one it was trained with.
 
         Raises:
@@ -137,6 +141,7 @@ class WorldLine:
             device=device,
             bfloat16=bfloat16,
             steps=steps,
+            shift=shift,
             sink_blocks=sink_blocks,
             recent_blocks=recent_blocks,
         )
@@ -246,7 +251,14 @@ class WorldLine:
         if self.causal is None:
             noise = Noise(seeds)
             return rollout_full_clip(
-                self.model, first, maps, noise=noise, steps=self.steps, views=self.views, bfloat16=self.bfloat16
+                self.model,
+                first,
+                maps,
+                noise=noise,
+                steps=self.steps,
+                shift=self.shift,
+                views=self.views,
+                bfloat16=self.bfloat16,
             )
         simulator = self.simulator(seeds)
         simulator.start(first, maps[:, :, :, :1])
