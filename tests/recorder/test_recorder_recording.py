@@ -131,9 +131,10 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
 
 def test_bank_outcomes_are_sealed(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     spec = BankSpec(name="bank", embodiment="aloha_viperx", family="state_change", scene="scene_12", layout=1)
-    config = RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, success_range=(0.25, 0.75))
+    config = RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, success_range=(0.25, 0.75), masks=False)
     record_banks(config, tmp_path / "banks")
     episodes = EpisodeSet.open(tmp_path / "banks")
+    assert episodes.robot_masks(0, "head") is None
     assert {row.outcome for row in episodes.rows} == {"unknown"}
     assert [row.candidate for row in episodes.rows] == [0, 1, 2, 3]
     sealed = pq.read_table(tmp_path / "banks" / SEALED_FILE).to_pylist()

@@ -71,6 +71,7 @@ class RecordBanksConfig(StrictModel):
     Attributes:
         banks, grid: which banks; one of the two.
         workers: processes, each of which records whole banks.
+        masks: also store the exact pixels of the robot and of each thing; whoever chooses among videos needs none.
         success_range: the share of a bank's candidates that succeed must lie in this range; otherwise the next initial
             state is tried (at most 20).
     """
@@ -82,6 +83,7 @@ class RecordBanksConfig(StrictModel):
     seed: int = Field(default=0, ge=0)
     num_frames: int = Field(default=33, ge=17, le=400)
     video_crf: int = Field(default=22, ge=0, le=51)
+    masks: bool = True
     success_range: tuple[float, float] = (0.25, 0.75)
 
     @model_validator(mode="after")
@@ -146,7 +148,8 @@ def _record_bank(task: tuple[BankSpec, RecordBanksConfig, Path, bool]) -> list[d
                 bank=spec.name,
                 candidate=candidate,
             )
-            writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
+            masks, labels = (recording.robot_masks, recording.thing_labels) if config.masks else (None, None)
+            writer.add(recording.episode, recording.frames, masks, thing_labels=labels)
     recorder.close()
     return sealed
 
