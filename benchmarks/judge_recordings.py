@@ -1,11 +1,12 @@
-"""How well the measured judge tells success from failure in true videos, and in true videos through a tokenizer.
+"""How well the measured judge tells success from failure: in true videos, in these through a tokenizer, in predictions.
 
-    python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER] [--split train validation] [--limit 500]
+    python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER | --rollouts FOLDER] [--segmenter FOLDER]
+        [--split train validation] [--limit 500]
 
-RECORDINGS is an EpisodeSet of `worldline record` (episodes, or banks with their sealed outcomes). The robot masks that the
-judge needs are the exact ones of the recording, so that nothing but the judge (and the tokenizer) is measured: this is
-what no prediction can exceed. Per task the area under the curve of the judge's score, the same within banks, and the
-share of outcomes that its rules tell rightly.
+RECORDINGS is an EpisodeSet of `worldline record` (episodes, or banks with their sealed outcomes). By default the robot masks
+that the judge needs are the exact ones of the recording, so that nothing but the judge (and the tokenizer, or the
+prediction) is measured; with a segmenter, they are its masks of what is shown. Per task the area under the curve of the
+judge's score, the same within banks with its 95 % interval over banks, and the share of outcomes that its rules tell rightly.
 """
 
 from __future__ import annotations
@@ -27,9 +28,13 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.planning.selectors import planning_indices
 from worldline_core.evaluation.policy.evidence import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts, measure, score
+from worldline_core.evaluation.scores import bootstrap_mean
+from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
+from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.recorder.banks import SEALED_FILE
+from worldline_core.rollout.rollout_set import RolloutSet
 
 
 @dataclass(frozen=True)
@@ -63,11 +68,21 @@ def task_of(instruction: str) -> str:
     return instruction.split()[0] + (" with both arms" if "both arms" in instruction else "")
 
 
+def interval(values: list[float]) -> str | None:
+    """Mean and 95 % bootstrap interval."""
+    if not values:
+        return None
+    found = bootstrap_mean(values, resamples=2000, seed=42)
+    return f"{found.mean:.3f} ({found.low:.3f} to {found.high:.3f}), {len(values)} banks"
+
+
 def main() -> None:
     """Judge every chosen recording; print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--tokenizer", type=Path)
+    parser.add_argument("--rollouts", type=Path)
+    parser.add_argument("--segmenter", type=Path)
     parser.add_argument("--split", nargs="+", help="splits; all by default")
     parser.add_argument("--limit", type=int)
     arguments = parser.parse_args()
@@ -76,23 +91,34 @@ def main() -> None:
     outcomes = (
         {row["episode_id"]: row["outcome"] for row in pq.read_table(sealed).to_pylist()} if sealed.exists() else {}
     )
+    rollouts = None if arguments.rollouts is None else RolloutSet.open(arguments.rollouts)
+    learned = None if arguments.segmenter is None else LearnedSegmenter.load(arguments.segmenter)
     tokenizer = None if arguments.tokenizer is None else load_tokenizer(arguments.tokenizer)
     judged: dict[str, list[tuple[float, bool, bool, str | None]]] = defaultdict(list)
     for position in tqdm(episodes.select(split=arguments.split)[: arguments.limit], disable=None):
         row = episodes.rows[position]
-        outcome, masks = outcomes.get(row.episode_id, row.outcome), episodes.robot_masks(position, "head")
-        if outcome == "unknown" or masks is None:
+        outcome = outcomes.get(row.episode_id, row.outcome)
+        if outcome == "unknown" or (rollouts is not None and row.episode_id not in rollouts.episode_ids):
             continue
         chosen = list(planning_indices(row.num_frames))
-        frames = {view: shrunk(episodes.frames(position, view)) for view in row.views}
+        if rollouts is not None:
+            frames = {view: rollouts.frames(row.episode_id, view) for view in row.views}
+        else:
+            frames = {view: shrunk(episodes.frames(position, view)) for view in row.views}
         if tokenizer is not None:
             frames = {view: through(tokenizer, video) for view, video in frames.items()}
-        late = [
-            cv2.resize(mask.astype(np.float32), IMAGE[::-1], interpolation=cv2.INTER_AREA) for mask in masks[chosen]
-        ]
+        segmenter: Segmenter | None = learned
+        if segmenter is None:
+            masks = episodes.robot_masks(position, "head")
+            if masks is None:
+                continue
+            late = [
+                cv2.resize(mask.astype(np.float32), IMAGE[::-1], interpolation=cv2.INTER_AREA) for mask in masks[chosen]
+            ]
+            segmenter = KnownMasks(np.stack(late) >= 0.5)
         family = route(row.instruction)
         shown = {view: video[chosen] for view, video in frames.items()}
-        measured = measure(KnownMasks(np.stack(late) >= 0.5), row.instruction, family, shown, None)
+        measured = measure(segmenter, row.instruction, family, shown, None)
         done = establishes_success(facts(measured, row.instruction, family))
         value = UNSEEN_SCORE if measured is None else score(measured)
         judged[task_of(row.instruction)].append((value, done, outcome == "success", row.bank))
@@ -106,7 +132,7 @@ def main() -> None:
             "episodes": len(rows),
             "successes": round(float(success.mean()), 3),
             "area": round(area(values, success), 3),
-            "area_within_banks": round(float(np.mean(within)), 3) if within else None,
+            "area_within_banks": interval(within),
             "told_rightly": round(float((done == success).mean()), 3),
         }
     print(json.dumps(table, indent=1))
