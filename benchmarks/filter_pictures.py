@@ -34,17 +34,17 @@ ROOT = Path(__file__).resolve().parents[1]
 MOMENTS = 8
 # Recording, seed, and the curve that shows the fault.
 CASES: dict[str, tuple[str, int, str]] = {
-    "static": ("ur5e_pair-test-s1-00002", 3, "coarse_image_change"),
-    "reset": ("xarm7_pair-test-s1-00001", 6, "distance_from_home_rad"),
-    "frozen": ("ur5e_pair-test-s1-00003", 1, "image_change"),
-    "broken_pictures": ("ur5e_pair-test-s1-00004", 1, "relative_detail"),
-    "too_dark": ("xarm7_pair-test-s1-00003", 4, "bright_level"),
-    "overexposed": ("aloha_viperx-test-s1-00001", 2, "white_share"),
-    "blur": ("ur5e_pair-test-s1-00005", 8, "relative_sharpness"),
-    "base_motion": ("ur5e_pair-test-s1-00002", 0, "changed_area"),
-    "joint_jump": ("xarm7_pair-test-s1-00004", 2, "largest_step_rad"),
-    "joint_speed": ("ur5e_pair-test-s1-00006", 3, "joint_speed_rad_s"),
-    "late_states": ("ur5e_pair-test-s1-00002", 1, ""),
+    "static": ("ur5e_silver-test-s1-00002", 3, "coarse_image_change"),
+    "reset": ("xarm7_white-test-s1-00001", 6, "distance_from_home_rad"),
+    "frozen": ("ur5e_silver-test-s1-00003", 1, "image_change"),
+    "broken_pictures": ("ur5e_silver-test-s1-00004", 1, "relative_detail"),
+    "too_dark": ("xarm7_white-test-s1-00003", 4, "bright_level"),
+    "overexposed": ("viperx_graphite-test-s1-00001", 2, "white_share"),
+    "blur": ("ur5e_slate-test-s1-00000", 8, "relative_sharpness"),
+    "base_motion": ("ur5e_silver-test-s1-00002", 0, "changed_area"),
+    "joint_jump": ("xarm7_white-test-s1-00004", 2, "largest_step_rad"),
+    "joint_speed": ("ur5e_slate-test-s1-00001", 3, "joint_speed_rad_s"),
+    "late_states": ("ur5e_silver-test-s1-00002", 1, ""),
 }
 
 
@@ -129,7 +129,7 @@ def main() -> None:
     }
 
     def wrong_calibration() -> np.ndarray:
-        clip = recorded("ur5e_pair-test-s1-00002")
+        clip = recorded("ur5e_silver-test-s1-00002")
         episode = corrupt(clip.episode, RecordedConventions(extrinsics="base_to_camera"))
         return picture(
             "calibration", replace(clip, episode=episode, fault="calibration", severity="inverse camera poses"), ""

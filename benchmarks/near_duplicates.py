@@ -243,7 +243,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="draw a copy and a look-alike of the banks instead of measuring")
     arguments = parser.parse_args()
     if arguments.picture is not None:
-        draw(arguments.banks, arguments.picture, "bank_lift_aloha-007", "bank_lift_aloha-029")
+        draw(arguments.banks, arguments.picture, "bank_lift_viperx-007", "bank_lift_viperx-029")
         return
     measure_copies(arguments.recordings)
     measure_different(arguments.recordings)

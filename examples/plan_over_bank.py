@@ -2,7 +2,7 @@
 
 Rolls out the first candidates of one shipped bank with the causal model, chooses, and only then reads the outcomes.
 
-Run: python examples/plan_over_bank.py [--bank bank_drawer_aloha] [--candidates 8] [--artifacts FOLDER]
+Run: python examples/plan_over_bank.py [--bank bank_close_ur5e] [--candidates 8] [--artifacts FOLDER]
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ METHOD = "banks_shipped_causal"
 def main() -> None:
     """Run the nodes that planning with one bank needs, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--bank", default="bank_drawer_aloha")
+    parser.add_argument("--bank", default="bank_close_ur5e")
     parser.add_argument("--candidates", type=int, default=8)
     parser.add_argument("--artifacts", type=Path, default=Path("artifacts"))
     arguments = parser.parse_args()

@@ -23,7 +23,7 @@ from worldline_core.shipped import shipped_folder
 def main() -> None:
     """Predict one shipped recording and write the video."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episode", default="ur5e_pair-test-s1-00000")
+    parser.add_argument("--episode", default="ur5e_silver-test-s1-00000")
     parser.add_argument("--model", choices=("causal", "stage2"), default="causal")
     parser.add_argument("--steps", type=int, help="Euler steps; by default the model's own")
     parser.add_argument("--frames", type=int, default=33, help="length of the video: 1 + whole blocks of the model")

@@ -14,7 +14,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
-EMBODIMENTS = ("aloha_viperx", "panda_pair", "so101", "ur5e_pair", "xarm7_pair")
+EMBODIMENTS = (
+    "panda_ivory", "so101", "ur5e_silver", "ur5e_slate", "viperx_graphite", "viperx_pearl", "xarm7_bronze", "xarm7_white"
+)  # fmt: skip
 GRID = (8, 12)
 
 

@@ -28,7 +28,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, DataError
 
-CLEAN, INVERTED = "ur5e_pair-test-s1-00000", "ur5e_pair-train-s1-00002"
+CLEAN, INVERTED = "ur5e_silver-test-s1-00000", "ur5e_silver-train-s1-00002"
 """Shipped recordings; the second has inverted extrinsics (injected_defects.json)."""
 HOSTILE = "<script>alert('x')</script>"
 

@@ -23,7 +23,7 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 
-IDS = ("xarm7_pair-test-s1-00000", "xarm7_pair-test-s1-00004")
+IDS = ("xarm7_white-test-s1-00001", "xarm7_white-test-s1-00003")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_curate_with_the_printed_line(tmp_path: Path, shipped: EpisodeSet, mista
     conventions = RecordedConventions(**mistake)
     written(tmp_path / "spoiled", shipped, conventions)
     spoiled = EpisodeSet.open(tmp_path / "spoiled")
-    kinematics = ArmKinematics(load_embodiment("xarm7_pair"))
+    kinematics = ArmKinematics(load_embodiment("xarm7_white"))
     frames = {view: spoiled.frames(0, view) for view in spoiled.rows[0].views}
     lines = diagnose(spoiled.episode(0), frames, kinematics).best.conventions.config_lines()
     assert lines == conventions.config_lines()

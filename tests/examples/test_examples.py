@@ -70,10 +70,10 @@ def test_plan_over_a_bank(project_root: Path, tmp_path: Path) -> None:
 
 def test_train_on_a_lerobot_dataset(project_root: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "dataset"
-    shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/aloha_viperx", dataset)
+    shutil.copytree(project_root / "artifacts/shipped/recordings/datasets/viperx_pearl", dataset)
     shutil.rmtree(dataset / "meta" / "worldline")  # what a foreign dataset does not have
     printed = _run(
-        project_root, "train_on_lerobot.py", dataset, "--embodiment", "aloha_viperx", "--steps", 2,
+        project_root, "train_on_lerobot.py", dataset, "--embodiment", "viperx_pearl", "--steps", 2,
         "--artifacts", tmp_path / "artifacts",
     )  # fmt: skip
     assert json.loads(printed[: printed.index("}") + 1])["steps"] == 2

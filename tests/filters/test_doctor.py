@@ -24,7 +24,7 @@ CONFIG = FilterDoctorConfig()
 @pytest.fixture(scope="module")
 def recording(project_root: Path) -> tuple[Episode, dict[str, ViewThumbnails], Signals]:
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
-    i = episodes.position("ur5e_pair-test-s1-00002")
+    i = episodes.position("xarm7_white-test-s1-00001")
     thumbnails = {view: episodes.thumbnails(i, view) for view in episodes.rows[i].views}
     return episodes.episode(i), thumbnails, measure(episodes.episode(i), thumbnails)
 

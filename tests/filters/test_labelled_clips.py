@@ -20,7 +20,7 @@ from worldline_core.filters.verdict import REASONS, Finding
 @pytest.fixture(scope="module")
 def recording(project_root: Path) -> Clip:
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
-    i = episodes.position("ur5e_pair-test-s1-00002")
+    i = episodes.position("ur5e_silver-test-s1-00002")
     masks = {view: episodes.robot_masks(i, view) for view in episodes.rows[i].views}
     frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
     return Clip(episodes.episode(i), frames, {view: m for view, m in masks.items() if m is not None})

@@ -82,7 +82,7 @@ def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Pat
 
 
 def test_an_episode_set_is_shown_with_tracks_of_its_commands(project_root: Path, tmp_path: Path) -> None:
-    name = "ur5e_pair-test-s1-00000"
+    name = "ur5e_silver-test-s1-00000"
     found = inspect(project_root / "artifacts/shipped/recordings", tmp_path, episode_id=name, video=True)
     assert [path.name for path in found.written] == ["contact_sheet.png", f"{name}.mp4"]
     video = decode_video(tmp_path / f"{name}.mp4")

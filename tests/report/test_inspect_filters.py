@@ -31,7 +31,7 @@ def filtered(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """Four episodes of one recording: healthy, dark in the middle, black throughout, and with a camera turned about."""
     root = tmp_path_factory.mktemp("artifacts")
     episodes = EpisodeSet.open(project_root / "artifacts" / "shipped" / "recordings")
-    i = episodes.position("ur5e_pair-test-s1-00002")
+    i = episodes.position("ur5e_silver-test-s1-00002")
     episode = episodes.episode(i)
     frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
     with EpisodeSetWriter(root / "curate" / "key") as writer:

@@ -28,7 +28,7 @@ class Observation:
     def __init__(self, recordings: Path) -> None:
         self.set = EpisodeSet.open(recordings)
         self.position = next(
-            i for i, row in enumerate(self.set.rows) if row.embodiment == "ur5e_pair" and row.split == "test"
+            i for i, row in enumerate(self.set.rows) if row.embodiment == "ur5e_silver" and row.split == "test"
         )
         self.episode = self.set.episode(self.position)
         self.images = {view: self.set.frames(self.position, view, [0])[0] for view in self.episode.cameras}
@@ -57,21 +57,21 @@ def causal(models: Path) -> WorldLine:
 def test_a_prediction_is_the_rollout_steps(
     observed: Observation, models: Path, tmp_path: Path, kind: str, sampler: str, steps: int | None
 ) -> None:
-    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_pair")))
+    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_silver")))
     write_index(tmp_path / "tracks", write_shard(tmp_path / "tracks", 0, [tracks]), sigma_px_ref=36.0)
     config = RolloutConfig.model_validate(
         {
             "sampler": sampler,
             "steps": steps,
             "num_frames": FRAMES,
-            "embodiments": ["ur5e_pair"],
+            "embodiments": ["ur5e_silver"],
             "max_episodes_per_embodiment": 1,
         }
     )
     inputs = {"episodes": observed.set.root, "tracks": tmp_path / "tracks", "tokenizer": models / "tokenizer"}
     rollout(config, inputs | {"checkpoint": models / kind}, tmp_path / "rollout")
     world = WorldLine.from_pretrained(models / kind, steps=steps)
-    predicted = world.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_pair")
+    predicted = world.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_silver")
     writer = RolloutSetWriter(tmp_path / "mine", "worldline", 8.0)
     writer.add(observed.episode.episode_id, 42, predicted)
     writer.close()
@@ -85,7 +85,7 @@ def test_a_prediction_is_the_rollout_steps(
 
 def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLine) -> None:
     def predict(controls: np.ndarray, seed: int = 42) -> np.ndarray:
-        videos = causal.predict(observed.images, controls, observed.cameras, embodiment="ur5e_pair", seed=seed)
+        videos = causal.predict(observed.images, controls, observed.cameras, embodiment="ur5e_silver", seed=seed)
         return videos["head"]
 
     first = predict(observed.controls)
@@ -97,7 +97,7 @@ def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLi
 
 def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:
     """Tools and wrist cameras of the same motion, given instead of the joints: the same maps, so the same video."""
-    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_pair")))
+    tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_silver")))
     cameras = {
         view: Camera(camera.K, tracks.T_base_camera[:FRAMES, v])
         for v, (view, camera) in enumerate(observed.episode.cameras.items())
@@ -113,7 +113,7 @@ def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -
         tool_poses=poses,
         gripper=tracks.gripper[:FRAMES, 0],
     )
-    by_joints = causal.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_pair")
+    by_joints = causal.predict(observed.images, observed.controls, observed.cameras, embodiment="ur5e_silver")
     for view in causal.views:
         assert np.abs(by_tools[view].astype(int) - by_joints[view].astype(int)).mean() < 0.5, view
 
@@ -124,7 +124,7 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
             "images": observed.images,
             "controls": observed.controls,
             "cameras": observed.cameras,
-            "embodiment": "ur5e_pair",
+            "embodiment": "ur5e_silver",
         }
         with pytest.raises(error, match=match):
             causal.predict(**(given | changes))  # type: ignore[arg-type]
