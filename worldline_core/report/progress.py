@@ -21,10 +21,10 @@ RELOAD_SECONDS = 5
 MOST_FACTS = 6
 PICTURES = ("previews/*.png", "previews/*.jpg", "media/*.jpg")
 SHARES: Mapping[str, float] = {
-    "curate": 22, "curate.banks": 44, "filter": 23, "render_actions": 9, "encode_latents": 5, "train_stage1": 8,
-    "train_stage2": 15, "distill": 33, "rollout": 5, "rollout.shipped_causal": 13, "rollout.shipped_stage2_35_steps": 44,
-    "rollout.banks_shipped_stage2": 98, "rollout.banks_shipped_causal": 165, "evaluate_video": 68, "evaluate_policy": 8,
-    "evaluate_planning": 55, "report": 18,
+    "curate": 17, "curate.banks": 20, "filter": 16, "render_actions": 8, "encode_latents": 3, "train_stage1": 7,
+    "train_stage2": 17, "distill": 27, "rollout": 5, "rollout.shipped_causal": 14, "rollout.shipped_stage2_4_steps": 10,
+    "rollout.banks_shipped_stage2": 41, "rollout.banks_shipped_causal": 76, "evaluate_video": 83, "evaluate_policy": 13,
+    "evaluate_planning": 33, "report": 19,
 }  # fmt: skip
 """Seconds of each step's nodes in the demo on one of two busy cores, and of those that take longer than the others of
 their step: only their ratios are used, until something was measured."""
