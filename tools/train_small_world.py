@@ -370,7 +370,7 @@ class CausalTraining:
                     maps,
                     history=history,
                     views=VIEWS,
-                    block_size=self.spec.block_size,
+                    spec=self.spec,
                     sampling=settings.sigma,
                     weighting=LossWeighting(motion=1.0),
                     generator=generator,

@@ -79,7 +79,7 @@ def test_equal_scores_leave_the_student_alone(clip) -> None:
 @pytest.mark.parametrize("score", [causal_score, full_clip_score])
 def test_a_student_update_reaches_the_student_alone(make_model, clip, score) -> None:
     student, real, fake = make_model(0), make_model(1), make_model(2)
-    options = {"views": clip.views, "block_size": clip.spec.block_size}
+    options = {"views": clip.views, "spec": clip.spec}
     generated = rollout(student, clip, 1, with_gradient=True)
     gradient = distribution_gradient(
         score(real, clip.maps, **options),
@@ -98,7 +98,7 @@ def test_a_fake_score_update_reaches_the_fake_score_alone(make_model, clip) -> N
     student, fake = make_model(0), make_model(2)
     generated = rollout(student, clip)
     assert not generated.requires_grad
-    score = causal_score(fake, clip.maps, views=clip.views, block_size=clip.spec.block_size)
+    score = causal_score(fake, clip.maps, views=clip.views, spec=clip.spec)
     fake_score_loss(
         score,
         generated,
@@ -187,7 +187,7 @@ def test_residual_predicting_students_generate_and_learn_as_well(make_model, cli
     )
     generated = rollout(student, clip, 2, with_gradient=True)
     sigma = torch.full((2, 2), 0.4)
-    scores = [full_clip_score(m, clip.maps, views=clip.views, block_size=2) for m in (real, fake)]
+    scores = [full_clip_score(m, clip.maps, views=clip.views, spec=clip.spec) for m in (real, fake)]
     gradient = distribution_gradient(*scores, generated, clip.noise, sigma, clip.spec.block_size)
     loss = distribution_matching_loss(generated, gradient)
     loss.backward()

@@ -103,7 +103,7 @@ def test_cached_nodes_agree_with_the_teacher_forcing_pass(make_model, clip) -> N
     noisy = torch.cat((clip.latents[..., :1, :, :], clip.noise[..., 1:, :, :]), dim=3)
     with torch.no_grad():
         velocity = model.forward_teacher_forcing(
-            noisy, clip.latents, torch.ones(2, 2), action_maps=clip.maps, block_size=2, views=clip.views
+            noisy, clip.latents, torch.ones(2, 2), action_maps=clip.maps, spec=clip.spec, views=clip.views
         )
     first = noisy + (NODES[1] - NODES[0]) * velocity
     torch.testing.assert_close(nodes[:, 1], first[..., 1:, :, :], rtol=1e-4, atol=1e-5)

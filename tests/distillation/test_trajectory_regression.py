@@ -20,7 +20,7 @@ class StraightStudent:
     def __init__(self, clean: torch.Tensor, noise: torch.Tensor) -> None:
         self.answer = noise - clean
 
-    def forward_teacher_forcing(self, noisy, clean, sigma, *, action_maps, block_size, views):
+    def forward_teacher_forcing(self, noisy, clean, sigma, *, action_maps, spec, views, fps):
         velocity = self.answer.clone()
         velocity[..., :1, :, :] = 0
         return velocity
@@ -106,7 +106,7 @@ def test_teacher_forcing_trains_every_block_on_recorded_history(make_model, clip
             maps,
             history=history,
             views=clip.views,
-            block_size=clip.spec.block_size,
+            spec=clip.spec,
             sampling=SigmaSampling(),
             weighting=LossWeighting(),
             generator=torch.Generator().manual_seed(5),

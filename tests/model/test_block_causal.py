@@ -11,16 +11,18 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
     CachedBlock,
+    CacheWindow,
     KVCache,
     TeacherForcingAttention,
     block_bounds,
 )
-from worldline_core.model.layers import grouped_attention
-from worldline_core.model.rope import rotate, rotation
+from worldline_core.model.contracts import CausalSpec
+from worldline_core.model.rope import Rotation, rotate
 from worldline_core.model.world_model import WorldModel
 
 BLOCK = 2
 FRAMES = 7
+SPEC = CausalSpec(block_size=BLOCK, sink_blocks=1, recent_blocks=3, sigmas=(1.0, 0.0))
 
 
 @pytest.fixture(scope="module", params=["velocity", "first_frame_residual"])
@@ -40,18 +42,28 @@ def frames_of(values: torch.Tensor, start: int, stop: int) -> torch.Tensor:
     return values[..., start:stop, :, :]
 
 
-def teacher_forcing_mask(bounds: list[tuple[int, int]], tokens_per_frame: int) -> torch.Tensor:
-    """Dense mask (True: may attend) of the sequence ``[clean blocks 0..k-1, noisy blocks 1..k]``."""
-    sizes = [(stop - start) * tokens_per_frame for start, stop in bounds]
-    clean = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes[:-1])])
-    noisy = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes) if i > 0])
-    clean_to_clean = clean[:, None] >= clean[None, :]
-    clean_to_noisy = torch.zeros(len(clean), len(noisy), dtype=torch.bool)
-    noisy_to_clean = noisy[:, None] > clean[None, :]
-    noisy_to_noisy = noisy[:, None] == noisy[None, :]
-    return torch.cat(
-        (torch.cat((clean_to_clean, clean_to_noisy), dim=1), torch.cat((noisy_to_clean, noisy_to_noisy), dim=1))
-    )
+WINDOWS = [(1, 0), (1, 1), (2, 1), (1, 2), (3, 2), (1, 9)]
+"""Sink and recent blocks; clips of `test_every_block_...` have seven blocks after the observed frame."""
+
+
+def one_block_at_a_time(
+    queries: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, by: Rotation, sizes: list[int], spec: CausalSpec
+) -> torch.Tensor:
+    """The sequence ``[clean blocks 0..k-1, noisy blocks 1..k]`` by its definition: a block, its window, a dense mask."""
+    blocks, history = range(len(sizes)), sum(sizes[:-1])
+    owner = torch.cat([torch.full((size,), block) for block, size in zip(blocks, sizes, strict=True)])
+    clean, mixed = owner[:history], []
+    for noisy, block in [(False, block) for block in blocks[:-1]] + [(True, block) for block in blocks[1:]]:
+        own = torch.nonzero(owner == block).flatten() + (history - sizes[0] if noisy else 0)
+        visible = {*range(spec.sink_blocks), *range(block - spec.recent_blocks, block)}
+        seen = torch.tensor([i for i in range(history) if int(clean[i]) < block and int(clean[i]) in visible])
+        seen = torch.cat((seen.long(), own))
+        angles = (by[0][: len(seen)], by[1][: len(seen)])
+        own_angles = (angles[0][-len(own) :], angles[1][-len(own) :])
+        scores = rotate(queries[..., own, :], own_angles) @ rotate(keys[..., seen, :], angles).mT
+        found = torch.softmax(scores / queries.shape[-1] ** 0.5, dim=-1) @ values[..., seen, :]
+        mixed.append(found.transpose(1, 2).flatten(2))
+    return torch.cat(mixed, dim=1)
 
 
 def test_blocks_of_a_clip() -> None:
@@ -67,41 +79,66 @@ def test_the_window_keeps_the_sink_and_the_recent_blocks() -> None:
         assert cache.frames == sum(10**block for block in kept)
 
 
-def test_blockwise_attention_equals_the_dense_mask(model: WorldModel) -> None:
-    bounds = block_bounds(FRAMES, BLOCK)
-    length = (FRAMES - BLOCK + FRAMES - 1) * 3
+@pytest.mark.parametrize("window", WINDOWS)
+def test_attention_of_alike_blocks_together_equals_one_block_at_a_time(window: tuple[int, int]) -> None:
+    spec = SPEC.model_copy(update={"sink_blocks": window[0], "recent_blocks": window[1]})
+    sizes = [3, *[6] * 7]
+    length = sum(sizes[:-1]) + sum(sizes[1:])
     generator = torch.Generator().manual_seed(2)
     queries = torch.randn(2, 4, length, 12, generator=generator)
     keys, values = torch.randn(2, 2, 2, length, 12, generator=generator)
-    by = rotation(model.config, torch.randn(3, length, generator=generator))
-    sizes = tuple((stop - start) * 3 for start, stop in bounds)
-    blockwise = TeacherForcingAttention(by, sizes)(0, queries, keys, values, None)
-    mask = teacher_forcing_mask(bounds, 3)
-    dense = grouped_attention(rotate(queries, by), rotate(keys, by), values, mask[None, None])
-    torch.testing.assert_close(blockwise, dense, rtol=1e-5, atol=1e-5)
-    reference = torch.nn.functional.scaled_dot_product_attention(
-        rotate(queries, by),
-        rotate(keys, by).repeat_interleave(2, dim=1),
-        values.repeat_interleave(2, dim=1),
-        attn_mask=mask,
-    )
-    torch.testing.assert_close(dense, reference.transpose(1, 2).flatten(2), rtol=1e-5, atol=1e-5)
+    angles = torch.randn(sum(sizes), 6, generator=generator).repeat(1, 2)
+    by = (angles.cos(), angles.sin())
+    together = TeacherForcingAttention(by, tuple(sizes), *window)(0, queries, keys, values, None)
+    every_head = (keys.repeat_interleave(2, dim=1), values.repeat_interleave(2, dim=1))
+    torch.testing.assert_close(together, one_block_at_a_time(queries, *every_head, by, sizes, spec))
 
 
-def test_clean_half_of_the_mask_is_block_causal() -> None:
-    block_of = torch.tensor([0, 0, 1, 1, 1, 1])
-    mask = teacher_forcing_mask(block_bounds(5, 2), 2)
-    assert torch.equal(mask[:6, :6], block_of[:, None] >= block_of[None, :])
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("fps", [None, (8.0, 20.0)])
+def test_every_block_of_a_long_clip_sees_what_the_cache_shows_it(
+    make_model: Callable[..., WorldModel], window: tuple[int, int], fps: tuple[float, float] | None
+) -> None:
+    model = make_model(3, fps=None if fps is None else 30.0).requires_grad_(False)
+    spec = SPEC.model_copy(update={"sink_blocks": window[0], "recent_blocks": window[1]})
+    noisy, clean, maps, sigma = clip(1 + 7 * BLOCK)
+    rates = None if fps is None else torch.tensor(fps)
+    velocity = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=spec, fps=rates)
+    cache = spec.new_cache(rates)
+    for block, (start, stop) in enumerate(block_bounds(1 + 7 * BLOCK, BLOCK)):
+        own = frames_of(maps, start, stop)
+        if block:
+            cached = model.forward_block(frames_of(noisy, start, stop), sigma[:, block - 1], cache, action_maps=own)
+            torch.testing.assert_close(frames_of(velocity, start, stop), cached, rtol=1e-5, atol=1e-5)
+        model.write_block(frames_of(clean, start, stop), cache, action_maps=own)
+    everything = spec.model_copy(update={"recent_blocks": 7})
+    unlimited = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=everything, fps=rates)
+    assert torch.allclose(unlimited, velocity, atol=1e-3) == (sum(window) >= 7)
+
+
+def test_a_pass_that_is_computed_again_reads_the_window_it_read_first(make_model: Callable[..., WorldModel]) -> None:
+    """Activation checkpointing runs the layers once more, when later blocks are already in the cache."""
+    model, gradients = make_model(), []
+    _, clean, _, sigma = clip()
+    for model.gradient_checkpointing in (False, True):
+        cache = KVCache(1, 1)
+        model.write_block(frames_of(clean, 0, 1), cache)
+        velocity = model.forward_block(frames_of(clean, 1, 3), sigma[:, 0], cache)
+        for start in (1, 3):
+            model.write_block(frames_of(clean, start, start + 2), cache)
+        gradients.append(torch.autograd.grad(velocity.square().sum(), list(model.layers.parameters())))
+    for plain, again in zip(*gradients, strict=True):
+        assert torch.equal(plain, again)
 
 
 def test_future_frames_and_actions_leave_past_blocks_unchanged(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
-    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=SPEC)
     noisy[..., 3:, :, :] += 1.0
     clean[..., 3:, :, :] += 1.0
     maps[..., 3:, :, :] -= 1.0
     sigma[:, 1:] *= 0.5
-    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=SPEC)
     assert torch.equal(frames_of(before, 0, 3), frames_of(after, 0, 3))
     assert bool((frames_of(before, 3, 5) - frames_of(after, 3, 5)).abs().amax() > 1e-3)
     assert bool((frames_of(before, 0, 1) == 0).all())
@@ -109,16 +146,16 @@ def test_future_frames_and_actions_leave_past_blocks_unchanged(model: WorldModel
 
 def test_a_noisy_block_does_not_see_its_own_clean_frames(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
-    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    before = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=SPEC)
     clean[..., 3:5, :, :] += 1.0
-    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    after = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=SPEC)
     assert torch.equal(frames_of(before, 1, 5), frames_of(after, 1, 5))
     assert not torch.allclose(frames_of(before, 5, 7), frames_of(after, 5, 7))
 
 
 def test_cached_passes_equal_the_full_block_causal_pass(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
-    full = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, block_size=BLOCK)
+    full = model.forward_teacher_forcing(noisy, clean, sigma, action_maps=maps, spec=SPEC)
     cache = KVCache(sink_blocks=1, recent_blocks=3)
     for block, (start, stop) in enumerate(block_bounds(FRAMES, BLOCK)):
         own = frames_of(maps, start, stop)
@@ -136,7 +173,7 @@ def test_the_write_pass_is_the_conditioned_form_and_not_sigma_zero(model: WorldM
     cache = KVCache(1, 3)
     model.write_block(observed, cache)
     model.write_block(block, cache)
-    written = cache._blocks[1].layers[1][0]
+    written = cache.window.blocks[1].layers[1][0]
     other = KVCache(1, 3)
     model.write_block(observed, other)
     seen = []
@@ -167,7 +204,7 @@ def test_the_window_keeps_the_sink_and_the_recent_blocks_and_never_leaves_the_tr
     assert len(set(sizes[3:])) == 1
     first = KVCache(1, 2)
     model.write_block(torch.zeros(1, 3, 4, 1, 4, 4), first)
-    assert torch.equal(cache._blocks[0].layers[0][0], first._blocks[0].layers[0][0])
+    assert torch.equal(cache.window.blocks[0].layers[0][0], first.window.blocks[0].layers[0][0])
 
 
 def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_blocks(model: WorldModel) -> None:
@@ -176,7 +213,7 @@ def test_a_long_rollout_with_the_window_equals_a_fresh_cache_with_the_same_block
     _, clean, _, sigma = clip()
     for start, stop in ((0, 1), (1, 3), (3, 5)):
         model.write_block(frames_of(clean, start, stop), rolled)
-    fresh._blocks, fresh.reference = list(rolled._blocks), rolled.reference
+    fresh.window, fresh.reference = CacheWindow(rolled.window.blocks), rolled.reference
     block = frames_of(clean, 5, 7)
     assert torch.equal(model.forward_block(block, sigma[:, 0], rolled), model.forward_block(block, sigma[:, 0], fresh))
 
@@ -193,7 +230,7 @@ def test_copies_of_a_cache_go_on_separately(model: WorldModel) -> None:
 def test_misuse_is_refused(model: WorldModel) -> None:
     noisy, clean, maps, sigma = clip()
     with pytest.raises(DataError, match="one sigma per block"):
-        model.forward_teacher_forcing(noisy, clean, sigma[:, :1], action_maps=maps, block_size=BLOCK)
+        model.forward_teacher_forcing(noisy, clean, sigma[:, :1], action_maps=maps, spec=SPEC)
     with pytest.raises(ConfigError, match="at least the observed frame"):
         KVCache(sink_blocks=0, recent_blocks=3)
     with pytest.raises(DataError, match="Latents have the wrong shape"):

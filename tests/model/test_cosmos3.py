@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,35 @@ def test_diffusers_weights_give_the_same_velocity(diffusers_model: torch.nn.Modu
         ).velocity[:, 0]
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-5)
         assert expected[:, :, 1:].abs().mean() > 0.1
+
+
+@torch.no_grad()
+def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(
+    diffusers_model: torch.nn.Module, tmp_path: Path
+) -> None:
+    """Cosmos3's fps modulation: a latent frame advances by 24 / fps; a stride of three shows 30 fps as 10."""
+    diffusers_model.save_pretrained(tmp_path)
+    model, _ = load_cosmos3(tmp_path, fps=30.0)
+    latents = torch.randn(2, 6, 5, 4, 6, generator=torch.Generator().manual_seed(5))
+    text = [3, 1, 4, 1, 5, 9, 2]
+    rates = (24.0, 30.0 / 3)
+    context = model.encode_text(torch.tensor([text, text]))
+    given = (latents[:, None], torch.tensor([0.7, 0.7]))
+    ours = model(*given, text=context, views=("head",), fps=torch.tensor(rates)).velocity[:, 0]
+    expected = [reference_velocity(diffusers_model, latents[i : i + 1], 0.7, text, rates[i]) for i in range(2)]
+    torch.testing.assert_close(ours, torch.cat(expected), rtol=1e-5, atol=1e-5)
+    at_config_rate = model(*given, text=context, views=("head",)).velocity[:, 0]
+    assert bool((at_config_rate - ours).abs().amax(dim=(1, 2, 3, 4)).min() > 1e-3)
+
+
+@torch.no_grad()
+def test_a_model_without_a_rate_counts_latent_frames_whatever_the_clips_rate(
+    make_model: Callable[..., WorldModel],
+) -> None:
+    model = make_model()
+    latents = torch.randn(2, 3, 4, 3, 4, 4, generator=torch.Generator().manual_seed(5))
+    sigma = torch.tensor([0.5, 0.7])
+    assert torch.equal(model(latents, sigma).velocity, model(latents, sigma, fps=torch.tensor([8.0, 30.0])).velocity)
 
 
 @torch.no_grad()

@@ -126,8 +126,26 @@ def test_blocks_equal_the_full_block_causal_pass_at_every_step(model: WorldModel
     noise = Noise([42, 43])
     noisy = torch.cat([first[:, :, :, None], *(noise.draw((3, 4, 4, 4, 4)) for _ in range(2))], dim=3)
     clean = torch.cat([first[:, :, :, None], *blocks], dim=3)
-    velocity = model.forward_teacher_forcing(noisy, clean, torch.ones(2, 2), action_maps=maps, block_size=4)
+    velocity = model.forward_teacher_forcing(noisy, clean, torch.ones(2, 2), action_maps=maps, spec=SPEC)
     torch.testing.assert_close(noisy - velocity, clean, rtol=1e-4, atol=1e-4)
+
+
+def test_rollouts_stand_in_time_by_the_rate_they_are_given(make_model: Callable[..., WorldModel]) -> None:
+    """A rate that is given counts like the config's own: by clip, by block, and in a fork."""
+    first, maps = observation(batch=1)
+    own, other = (make_model(fps=fps).requires_grad_(False) for fps in (20.0, 8.0))
+    clips = [
+        rollout_full_clip(model, first, maps, noise=Noise([42]), steps=2, fps=fps)
+        for model, fps in ((own, None), (other, 20.0), (other, None))
+    ]
+    assert torch.equal(clips[0], clips[1])
+    assert not torch.allclose(clips[1], clips[2], rtol=0, atol=1e-5)
+    blocks = []
+    for model, fps in ((own, None), (other, 20.0)):
+        simulator = BlockCausalSimulator(model, SPEC, noise=Noise([42]), fps=fps)
+        roll(simulator, first, maps)
+        blocks.append(simulator.fork().step(maps[:, :, :, 1:5]))
+    assert torch.equal(*blocks)
 
 
 def test_long_rollouts_keep_a_window_of_constant_size(model: WorldModel) -> None:

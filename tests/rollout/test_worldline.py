@@ -84,6 +84,8 @@ def test_a_prediction_is_the_rollout_steps(
 
 
 def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLine) -> None:
+    assert causal.simulator([42]).fps == causal.contract.fps
+
     def predict(controls: np.ndarray, seed: int = 42) -> np.ndarray:
         videos = causal.predict(observed.images, controls, observed.cameras, embodiment="ur5e_silver", seed=seed)
         return videos["head"]

@@ -1,10 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
 from worldline_core.errors import ConfigError
+from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import VIEWS
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import (
+    FlowMatchingObjective,
     LossWeighting,
     SigmaSampling,
     add_noise,
@@ -12,6 +18,23 @@ from worldline_core.training.flow_matching import (
     sample_sigmas,
     velocity_target,
 )
+
+
+def test_clips_are_placed_in_time_by_their_own_rates(
+    make_model: Callable[..., WorldModel], clip: tuple[torch.Tensor, ...]
+) -> None:
+    sampling, weighting = SigmaSampling(), LossWeighting()
+
+    def losses(model: WorldModel, *fps: float) -> list[float]:
+        batch = Batch((), VIEWS, clip[0], fps=torch.tensor(fps) if fps else None)
+        objective = FlowMatchingObjective(model, sigma=sampling, weighting=weighting)
+        seed = torch.Generator().manual_seed
+        return [objective.loss(batch, seed(0), 0)[0].item(), objective.validation_losses(batch, seed(0))["loss"]]
+
+    with torch.no_grad():
+        modulated, counted = make_model(fps=8.0), make_model()
+        assert losses(modulated, 8.0, 8.0) == losses(modulated) != losses(modulated, 8.0, 2.0)
+        assert losses(counted, 8.0, 2.0) == losses(counted)
 
 
 @pytest.fixture

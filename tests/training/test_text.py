@@ -84,7 +84,9 @@ def test_a_stride_slows_the_frames_that_the_prompt_names(world: Any) -> None:
     store = LatentStore.open(world.latents)
     loader = ClipLoader(store, views=("head",), text=record, frame_rates={"episode-000": 8.0})
     assert loader.clip_facts(Clip("episode-000", 0, 9, 2)) == ClipFacts(9, 4.0, (32, 32))
-    loader.load(ClipBatch((Clip("episode-000", 0, 9, 1),), "head"))
+    batch = loader.load(ClipBatch((Clip("episode-000", 0, 9, 1),), "head"))
+    assert batch.fps is not None
+    assert batch.fps.tolist() == [8.0]
     assert asked == [ClipFacts(9, 8.0, (32, 32))]
     with pytest.raises(ArtifactError, match="frame rate of an episode is not known"):
         loader.load(ClipBatch((Clip("episode-001", 0, 9, 1),), "head"))

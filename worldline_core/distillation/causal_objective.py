@@ -66,6 +66,7 @@ def self_forced_rollout(
     *,
     views: Sequence[str],
     spec: CausalSpec,
+    fps: Float[Tensor, " b"] | None = None,
     with_gradient: bool,
 ) -> Float[Tensor, "b v c t h w"]:
     """Generate a clip with the student's sampler, stopping every block at `exit_step` with its clean prediction.
@@ -85,7 +86,7 @@ def self_forced_rollout(
     """
     if not 0 <= exit_step < spec.steps:
         raise ConfigError("No such exit step", expected=f"0..{spec.steps - 1}", got=exit_step)
-    cache = spec.new_cache()
+    cache = spec.new_cache(fps)
     student.write_block(first, cache, action_maps=action_maps[..., :1, :, :], views=views)
     bounds = block_bounds(noise.shape[3], spec.block_size)
     blocks = [first]
@@ -138,5 +139,13 @@ class CausalObjective[BatchT: Batch](Objective[BatchT], ABC):
         """The model's own rollout from the observed frame of each clip."""
         first = batch.latents[..., :1, :, :]
         return self_forced_rollout(
-            self.model, first, maps, noise, exit_step, views=batch.views, spec=self.spec, with_gradient=with_gradient
+            self.model,
+            first,
+            maps,
+            noise,
+            exit_step,
+            views=batch.views,
+            spec=self.spec,
+            fps=batch.fps,
+            with_gradient=with_gradient,
         )

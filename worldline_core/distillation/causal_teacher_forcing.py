@@ -1,7 +1,7 @@
 """Stage III, step 1: causal teacher forcing (appendix, "Causal Teacher-Forcing Adaptation").
 
 The Stage II objective under block-causal attention: one observed latent frame, then blocks; each noisy block sees the
-recorded clean blocks before it and its own action maps.
+recorded clean blocks of its window and its own action maps.
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """
@@ -15,13 +15,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.distillation.causal_objective import CausalObjective, block_sigmas, frame_sigmas, maps_of
+from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import LossWeighting, SigmaSampling, add_noise, flow_matching_loss
 
 
 class TeacherForcingObjective(CausalObjective[Batch]):
-    """Flow matching of every block given the clean blocks before it."""
+    """Flow matching of every block given the clean blocks of its window."""
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Teacher-forcing loss of one batch; the history may be a slightly corrupted copy of the recorded latents."""
@@ -37,7 +38,8 @@ class TeacherForcingObjective(CausalObjective[Batch]):
             maps_of(batch),
             history=history,
             views=batch.views,
-            block_size=self.spec.block_size,
+            fps=batch.fps,
+            spec=self.config.training_spec,
             sampling=settings.sigma,
             weighting=settings.weighting,
             generator=generator,
@@ -52,12 +54,13 @@ def teacher_forcing_loss(
     *,
     history: Float[Tensor, "b v c t h w"] | None = None,
     views: Sequence[str],
-    block_size: int,
+    fps: Float[Tensor, " b"] | None = None,
+    spec: CausalSpec,
     sampling: SigmaSampling,
     weighting: LossWeighting,
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
-    """Flow-matching loss of every block of `latents`, given the clean blocks before it.
+    """Flow-matching loss of every block of `latents`, given the clean blocks that `spec` keeps before it.
 
     Args:
         history: clean blocks the model sees instead of `latents` themselves.
@@ -65,16 +68,17 @@ def teacher_forcing_loss(
     Raises:
         DataError: the clip does not divide into blocks.
     """
-    sigma = block_sigmas(sampling, len(latents), latents.shape[3], block_size, generator)
+    sigma = block_sigmas(sampling, len(latents), latents.shape[3], spec.block_size, generator)
     noise = torch.randn(latents.shape, generator=generator, device=generator.device)
     sigma, noise = sigma.to(latents), noise.to(latents)
-    levels = frame_sigmas(sigma, block_size)
+    levels = frame_sigmas(sigma, spec.block_size)
     velocity = model.forward_teacher_forcing(
         add_noise(latents, noise, levels),
         latents if history is None else history,
         sigma,
         action_maps=action_maps,
-        block_size=block_size,
+        spec=spec,
         views=views,
+        fps=fps,
     )
     return flow_matching_loss(velocity, latents, noise, levels, weighting)

@@ -102,6 +102,7 @@ class DistillationRun:
         join_processes(device)
         info = read_checkpoint_info(Path(inputs["stage2"]))
         store, tracks = LatentStore.open(Path(inputs["latents"])), ActionTracks.open(Path(inputs["tracks"]))
+        episodes = EpisodeSet.open(Path(inputs["episodes"]))
         contract = info.contract
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=inputs["latents"], **found)
@@ -111,6 +112,7 @@ class DistillationRun:
             views=tuple(config.views),
             tracks=tracks,
             wrist_projection=contract.wrist_projection,
+            frame_rates={row.episode_id: row.fps for row in episodes.rows},
             device=device,
         )
         return cls(
@@ -119,7 +121,7 @@ class DistillationRun:
             stage2_info=info,
             store=store,
             loader=loader,
-            rows=training_rows(store, EpisodeSet.open(Path(inputs["episodes"])), stage=2, tracks=tracks),
+            rows=training_rows(store, episodes, stage=2, tracks=tracks),
             output=output,
             perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
         )

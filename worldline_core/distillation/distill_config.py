@@ -19,11 +19,16 @@ CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
 
 
-class CacheWindow(StrictModel):
-    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper)."""
+class WindowConfig(StrictModel):
+    """Finished blocks that stay visible: the first ones and the most recent ones (one and three in the paper).
+
+    ``trained_on``: what the passes over whole clips show a block: the same window, at the same positions ("window"), or
+    every block before it ("full_history"), which no rollout longer than the window ever shows it.
+    """
 
     sink_blocks: int = Field(default=1, ge=1)
     recent_blocks: int = Field(default=3, ge=0)
+    trained_on: Literal["window", "full_history"] = Field(default="window", exclude_if=lambda value: value == "window")
 
 
 class TeacherForcingConfig(StrictModel):
@@ -114,7 +119,7 @@ class DistillConfig(StrictModel):
     validation_splits: list[str] = Field(default=["validation"])
     views: list[str] = Field(default=["head", "left_wrist", "right_wrist"], min_length=1)
     block_size: int = Field(default=4, ge=1)
-    window: CacheWindow = CacheWindow()
+    window: WindowConfig = WindowConfig()
     sigmas: tuple[float, ...] = CAUSAL_SIGMAS
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
@@ -145,10 +150,21 @@ class DistillConfig(StrictModel):
 
         Of recent blocks it keeps no more than the longest clip has: what lies further back, it has never seen.
         """
-        blocks = (max(self.clips.lengths) - 1) // (TEMPORAL_FACTOR * self.block_size)
         return CausalSpec(
             block_size=self.block_size,
             sink_blocks=self.window.sink_blocks,
-            recent_blocks=max(0, min(self.window.recent_blocks, blocks - 1)),
+            recent_blocks=min(self.window.recent_blocks, self._earlier_blocks),
             sigmas=self.sigmas,
         )
+
+    @property
+    def training_spec(self) -> CausalSpec:
+        """What a block sees in the passes over whole clips; like ``spec``, unless the window says otherwise."""
+        if self.window.trained_on == "window":
+            return self.spec
+        return self.spec.model_copy(update={"recent_blocks": self._earlier_blocks})
+
+    @property
+    def _earlier_blocks(self) -> int:
+        """Whole blocks before the last one of the longest clip."""
+        return (max(self.clips.lengths) - 1) // (TEMPORAL_FACTOR * self.block_size) - 1

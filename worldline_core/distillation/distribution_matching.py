@@ -30,6 +30,7 @@ from worldline_core.distillation.causal_objective import (
 )
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
 from worldline_core.distillation.trajectory_store import TrajectoryBatch
+from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
@@ -115,7 +116,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
     def score(self, model: WorldModel, batch: Batch, maps: Tensor) -> Score:
         """The velocity field of a score model, in the form it was trained in."""
         form = full_clip_score if self.settings.real_score == "stage2" else causal_score
-        return form(model, maps, views=batch.views, block_size=self.spec.block_size)
+        return form(model, maps, views=batch.views, fps=batch.fps, spec=self.config.training_spec)
 
 
 def is_student_iteration(iteration: int) -> bool:
@@ -124,26 +125,36 @@ def is_student_iteration(iteration: int) -> bool:
 
 
 def causal_score(
-    model: WorldModel, action_maps: Float[Tensor, "b v a t h w"], *, views: Sequence[str], block_size: int
+    model: WorldModel,
+    action_maps: Float[Tensor, "b v a t h w"],
+    *,
+    views: Sequence[str],
+    spec: CausalSpec,
+    fps: Float[Tensor, " b"] | None = None,
 ) -> Score:
-    """Score of each block given the clean blocks before it (teacher-forcing pass over the rollout itself)."""
+    """Score of each block given the clean blocks of its window (teacher-forcing pass over the rollout itself)."""
 
     def velocity(noisy: Tensor, clean: Tensor, sigma: Tensor) -> Tensor:
         return model.forward_teacher_forcing(
-            noisy, clean, sigma, action_maps=action_maps, block_size=block_size, views=views
+            noisy, clean, sigma, action_maps=action_maps, spec=spec, views=views, fps=fps
         ).float()
 
     return velocity
 
 
 def full_clip_score(
-    model: WorldModel, action_maps: Float[Tensor, "b v a t h w"], *, views: Sequence[str], block_size: int
+    model: WorldModel,
+    action_maps: Float[Tensor, "b v a t h w"],
+    *,
+    views: Sequence[str],
+    spec: CausalSpec,
+    fps: Float[Tensor, " b"] | None = None,
 ) -> Score:
     """Score of the whole clip given its first frame alone, as Stage II was trained; blocks share attention."""
 
     def velocity(noisy: Tensor, clean: Tensor, sigma: Tensor) -> Tensor:
-        levels = frame_sigmas(sigma, block_size)
-        return model(noisy, levels, action_maps=action_maps, views=views).velocity.float()
+        levels = frame_sigmas(sigma, spec.block_size)
+        return model(noisy, levels, action_maps=action_maps, views=views, fps=fps).velocity.float()
 
     return velocity
 

@@ -87,6 +87,7 @@ def teacher_trajectories(
     views: Sequence[str],
     spec: CausalSpec,
     substeps: Sequence[int],
+    fps: Float[Tensor, " b"] | None = None,
     generated_history: bool = False,
 ) -> Float[Tensor, "b k v c u h w"]:
     """States at every node of every block after the observed frame (u = t - 1 latent frames).
@@ -100,7 +101,7 @@ def teacher_trajectories(
         DataError: the clip does not divide into blocks.
     """
     bounds = block_bounds(latents.shape[3], spec.block_size)
-    cache = spec.new_cache()
+    cache = spec.new_cache(fps)
     teacher.write_block(latents[..., :1, :, :], cache, action_maps=action_maps[..., :1, :, :], views=views)
     blocks: list[Tensor] = []
     for start, stop in bounds[1:]:
@@ -143,6 +144,7 @@ def trajectory_shard(
             views=batch.views,
             spec=config.spec,
             substeps=settings.substeps,
+            fps=batch.fps,
             generated_history=settings.history == "generated",
         )
     return batch.clips, nodes, robot_masks(loader, batch.clips, batch.views)

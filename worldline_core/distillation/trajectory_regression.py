@@ -43,7 +43,8 @@ class TrajectoryObjective(CausalObjective[TrajectoryBatch]):
             draw_nodes(len(batch.latents), blocks, self.spec.steps, generator),
             mask=batch.mask,
             views=batch.views,
-            spec=self.spec,
+            fps=batch.fps,
+            spec=self.config.training_spec,
             config=self.config.trajectory_regression,
             perceptual=self.perceptual,
         )
@@ -74,6 +75,7 @@ def trajectory_regression_loss(
     *,
     mask: Float[Tensor, "b v t h w"] | None,
     views: Sequence[str],
+    fps: Float[Tensor, " b"] | None = None,
     spec: CausalSpec,
     config: TrajectoryRegressionConfig,
     perceptual: PerceptualDistance | None = None,
@@ -96,7 +98,7 @@ def trajectory_regression_loss(
     end = with_observed_frame(first, nodes[:, -1])
     sigma, sigma_next = levels[index], levels[index + 1]
     velocity = student.forward_teacher_forcing(
-        state, clean, sigma, action_maps=action_maps, block_size=spec.block_size, views=views
+        state, clean, sigma, action_maps=action_maps, spec=spec, views=views, fps=fps
     ).float()
     here = broadcast_sigma(frame_sigmas(sigma, spec.block_size))
     there = broadcast_sigma(frame_sigmas(sigma_next, spec.block_size))

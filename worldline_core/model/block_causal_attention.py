@@ -6,9 +6,12 @@ A block of latent frames sees itself and the clean blocks before it. Block 0 is 
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
@@ -30,6 +33,15 @@ def block_bounds(latent_frames: int, block_size: int) -> list[tuple[int, int]]:
             next_step="cut the clip, or change the block size",
         )
     return [(0, 1), *((start, start + block_size) for start in range(1, latent_frames, block_size))]
+
+
+def window_bounds(block: int, sink_blocks: int, recent_blocks: int) -> tuple[int, int]:
+    """``(stop, start)``: of the blocks before ``block``, it sees those below ``stop`` (the sink) and those from ``start``.
+
+    The one rule of which finished blocks stay visible, in training and in a rollout.
+    """
+    stop = min(sink_blocks, block)
+    return stop, max(stop, block - recent_blocks)
 
 
 @dataclass
@@ -56,34 +68,47 @@ class FullAttention:
 
 @dataclass
 class TeacherForcingAttention:
-    """One pass over ``[clean blocks 0..k-1, noisy blocks 1..k]``.
+    """One pass over ``[clean blocks 0..k-1, noisy blocks 1..k]`` in which every block sees what a rollout shows it.
 
-    A clean block sees itself and the clean blocks before it; a noisy block sees itself and the clean blocks before it.
-    Each block is one unmasked call on its own keys: nothing is computed only to be masked away, and no mask of
-    sequence length squared exists (at full size it would hold 10^9 entries).
+    A block, clean or noisy, sees itself and the clean blocks of its window, at positions counted from the start of that
+    window, as :class:`KVCache` holds them. Blocks with windows of one length are alike (the clean and the noisy form of
+    a block, and all blocks whose window is full): they are one unmasked call of attention, with the blocks as batch.
+    Nothing is computed only to be masked away, and no mask of sequence length squared exists (at full size it would hold
+    10^9 entries).
     """
 
     by: Rotation
+    """Of positions from 0 on, as many as the longest window and the block after it have."""
     sizes: tuple[int, ...]
     """Tokens of each block, the observed frame first."""
+    sink_blocks: int
+    recent_blocks: int
 
     def __call__(
         self, layer: int, queries: Tensor, keys: Tensor, values: Tensor, text: tuple[Tensor, Tensor] | None
     ) -> Tensor:
-        queries, keys = rotate(queries, self.by), rotate(keys, self.by)
-        clean_length = sum(self.sizes[:-1])
-        mixed: list[Tensor] = []
-        stop = 0
-        for size in self.sizes[:-1]:
-            start, stop = stop, stop + size
-            mixed.append(grouped_attention(queries[..., start:stop, :], keys[..., :stop, :], values[..., :stop, :]))
-        history, start = 0, clean_length
-        for earlier, size in zip(self.sizes[:-1], self.sizes[1:], strict=True):
-            history, own = history + earlier, slice(start, start + size)
-            seen_keys = torch.cat((keys[..., :history, :], keys[..., own, :]), dim=-2)
-            seen_values = torch.cat((values[..., :history, :], values[..., own, :]), dim=-2)
-            mixed.append(grouped_attention(queries[..., own, :], seen_keys, seen_values))
-            start += size
+        starts = [0, *itertools.accumulate(self.sizes)]
+        clean = [(block, starts[block]) for block in range(len(self.sizes) - 1)]
+        noisy = [(block, starts[-2] - self.sizes[0] + starts[block]) for block in range(1, len(self.sizes))]
+        alike: dict[int, list[tuple[int, list[slice]]]] = {}
+        for place, (block, start) in enumerate(clean + noisy):
+            sink, recent = window_bounds(block, self.sink_blocks, self.recent_blocks)
+            window = [slice(0, starts[sink]), slice(starts[recent], starts[block])]
+            own = slice(start, start + self.sizes[block])
+            alike.setdefault(sum(part.stop - part.start for part in window), []).append((place, [*window, own]))
+        mixed: list[Tensor] = [queries] * len(clean + noisy)
+        for length, group in alike.items():
+            own = torch.stack([queries[..., parts[-1], :] for _, parts in group])
+            seen_keys, seen_values = (
+                torch.stack([torch.cat([source[..., part, :] for part in parts], dim=-2) for _, parts in group])
+                for source in (keys, values)
+            )
+            cosine, sine = (angles[..., : seen_keys.shape[-2], :] for angles in self.by)
+            own = rotate(own, (cosine[..., length:, :], sine[..., length:, :]))
+            seen_keys = rotate(seen_keys, (cosine, sine))
+            found = grouped_attention(own.flatten(0, 1), seen_keys.flatten(0, 1), seen_values.flatten(0, 1))
+            for (place, _), part in zip(group, rearrange(found, "(g b) n d -> g b n d", g=len(group)), strict=True):
+                mixed[place] = part
         return torch.cat(mixed, dim=1)
 
 
@@ -93,6 +118,33 @@ class CachedBlock:
 
     frames: int
     layers: dict[int, tuple[Tensor, Tensor]]
+
+
+class CacheWindow:
+    """The finished blocks that the next block sees. It never changes: a cache that takes a block gets a new window.
+
+    So a pass that is computed again in a backward pass (activation checkpointing) reads what it read the first time.
+    """
+
+    def __init__(self, blocks: Sequence[CachedBlock] = ()) -> None:
+        self.blocks = tuple(blocks)
+        self._rotated: dict[int, tuple[Tensor, Tensor]] = {}
+
+    @property
+    def frames(self) -> int:
+        """Latent frames in the window: the temporal position of the next block's first frame."""
+        return sum(block.frames for block in self.blocks)
+
+    def read(self, layer: int, by: Rotation) -> tuple[Tensor, Tensor] | None:
+        """Keys (rotated by the window's rotation) and values of ``layer``, ``(b heads n d)``; None while empty."""
+        if not self.blocks:
+            return None
+        if layer not in self._rotated:
+            keys, values = (
+                torch.cat(parts, dim=-2) for parts in zip(*(block.layers[layer] for block in self.blocks), strict=True)
+            )
+            self._rotated[layer] = (rotate(keys, by), values)
+        return self._rotated[layer]
 
 
 class KVCache:
@@ -108,12 +160,13 @@ class KVCache:
     Args:
         sink_blocks: blocks kept from the start of the rollout (block 0 is the observed latent frame).
         recent_blocks: finished blocks kept besides the sink.
+        fps: frames per second of each clip, ``(b)``; None: as the model's config says.
 
     Raises:
         ConfigError: not even the observed frame is kept.
     """
 
-    def __init__(self, sink_blocks: int, recent_blocks: int) -> None:
+    def __init__(self, sink_blocks: int, recent_blocks: int, fps: Tensor | None = None) -> None:
         if sink_blocks < 1 or recent_blocks < 0:
             raise ConfigError(
                 "The cache must keep at least the observed frame",
@@ -122,45 +175,32 @@ class KVCache:
             )
         self.sink_blocks = sink_blocks
         self.recent_blocks = recent_blocks
+        self.fps = fps
         self.reference: Tensor | None = None
         """Latents of the observed frame, ``(b v c 1 h w)``; None while the cache is empty."""
-        self._blocks: list[CachedBlock] = []
-        self._rotated: dict[int, tuple[Tensor, Tensor]] = {}
+        self.window = CacheWindow()
 
     @property
     def frames(self) -> int:
-        """Latent frames in the window: the temporal position of the next block's first frame."""
-        return sum(block.frames for block in self._blocks)
+        """Latent frames in the window."""
+        return self.window.frames
 
     @property
     def nbytes(self) -> int:
         """Bytes of the stored keys and values."""
-        parts = (part for block in self._blocks for pair in block.layers.values() for part in pair)
+        parts = (part for block in self.window.blocks for pair in block.layers.values() for part in pair)
         return sum(part.numel() * part.element_size() for part in parts)
 
     def append(self, block: CachedBlock) -> None:
         """Take a finished block into the window and let go of what falls out of it."""
-        self._blocks.append(block)
-        if len(self._blocks) > self.sink_blocks + self.recent_blocks:
-            del self._blocks[self.sink_blocks]
-        self._rotated.clear()
-
-    def read(self, layer: int, by: Rotation) -> tuple[Tensor, Tensor] | None:
-        """Keys (rotated by the window's rotation) and values of ``layer``, ``(b heads n d)``; None while empty."""
-        if not self._blocks:
-            return None
-        if layer not in self._rotated:
-            keys, values = (
-                torch.cat(parts, dim=-2) for parts in zip(*(block.layers[layer] for block in self._blocks), strict=True)
-            )
-            self._rotated[layer] = (rotate(keys, by), values)
-        return self._rotated[layer]
+        blocks = (*self.window.blocks, block)
+        stop, start = window_bounds(len(blocks), self.sink_blocks, self.recent_blocks)
+        self.window = CacheWindow(blocks[:stop] + blocks[start:])
 
     def copy(self) -> KVCache:
         """A cache with the same window that can go on separately (tensors are shared; they are never changed)."""
-        other = KVCache(self.sink_blocks, self.recent_blocks)
-        other.reference = self.reference
-        other._blocks = list(self._blocks)
+        other = KVCache(self.sink_blocks, self.recent_blocks, self.fps)
+        other.reference, other.window = self.reference, self.window
         return other
 
 
@@ -174,7 +214,7 @@ class CachedAttention:
     """
 
     by: Rotation
-    cache: KVCache
+    window: CacheWindow
     window_by: Rotation
     written: dict[int, tuple[Tensor, Tensor]] | None = None
 
@@ -184,7 +224,7 @@ class CachedAttention:
         if self.written is not None:
             self.written[layer] = (keys, values)
         queries, keys = rotate(queries, self.by), rotate(keys, self.by)
-        window = self.cache.read(layer, self.window_by)
+        window = self.window.read(layer, self.window_by)
         if window is not None:
             keys, values = torch.cat((window[0], keys), dim=-2), torch.cat((window[1], values), dim=-2)
         return grouped_attention(queries, keys, values)

@@ -10,6 +10,7 @@ import itertools
 from typing import Literal, Self
 
 from pydantic import Field, field_validator
+from torch import Tensor
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
 from worldline_core.actions.episode_tracks import WristProjection
@@ -83,7 +84,10 @@ class ActionContract(StrictModel):
 
 
 class CausalSpec(StrictModel):
-    """Blocks of a block-causal model.
+    """Blocks of a block-causal model: the same in training and in a rollout.
+
+    A block sees the sink and the recent blocks before it at positions counted from the start of that window, whether its
+    history lies in a cache (:meth:`new_cache`) or beside it in one pass (``WorldModel.forward_teacher_forcing``).
 
     Attributes:
         block_size: latent frames per block.
@@ -109,6 +113,6 @@ class CausalSpec(StrictModel):
         """Euler steps per block."""
         return len(self.sigmas) - 1
 
-    def new_cache(self) -> KVCache:
-        """An empty cache with this window."""
-        return KVCache(self.sink_blocks, self.recent_blocks)
+    def new_cache(self, fps: Tensor | None = None) -> KVCache:
+        """An empty cache with this window, for clips of ``fps`` frames per second ``(b)``."""
+        return KVCache(self.sink_blocks, self.recent_blocks, fps)

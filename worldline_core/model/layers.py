@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from worldline_core.errors import ConfigError, DataError
@@ -60,6 +61,15 @@ def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tenso
     else:
         mixed = F.scaled_dot_product_attention(rows, keys, values, attn_mask=mask)
     return rearrange(mixed, "b k (n g) d -> b n (k g d)", g=groups)
+
+
+@dataclass(frozen=True)
+class TextContext:
+    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once."""
+
+    layers: tuple[tuple[Tensor, Tensor], ...]
+    mask: Bool[Tensor, "b m"] | None
+    size: int
 
 
 class RMSNorm(nn.Module):

@@ -40,7 +40,8 @@ def video_positions(
     grid: tuple[int, int],
     views: Sequence[str],
     temporal_offset: float = 0.0,
-) -> Float[Tensor, "3 n"]:
+    fps: Float[Tensor, " b"] | None = None,
+) -> Float[Tensor, "3 *batch n"]:
     """Coordinates of the video tokens, flattened in order ``(t v h w)``.
 
     Args:
@@ -48,21 +49,29 @@ def video_positions(
         grid: patch rows and columns of one view.
         views: names of the views, all sharing the temporal coordinates (docs/method.md section 3).
         temporal_offset: added to the temporal axis (text length plus margin when there is text).
+        fps: frames per second of each clip, as it is shown (a stride lowers the rate): latent frame ``j`` stands at
+            ``j base_fps / fps``. None takes the config's; a model whose config has none counts latent frames.
+
+    Returns:
+        the coordinates of all clips, or with ``fps`` those of each clip, ``(3 b n)``.
     """
     rows, columns = grid
-    step = 1.0 if config.fps is None else config.base_fps / config.fps
     device = frames.device
-    time = frames.to(torch.float32) * step + temporal_offset
+    time = frames.to(torch.float32)
+    if config.fps is not None:
+        rate = config.fps if fps is None else rearrange(fps.to(device, torch.float32), "b -> b 1")
+        time = time / rate * config.base_fps
+    time = time + temporal_offset
     starts = torch.tensor(view_starts(config, views), device=device)
     height = rearrange(starts, "v -> v 1") + torch.arange(rows, device=device, dtype=torch.float32)
     width = torch.arange(columns, device=device, dtype=torch.float32)
-    shape = (len(time), len(views), rows, columns)
+    shape = (*time.shape, len(views), rows, columns)
     axes = (
-        rearrange(time, "t -> t 1 1 1").expand(shape),
+        rearrange(time, "... t -> ... t 1 1 1").expand(shape),
         rearrange(height, "v h -> 1 v h 1").expand(shape),
         rearrange(width, "w -> 1 1 1 w").expand(shape),
     )
-    return rearrange(torch.stack(axes), "xyz t v h w -> xyz (t v h w)")
+    return rearrange(torch.stack(axes), "xyz ... t v h w -> xyz ... (t v h w)")
 
 
 def text_positions(lengths: Tensor, size: int) -> Float[Tensor, "3 b n"]:
@@ -93,7 +102,7 @@ def rotation(config: WorldModelConfig, positions: Float[Tensor, "3 *batch n"]) -
     return angles.cos(), angles.sin()
 
 
-def rotate(values: Float[Tensor, "b heads n d"], by: Rotation) -> Float[Tensor, "b heads n d"]:
+def rotate(values: Float[Tensor, "*batch heads n d"], by: Rotation) -> Float[Tensor, "*batch heads n d"]:
     """Rotate queries or keys; ``by`` broadcasts over batch and heads."""
     cosine, sine = (part.to(values.dtype) for part in by)
     first, second = values.chunk(2, dim=-1)

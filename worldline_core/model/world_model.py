@@ -16,7 +16,7 @@ from typing import cast
 
 import torch
 from einops import rearrange, repeat
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
 
@@ -29,11 +29,13 @@ from worldline_core.model.block_causal_attention import (
     TeacherForcingAttention,
     block_bounds,
 )
+from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.layers import (
     ActionEncoder,
     GenerationAttention,
     MixtureLayer,
     RMSNorm,
+    TextContext,
     TimeEmbedder,
     check_shapes,
     is_text_parameter,
@@ -41,15 +43,6 @@ from worldline_core.model.layers import (
 )
 from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
 from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
-
-
-@dataclass(frozen=True)
-class TextContext:
-    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once."""
-
-    layers: tuple[tuple[Tensor, Tensor], ...]
-    mask: Bool[Tensor, "b m"] | None
-    size: int
 
 
 @dataclass(frozen=True)
@@ -141,6 +134,7 @@ class WorldModel(nn.Module):
         action_maps: Float[Tensor, "b v a t h w"] | None = None,
         text: TextContext | None = None,
         views: Sequence[str] = VIEWS,
+        fps: Float[Tensor, " b"] | None = None,
         features_at: int | None = None,
     ) -> WorldModelOutput:
         """Velocity of a whole clip whose first latent frame is the clean observation (Stage I and II).
@@ -151,6 +145,7 @@ class WorldModel(nn.Module):
             action_maps: maps at latent resolution; None runs without the action branch.
             text: from :meth:`encode_text`.
             views: names of the views in ``latents``.
+            fps: frames per second of each clip as it is shown; None: as the config says.
             features_at: also return the video tokens after this many layers (1-based), as ``(b v t h w d)``.
 
         Raises:
@@ -160,7 +155,7 @@ class WorldModel(nn.Module):
         check_shapes(self.config, latents, views, action_maps)
         frames, (rows, columns) = latents.shape[3], self._patch_grid(latents)
         offset = 0.0 if text is None else text.size + self.config.temporal_margin
-        by = self._rotation(torch.arange(frames, device=latents.device), latents, views, offset)
+        by = self._rotation(torch.arange(frames, device=latents.device), latents, views, fps, offset)
         clean = torch.zeros(len(latents), frames, dtype=torch.bool, device=latents.device)
         clean[:, 0] = True
         tokens = self._embed(latents, sigma, clean, action_maps, views)
@@ -225,41 +220,41 @@ class WorldModel(nn.Module):
         sigma: Float[Tensor, "b blocks"],
         *,
         action_maps: Float[Tensor, "b v a t h w"] | None = None,
-        block_size: int,
+        spec: CausalSpec,
         views: Sequence[str] = VIEWS,
+        fps: Float[Tensor, " b"] | None = None,
     ) -> Float[Tensor, "b v c t h w"]:
         """Block-causal velocity of every block in one pass (paper, Stage III step 1).
 
-        Noisy block ``i`` sees the clean blocks before it and itself, with its own action maps. Frame 0 of ``noisy`` is
-        not read; its velocity is 0.
+        Noisy block ``i`` sees itself, with its own action maps, and the clean blocks that ``spec`` keeps before it: what
+        :meth:`forward_block` sees after these blocks were written. Frame 0 of ``noisy`` is not read; its velocity is 0.
 
         Raises:
             DataError: a shape does not fit, or the clip does not divide into blocks.
         """
         check_shapes(self.config, noisy, views, action_maps)
         batch, _, _, frames, _, _ = noisy.shape
-        bounds = block_bounds(frames, block_size)
+        bounds = block_bounds(frames, spec.block_size)
         if clean.shape != noisy.shape or sigma.shape != (batch, len(bounds) - 1):
             raise DataError(
                 "Teacher forcing needs clean latents like the noisy ones and one sigma per block",
                 expected=f"{tuple(noisy.shape)} and {(batch, len(bounds) - 1)}",
                 got=f"{tuple(clean.shape)} and {tuple(sigma.shape)}",
             )
-        history = frames - block_size
-        frame_sigma = repeat(sigma, "b blocks -> b (blocks size)", size=block_size)
+        history = frames - spec.block_size
+        frame_sigma = repeat(sigma, "b blocks -> b (blocks size)", size=spec.block_size)
         latents = torch.cat((clean[..., :history, :, :], noisy[..., 1:, :, :].to(clean.dtype)), dim=3)
         frame_sigma = torch.cat((frame_sigma.new_zeros(batch, history), frame_sigma), dim=1)
         is_clean = (torch.arange(history + frames - 1, device=noisy.device) < history).expand(batch, -1)
         maps = None
         if action_maps is not None:
             maps = torch.cat((action_maps[..., :history, :, :], action_maps[..., 1:, :, :]), dim=3)
-        index = torch.cat((torch.arange(history), torch.arange(1, frames))).to(noisy.device)
-        by = self._rotation(index, noisy, views)
+        by = self._rotation(torch.arange(frames, device=noisy.device), noisy, views, fps)
         rows, columns = self._patch_grid(noisy)
         per_frame = len(views) * rows * columns
         sizes = tuple((stop - start) * per_frame for start, stop in bounds)
         tokens = self._embed(latents, frame_sigma, is_clean, maps, views)
-        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes))
+        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes, spec.sink_blocks, spec.recent_blocks))
         velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
 
@@ -270,9 +265,13 @@ class WorldModel(nn.Module):
         """Patch rows and columns of one view."""
         return latents.shape[-2] // self.config.patch_size, latents.shape[-1] // self.config.patch_size
 
-    def _rotation(self, frames: Tensor, latents: Tensor, views: Sequence[str], offset: float = 0.0) -> Rotation:
-        """Rotary angles of the tokens of these latent frames (temporal positions)."""
-        return rotation(self.config, video_positions(self.config, frames, self._patch_grid(latents), views, offset))
+    def _rotation(
+        self, frames: Tensor, latents: Tensor, views: Sequence[str], fps: Tensor | None, offset: float = 0.0
+    ) -> Rotation:
+        """Rotary angles of the tokens of these latent frames, for all heads: ``(n d)``, or ``(b 1 n d)`` by clip."""
+        positions = video_positions(self.config, frames, self._patch_grid(latents), views, offset, fps)
+        cosine, sine = rotation(self.config, positions)
+        return (cosine, sine) if positions.ndim == 2 else (cosine[:, None], sine[:, None])
 
     def _run_block(
         self,
@@ -287,8 +286,8 @@ class WorldModel(nn.Module):
         """Tokens of one block that attends to itself and to the cache's window, which it follows in time."""
         check_shapes(self.config, latents, views, action_maps)
         own, window = (torch.arange(count, device=latents.device) for count in (latents.shape[3], cache.frames))
-        by = self._rotation(own + cache.frames, latents, views)
-        attend = CachedAttention(by, cache, self._rotation(window, latents, views), written)
+        by = self._rotation(own + cache.frames, latents, views, cache.fps)
+        attend = CachedAttention(by, cache.window, self._rotation(window, latents, views, cache.fps), written)
         return self._run(self._embed(latents, sigma, clean, action_maps, views), attend)[0]
 
     def _embed(

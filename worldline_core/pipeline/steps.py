@@ -197,7 +197,7 @@ _STEPS = (
     ),
     Step(
         "distill",
-        2,
+        3,
         "worldline_core.distillation.distill",
         "distill",
         "DistillConfig",

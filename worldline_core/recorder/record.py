@@ -104,7 +104,7 @@ class RecordConfig(StrictModel):
 
     groups: tuple[RecordGroup, ...] = Field(min_length=1)
     seed: int = Field(default=0, ge=0)
-    num_frames: int = Field(default=33, ge=17, le=400)
+    num_frames: int = Field(default=33, ge=17, le=2000)
     workers: int = Field(default=2, ge=1, le=64)
     video_crf: int = Field(default=18, ge=0, le=51)
     mcap: bool = False

@@ -88,6 +88,7 @@ def rollout_full_clip(
     frames: int | None = None,
     views: Sequence[str] = VIEWS,
     text: TextContext | None = None,
+    fps: float | None = None,
     bfloat16: bool = False,
 ) -> Float[Tensor, "b v c t h w"]:
     """Integrate from noise to a clip whose first latent frame is ``first_latents``; no classifier-free guidance.
@@ -96,6 +97,7 @@ def rollout_full_clip(
         action_maps: controls of every latent frame; None for a model without actions (then give ``frames``).
         noise: one source per clip.
         shift: moves the noise levels of the steps towards noise.
+        fps: frames per second of the clips; None: as the model's config says.
 
     Raises:
         ConfigError: fewer than one step.
@@ -107,11 +109,12 @@ def rollout_full_clip(
     first = repeat(first_latents.float(), "b v c h w -> b v c 1 h w")
     latents = noise.draw((views_count, channels, frames, height, width), first.device)
     latents = torch.cat((first, latents[:, :, :, 1:]), dim=3)
+    rates = None if fps is None else torch.full((batch,), fps, device=first.device)
 
     def velocity(state: Tensor, sigma: float) -> Tensor:
         # The first frame's velocity is zero, so it stays what was observed.
         levels = torch.full((batch,), sigma, device=state.device)
-        return model(state, levels, action_maps=action_maps, text=text, views=views).velocity
+        return model(state, levels, action_maps=action_maps, text=text, views=views, fps=rates).velocity
 
     with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
         return integrate(velocity, latents, shifted_sigmas(steps, shift))
@@ -127,6 +130,7 @@ class BlockCausalSimulator:
     Args:
         spec: block size, window and nodes, as the model was trained with.
         noise: one source per clip.
+        fps: frames per second of the clips; None: as the model's config says.
     """
 
     def __init__(
@@ -136,11 +140,13 @@ class BlockCausalSimulator:
         *,
         noise: Noise,
         views: Sequence[str] = VIEWS,
+        fps: float | None = None,
         bfloat16: bool = False,
     ) -> None:
         self.model = model
         self.spec = spec
         self.views = tuple(views)
+        self.fps = fps
         self.bfloat16 = bfloat16
         self.noise = noise
         self.cache = spec.new_cache()
@@ -150,7 +156,8 @@ class BlockCausalSimulator:
         self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 h w"] | None = None
     ) -> None:
         """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
-        self.cache = self.spec.new_cache()
+        rates = None if self.fps is None else torch.full((len(first_latents),), self.fps, device=first_latents.device)
+        self.cache = self.spec.new_cache(rates)
         self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
 
     @torch.no_grad()
@@ -183,7 +190,7 @@ class BlockCausalSimulator:
     def fork(self) -> BlockCausalSimulator:
         """A simulator in the same state that goes on separately: to try several controls from one moment."""
         other = BlockCausalSimulator(
-            self.model, self.spec, noise=self.noise.copy(), views=self.views, bfloat16=self.bfloat16
+            self.model, self.spec, noise=self.noise.copy(), views=self.views, fps=self.fps, bfloat16=self.bfloat16
         )
         other.cache = self.cache.copy()
         other._unwritten = self._unwritten

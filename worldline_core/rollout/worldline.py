@@ -249,7 +249,9 @@ class WorldLine:
         if self.causal is None:
             raise CheckpointError("Only a causal model goes block by block", expected="causal", got=self.info.kind)
         noise = Noise(seeds)
-        return BlockCausalSimulator(self.model, self.causal, noise=noise, views=self.views, bfloat16=self.bfloat16)
+        return BlockCausalSimulator(
+            self.model, self.causal, noise=noise, views=self.views, fps=self.contract.fps, bfloat16=self.bfloat16
+        )
 
     def _sample(self, first: Tensor, maps: Tensor, seeds: Sequence[int]) -> Tensor:
         self.block_seconds = []
@@ -263,6 +265,7 @@ class WorldLine:
                 steps=self.steps,
                 shift=self.shift,
                 views=self.views,
+                fps=self.contract.fps,
                 bfloat16=self.bfloat16,
             )
         simulator = self.simulator(seeds)

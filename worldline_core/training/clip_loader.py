@@ -153,6 +153,7 @@ class SkipLog:
 class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
 
+    ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
     ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
     """
 
@@ -163,6 +164,7 @@ class Batch:
     text_ids: Int[Tensor, "b n"] | None = None
     text_mask: Bool[Tensor, "b n"] | None = None
     frames: UInt8[Tensor, "b v frames height width 3"] | None = None
+    fps: Float[Tensor, " b"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -178,7 +180,8 @@ class ClipLoader:
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
         wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
-        frame_rates: frame rate of each episode [1/s]; needed with ``text``.
+        frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
+            rate.
     """
 
     def __init__(
@@ -228,14 +231,19 @@ class ClipLoader:
             ids, mask = self.text([self.store.row(clip.episode_id).instruction for clip in clips], facts)
             ids, mask = ids.to(self.device), mask.to(self.device)
         frames = read.data if read.data.dtype == torch.uint8 else None
-        return Batch(clips, views, latents, maps, ids, mask, frames)
+        rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
+        fps = None if rates is None else torch.tensor(rates, device=self.device)
+        return Batch(clips, views, latents, maps, ids, mask, frames, fps)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """What a prompt may say of a clip: a stride shows its frames at a lower rate."""
+        return ClipFacts(clip.num_frames, self._rate(clip), self.store.image_size)
+
+    def _rate(self, clip: Clip) -> float:
         rate = self.frame_rates.get(clip.episode_id)
         if rate is None:
             raise ArtifactError("The frame rate of an episode is not known.", where=clip.episode_id)
-        return ClipFacts(clip.num_frames, rate / clip.stride, self.store.image_size)
+        return rate / clip.stride
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
         """Maps at latent resolution: latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""

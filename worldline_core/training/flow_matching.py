@@ -167,6 +167,7 @@ class FlowMatchingObjective:
             action_maps=maps,
             text=self._text(batch) if with_text else None,
             views=batch.views,
+            fps=batch.fps,
             features_at=None if self.relational is None else self.relational.layer,
         )
         flow = flow_matching_loss(output.velocity, latents, noise, sigma, self.weighting)
@@ -211,6 +212,7 @@ class FlowMatchingObjective:
                 action_maps=maps,
                 text=self._text(batch),
                 views=batch.views,
+                fps=batch.fps,
             ).velocity
             for name, kind in (("loss", "velocity"), ("sample_error", "sample")):
                 weighting = LossWeighting.model_validate({"kind": kind})

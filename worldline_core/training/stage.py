@@ -142,7 +142,13 @@ class Stage:
 
     def loader(self, **conditions: Any) -> ClipLoader:
         """A loader of this run's clips; ``conditions`` as `ClipLoader` takes them (action tracks, text)."""
-        return ClipLoader(self.source, views=self.model.config.views, device=self.config.trainer.device, **conditions)
+        return ClipLoader(
+            self.source,
+            views=self.model.config.views,
+            frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
+            device=self.config.trainer.device,
+            **conditions,
+        )
 
     def train(
         self, objective: FlowMatchingObjective, groups: Sequence[ParameterGroup], loader: ClipLoader

@@ -56,10 +56,7 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
     title = "stage I" if config.kind == "stage1" else "base"
     stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model)
     model = stage.model
-    loader = stage.loader(
-        text=load_text_encoder(config.text, model.config.vocab_size),
-        frame_rates={row.episode_id: row.fps for row in stage.episodes.rows},
-    )
+    loader = stage.loader(text=load_text_encoder(config.text, model.config.vocab_size))
     objective = FlowMatchingObjective(
         model, sigma=config.sigma, weighting=config.weighting, text_dropout=config.text_dropout
     )

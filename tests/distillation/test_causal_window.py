@@ -1,0 +1,108 @@
+"""Training sees what inference sees: every objective's pass over a long clip equals the rollout's cache, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
+from worldline_core.distillation.distill_config import DistillConfig
+from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
+from worldline_core.distillation.trajectory_regression import TrajectoryObjective
+from worldline_core.distillation.trajectory_store import TrajectoryBatch
+from worldline_core.model.block_causal_attention import block_bounds
+from worldline_core.model.world_model import WorldModel
+
+VIEWS = ("head", "left_wrist", "right_wrist")
+FRAMES = 13  # the observed latent frame and six blocks of two; the window holds two blocks
+
+
+def config_of(**window: Any) -> DistillConfig:
+    return DistillConfig.model_validate(
+        {
+            "clips": {"lengths": [1 + 4 * (FRAMES - 1)]},
+            "block_size": 2,
+            "window": {"sink_blocks": 1, "recent_blocks": 1, **window},
+            "distribution_matching": {"real_score": "causal_teacher"},
+        }
+    )
+
+
+def batch_of(steps: int) -> TrajectoryBatch:
+    generator = torch.Generator().manual_seed(4)
+    latents = torch.randn(2, 3, 4, FRAMES, 4, 4, generator=generator)
+    return TrajectoryBatch(
+        clips=(),
+        views=VIEWS,
+        latents=latents,
+        action_maps=torch.randn(2, 3, 9, FRAMES, 4, 4, generator=generator),
+        fps=torch.tensor([8.0, 30.0]),
+        nodes=torch.randn(2, steps + 1, 3, 4, FRAMES - 1, 4, 4, generator=generator),
+        history=latents,
+        mask=torch.zeros(2, 3, FRAMES, 4, 4),
+    )
+
+
+def passes_of(name: str, config: DistillConfig, make_model: Callable[..., WorldModel]) -> list[tuple[WorldModel, Any]]:
+    """Every teacher-forced pass of one loss of the objective: the model, its arguments, and the velocity."""
+    models = [make_model(seed, fps=15.0) for seed in range(3)]
+    objective = {
+        "teacher_forcing": lambda: TeacherForcingObjective(models[0], config),
+        "trajectory_regression": lambda: TrajectoryObjective(models[0], config, None),
+        "distribution_matching": lambda: DistributionMatchingObjective(models[0], models[1], models[2], config, None),
+    }[name]()
+    seen: list[tuple[WorldModel, Any]] = []
+    for model in models:
+
+        def watched(*given: Any, model: WorldModel = model, **named: Any) -> torch.Tensor:
+            velocity = WorldModel.forward_teacher_forcing(model, *given, **named)
+            seen.append((model, (*given, named["action_maps"], velocity)))
+            return velocity
+
+        model.forward_teacher_forcing = watched  # type: ignore[method-assign]
+    # Iteration 5 is the student's turn of distribution matching: both scores are asked.
+    objective.loss(batch_of(config.spec.steps), torch.Generator().manual_seed(0), 5)  # type: ignore[arg-type]
+    return seen
+
+
+@torch.no_grad()
+def blockwise(model: WorldModel, config: DistillConfig, given: Any) -> torch.Tensor:
+    """The velocities of the same noisy blocks, as a rollout over the same clean history computes them."""
+    noisy, clean, sigma, maps, _ = given
+    cache, found = config.spec.new_cache(torch.tensor([8.0, 30.0])), [torch.zeros_like(noisy[..., :1, :, :])]
+    for block, (start, stop) in enumerate(block_bounds(FRAMES, 2)):
+        own = maps[..., start:stop, :, :]
+        if block:
+            found.append(model.forward_block(noisy[..., start:stop, :, :], sigma[:, block - 1], cache, action_maps=own))
+        model.write_block(clean[..., start:stop, :, :], cache, action_maps=own)
+    return torch.cat(found, dim=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "passes"), [("teacher_forcing", 1), ("trajectory_regression", 1), ("distribution_matching", 2)]
+)
+def test_an_objective_trains_on_what_a_rollout_sees(
+    name: str, passes: int, make_model: Callable[..., WorldModel]
+) -> None:
+    config = config_of()
+    assert config.training_spec == config.spec
+    seen = passes_of(name, config, make_model)
+    assert len(seen) == passes
+    for model, given in seen:
+        torch.testing.assert_close(given[-1], blockwise(model, config, given), rtol=1e-5, atol=1e-5)
+
+
+def test_full_history_can_still_be_trained_on(make_model: Callable[..., WorldModel]) -> None:
+    config = config_of(trained_on="full_history")
+    (model, given), *_ = passes_of("teacher_forcing", config, make_model)
+    rolled = blockwise(model, config, given)
+    assert torch.allclose(given[-1][..., :5, :, :], rolled[..., :5, :, :], atol=1e-5)  # the window holds two blocks
+    assert not torch.allclose(given[-1][..., 5:, :, :], rolled[..., 5:, :, :], atol=1e-3)
+
+
+def test_the_setting_is_left_out_of_dumps_at_its_default() -> None:
+    assert "trained_on" not in config_of().model_dump()["window"]
+    assert config_of(trained_on="full_history").model_dump()["window"]["trained_on"] == "full_history"
