@@ -19,7 +19,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
+from worldline_core.model.contracts import CAUSAL_SIGMAS, NATIVE_VECTORS, CausalSpec
+from worldline_core.model.film import new_action_branch
 from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
@@ -62,7 +63,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
         for seed, (name, embodiment) in enumerate(NAMES.items()):
-            joints = np.zeros((N, 14), np.float32)
+            joints = np.linspace(np.zeros(14), np.full(14, seed), N, dtype=np.float32)
             episode = Episode(
                 episode_id=name, source="synthetic", embodiment=embodiment, scene="s", task_family="lift", instruction="lift",
                 outcome="unknown", split="test" if seed else "train", fps=8.0, state=joints, action=joints,
@@ -90,6 +91,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     save_checkpoint(root / "causal", model, kind="causal", action_contract=contract, causal=SPEC)
     small = make_spec(recent_blocks=1, sigmas=(1.0, 0.5, 0.0))
     save_checkpoint(root / "small_blocks", model, kind="causal", action_contract=contract, causal=small)
+    film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
+    contract = contract.model_copy(update={"maps": NATIVE_VECTORS})
+    model.config, model.action_encoder = film, new_action_branch(film)
+    torch.nn.init.normal_(model.action_encoder.proj[0].weight, generator=generator)
+    save_checkpoint(root / "film", model, kind="stage2", action_contract=contract)
     return {
         "episodes": root / "episodes",
         "tracks": root / "tracks",
@@ -235,6 +241,18 @@ def test_the_whole_clip_sampler_takes_stage2_checkpoints_only(inputs: dict[str, 
     assert rollout(config, stage2, tmp_path)["frames"] == N
     with pytest.raises(ConfigError, match="lacks inputs"):
         rollout(config, {"episodes": inputs["episodes"]}, tmp_path)
+
+
+def test_a_model_with_film_is_driven_by_the_control_vectors_of_the_recording(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    config = RolloutConfig(method="film", sampler="full_clip", steps=2, num_frames=5, embodiments=("aloha_viperx",))
+    film = inputs | {"checkpoint": inputs["checkpoint"].parent / "film"}
+    seen = []
+    for actions in ("true", "zero", "shuffled"):
+        rollout(config.model_copy(update={"actions": actions}), film, tmp_path / actions)
+        seen.append(RolloutSet.open(tmp_path / actions).frames("b-1", "head").tobytes())
+    assert len(set(seen)) == 3
 
 
 def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:

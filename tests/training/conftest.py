@@ -138,7 +138,7 @@ def write_episodes(root: Path, count: int, validation: int) -> None:
                 row, column = centre(number, frame)
                 bump = np.exp(-((rows / 8 - row) ** 2 + (columns / 8 - column) ** 2))
                 frames[frame] = (40 + 180 * bump[..., None]).astype(np.uint8)
-            state = np.zeros((FRAMES, 2), np.float32)
+            state = np.linspace([0, 0], [number, 1], FRAMES, dtype=np.float32)
             writer.add(
                 Episode(
                     episode_id=f"episode-{number:03d}",

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, TrainingError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import ActionContract, CausalSpec
+from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import stage as stage_module
@@ -182,6 +182,32 @@ def test_what_stage2_trains(model_config: MakeConfig) -> None:
         assert not any(frozen in name for name in names), frozen
     both = [set(group.parameters) for group in stage1_groups(model)]
     assert both[0] | both[1] | set(action.parameters) == {name for name, _ in model.named_parameters()}
+
+
+def test_native_control_vectors_take_the_place_of_maps(
+    world: Any, stage1_folder: Path, make_contract: Callable[..., ActionContract], tmp_path: Path
+) -> None:
+    """The paper's ablation: a Stage I model with maps becomes a Stage II model with FiLM, driven by its own vectors."""
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    result = train_stage2(stage2(30, native_size=3, action_dropout=0.0), inputs, tmp_path / "film")
+    model, info = load_checkpoint(tmp_path / "film", expect_kind="stage2")
+    assert (info.config.native_size, info.contract.maps) == (3, NATIVE_VECTORS)
+    assert all(layer.weight.abs().max() > 0 for layer in model.action_encoder.proj)  # type: ignore[union-attr]
+    assert result["validation/loss"] != result["validation/loss_shuffled_actions"]
+    train_stage2(stage2(2, native_size=3, start_from="stage2"), inputs | {"stage1": tmp_path / "film"}, tmp_path / "on")
+    with pytest.raises(DataError, match=r"(?s)driven by control vectors.*up to 1 numbers.*got: 2"):
+        train_stage2(stage2(2, native_size=1), inputs, tmp_path / "small")
+    with pytest.raises(CheckpointError, match="action contract differs"):
+        train_stage2(stage2(2, start_from="stage2"), inputs | {"stage1": tmp_path / "film"}, tmp_path / "maps")
+
+
+def test_only_episodes_of_some_outcomes_can_be_trained_on(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2, outcomes=["success"]), inputs, tmp_path / "out")
+    assert load_checkpoint(tmp_path / "out")[1].metadata["episodes"] == 3  # of six
+    with pytest.raises(DataError, match="No episode is left"):
+        train_stage2(stage2(2, outcomes=["unknown"]), inputs, tmp_path / "none")
+    assert "outcomes" not in stage2(2).model_dump()
 
 
 def test_outcomes_do_not_reach_the_model(world: Any, stage1_folder: Path, tmp_path: Path) -> None:

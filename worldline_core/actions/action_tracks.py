@@ -10,6 +10,7 @@ the future is seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -98,7 +99,8 @@ def compute_tracks(
         views=VIEWS, arms=arms, image_size=image_size, controls=kind, camera_motion=motion,
     )  # fmt: skip
     present = [number for number, view in enumerate(VIEWS) if view in episode.cameras]
-    return tracks, count_samples(seen.cause[:, present], gripper, arms, outside_limits)
+    native = np.asarray(episode.action if kind == "action" else episode.state, dtype=np.float32)
+    return replace(tracks, native=native), count_samples(seen.cause[:, present], gripper, arms, outside_limits)
 
 
 def tracks_of_projection(

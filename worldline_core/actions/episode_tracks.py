@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from einops import repeat
 from jaxtyping import Bool, Float
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
@@ -28,6 +29,7 @@ from torch import Tensor
 
 from worldline_core.actions.tool_projection import project_tools
 from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 
@@ -69,6 +71,8 @@ class EpisodeTracks:
             controls), "first_frame_mount" (kinematics, mount solved at the first frame), "recorded", or "absent".
         controls: "state", "action", or "ee_pose" where a source records tool poses.
         capsules: (N, S, 2, 3) robot parts as base-frame segments, capsule_radii (S,) in metres.
+        native: (N, D) the control vectors themselves, in the layout of the embodiment's state; in memory only, and None
+            for tracks that were opened without their episodes.
     """
 
     episode_id: str
@@ -88,6 +92,7 @@ class EpisodeTracks:
     K: np.ndarray
     capsules: np.ndarray
     capsule_radii: np.ndarray
+    native: np.ndarray | None = None
 
     @property
     def num_frames(self) -> int:
@@ -121,6 +126,7 @@ class EpisodeTracks:
         cut = replace(
             self,
             **{name: getattr(self, name)[index] for name in (*SAMPLES, "T_base_tool", "T_base_camera", "capsules")},
+            native=None if self.native is None else self.native[index],
         )
         wrists = [i for i, view in enumerate(self.views) if view != HEAD_VIEW]
         if wrist_projection == "current_camera" or not wrists:
@@ -181,6 +187,28 @@ def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None =
     return TrackBatch(**{name: torch.from_numpy(np.stack(column)) for name, column in columns.items()})
 
 
+def native_vectors(
+    clips: Sequence[EpisodeTracks], views: Sequence[str], size: int
+) -> Float[Tensor, "b v {size} t 1 1"]:
+    """Control vectors of clips of equal length, padded with zeros to ``size`` and repeated for every view: action maps of
+    one cell, for models with FiLM.
+
+    Raises: DataError when a clip has no control vectors, or longer ones.
+    """
+    rows = []
+    for clip in clips:
+        if clip.native is None or clip.native.shape[1] > size:
+            raise DataError(
+                "The model is driven by control vectors that these tracks do not have",
+                where=f"episode {clip.episode_id}, embodiment {clip.embodiment}",
+                expected=f"up to {size} numbers a frame",
+                got=None if clip.native is None else clip.native.shape[1],
+                next_step="open the tracks with their episodes, or train with a larger native_size",
+            )
+        rows.append(np.pad(clip.native, ((0, 0), (0, size - clip.native.shape[1]))))
+    return repeat(torch.from_numpy(np.stack(rows)), "b t c -> b v c t 1 1", v=len(views))
+
+
 def shard_name(number: int) -> str:
     """File name of a shard."""
     return f"tracks-{number:05d}.safetensors"
@@ -227,15 +255,26 @@ def write_index(root: Path, rows: Sequence[dict[str, Any]], *, sigma_px_ref: flo
 
 
 class ActionTracks:
-    """Read access to a finished ActionTracks artifact; only the episodes asked for are read."""
+    """Read access to a finished ActionTracks artifact; only the episodes asked for are read.
 
-    def __init__(self, root: Path, rows: Sequence[dict[str, Any]], description: TracksDescription) -> None:
+    Args:
+        episodes: the recordings, for tracks that carry their native control vectors too.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        rows: Sequence[dict[str, Any]],
+        description: TracksDescription,
+        episodes: EpisodeSet | None = None,
+    ) -> None:
         self.root = root
+        self.episodes = episodes
         self.sigma_px_ref = description.sigma_px_ref
         self._rows = {row["episode_id"]: row for row in rows}
 
     @classmethod
-    def open(cls, root: Path) -> ActionTracks:
+    def open(cls, root: Path, episodes: EpisodeSet | None = None) -> ActionTracks:
         """Open an artifact.
 
         Raises: ArtifactError when the index is missing or lacks a column, or `tracks.json` does not say the width.
@@ -251,7 +290,7 @@ class ActionTracks:
             raise ArtifactError(
                 "ActionTracks index lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
             )
-        return cls(Path(root), table.to_pylist(), _read_description(Path(root) / DESCRIPTION_FILE))
+        return cls(Path(root), table.to_pylist(), _read_description(Path(root) / DESCRIPTION_FILE), episodes)
 
     @property
     def episode_ids(self) -> list[str]:
@@ -297,8 +336,13 @@ class ActionTracks:
             image_size=(row["height"], row["width"]),
             controls=row["controls"],
             camera_motion=tuple(row["camera_motion"]),
+            native=None if self.episodes is None else self._native(self.episodes, episode_id, row["controls"]),
             **arrays,
         )
+
+    def _native(self, episodes: EpisodeSet, episode_id: str, controls: str) -> np.ndarray:
+        episode = episodes.episode(episodes.position(episode_id))
+        return np.asarray(episode.action if controls == "action" else episode.state, np.float32)
 
 
 def _read_description(path: Path) -> TracksDescription:

@@ -60,7 +60,7 @@ def maps_of(batch: Batch) -> Float[Tensor, "b v a t h w"]:
 def self_forced_rollout(
     student: WorldModel,
     first: Float[Tensor, "b v c 1 h w"],
-    action_maps: Float[Tensor, "b v a t h w"],
+    action_maps: Float[Tensor, "b v a t #h #w"],
     noise: Float[Tensor, "b v c t h w"],
     exit_step: int,
     *,

@@ -50,7 +50,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
 def teacher_forcing_loss(
     model: WorldModel,
     latents: Float[Tensor, "b v c t h w"],
-    action_maps: Float[Tensor, "b v a t h w"] | None,
+    action_maps: Float[Tensor, "b v a t #h #w"] | None,
     *,
     history: Float[Tensor, "b v c t h w"] | None = None,
     views: Sequence[str],

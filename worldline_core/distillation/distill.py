@@ -101,8 +101,9 @@ class DistillationRun:
         device = config.teacher_forcing.trainer.device
         join_processes(device)
         info = read_checkpoint_info(Path(inputs["stage2"]))
-        store, tracks = LatentStore.open(Path(inputs["latents"])), ActionTracks.open(Path(inputs["tracks"]))
-        episodes = EpisodeSet.open(Path(inputs["episodes"]))
+        native = info.config.native_size
+        store, episodes = LatentStore.open(Path(inputs["latents"])), EpisodeSet.open(Path(inputs["episodes"]))
+        tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
         contract = info.contract
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=inputs["latents"], **found)
@@ -113,6 +114,7 @@ class DistillationRun:
             tracks=tracks,
             wrist_projection=contract.wrist_projection,
             frame_rates={row.episode_id: row.fps for row in episodes.rows},
+            native_size=native,
             device=device,
         )
         return cls(

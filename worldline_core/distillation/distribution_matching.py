@@ -126,7 +126,7 @@ def is_student_iteration(iteration: int) -> bool:
 
 def causal_score(
     model: WorldModel,
-    action_maps: Float[Tensor, "b v a t h w"],
+    action_maps: Float[Tensor, "b v a t #h #w"],
     *,
     views: Sequence[str],
     spec: CausalSpec,
@@ -144,7 +144,7 @@ def causal_score(
 
 def full_clip_score(
     model: WorldModel,
-    action_maps: Float[Tensor, "b v a t h w"],
+    action_maps: Float[Tensor, "b v a t #h #w"],
     *,
     views: Sequence[str],
     spec: CausalSpec,

@@ -81,7 +81,7 @@ def euler_nodes(
 def teacher_trajectories(
     teacher: WorldModel,
     latents: Float[Tensor, "b v c t h w"],
-    action_maps: Float[Tensor, "b v a t h w"],
+    action_maps: Float[Tensor, "b v a t #h #w"],
     noise: Float[Tensor, "b v c t h w"],
     *,
     views: Sequence[str],

@@ -70,7 +70,7 @@ def trajectory_regression_loss(
     student: WorldModel,
     nodes: Float[Tensor, "b k v c u h w"],
     clean: Float[Tensor, "b v c t h w"],
-    action_maps: Float[Tensor, "b v a t h w"] | None,
+    action_maps: Float[Tensor, "b v a t #h #w"] | None,
     index: Int[Tensor, "b blocks"],
     *,
     mask: Float[Tensor, "b v t h w"] | None,

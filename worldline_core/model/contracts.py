@@ -18,6 +18,8 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
 
+NATIVE_VECTORS = "none: native control vectors, zero-padded"
+"""In place of maps: what drives a model with FiLM. Their layout is that of the embodiment's state."""
 CAUSAL_SHIFT = 5.0
 CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
 """Nodes of the paper's four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4, 0."""
@@ -37,7 +39,7 @@ class ActionContract(StrictModel):
     """
 
     controls: Literal["action", "state", "ee_pose"]
-    maps: Literal["[h, d h, r1 h .. r6 h, g h], arms added"]
+    maps: Literal["[h, d h, r1 h .. r6 h, g h], arms added", "none: native control vectors, zero-padded"]
     depth_unit: Literal["m"]
     rotation: Literal["rot6d, end effector in the camera frame"]
     gripper: Literal["0 closed, 1 open"]

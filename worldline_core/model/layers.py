@@ -228,7 +228,7 @@ class TimeEmbedder(nn.Module):
 
 
 def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str], action_maps: Tensor | None) -> None:
-    """Refuse latents that are not those of ``views``, and action maps that do not lie on their grid.
+    """Refuse latents that are not those of ``views``, and action maps that do not lie on their grid (vectors: of 1 x 1).
 
     Raises:
         DataError: a shape does not fit.
@@ -242,7 +242,8 @@ def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str]
         expected = f"(b, {len(views)}, {config.latent_channels}, t, h, w), h and w multiples of {config.patch_size}"
         raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
     if action_maps is not None:
-        wanted = (*latents.shape[:2], config.action_channels, *latents.shape[3:])
+        grid = latents.shape[4:] if config.action_conditioning == "maps" else (1, 1)
+        wanted = (*latents.shape[:2], config.action_channels, latents.shape[3], *grid)
         if action_maps.shape != wanted:
             raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
 

@@ -30,6 +30,7 @@ from worldline_core.model.block_causal_attention import (
     block_bounds,
 )
 from worldline_core.model.contracts import CausalSpec
+from worldline_core.model.film import NativeActionFilm, new_action_branch
 from worldline_core.model.layers import (
     ActionEncoder,
     GenerationAttention,
@@ -67,7 +68,7 @@ class WorldModel(nn.Module):
         self.proj_in = nn.Linear(config.patch_dim, config.hidden_size)
         self.proj_out = nn.Linear(config.hidden_size, config.patch_dim)
         self.time_embedder = TimeEmbedder(config.hidden_size)
-        self.action_encoder = ActionEncoder(config.action_channels, config.patch_size, config.hidden_size)
+        self.action_encoder = new_action_branch(config)
         self.view_embedding = (
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
@@ -131,7 +132,7 @@ class WorldModel(nn.Module):
         latents: Float[Tensor, "b v c t h w"],
         sigma: Tensor,
         *,
-        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        action_maps: Float[Tensor, "b v a t #h #w"] | None = None,
         text: TextContext | None = None,
         views: Sequence[str] = VIEWS,
         fps: Float[Tensor, " b"] | None = None,
@@ -142,7 +143,8 @@ class WorldModel(nn.Module):
         Args:
             latents: noisy latents behind a clean first frame.
             sigma: noise level in [0, 1], ``(b)`` or ``(b t)``; not read on the first frame.
-            action_maps: maps at latent resolution; None runs without the action branch.
+            action_maps: maps at latent resolution, or control vectors ``(b v size t 1 1)`` of a model with
+                ``native_film``; None runs without the action branch.
             text: from :meth:`encode_text`.
             views: names of the views in ``latents``.
             fps: frames per second of each clip as it is shown; None: as the config says.
@@ -159,7 +161,8 @@ class WorldModel(nn.Module):
         clean = torch.zeros(len(latents), frames, dtype=torch.bool, device=latents.device)
         clean[:, 0] = True
         tokens = self._embed(latents, sigma, clean, action_maps, views)
-        tokens, features = self._run(tokens, FullAttention(by, None if text is None else text.mask), text, features_at)
+        attend = FullAttention(by, None if text is None else text.mask)
+        tokens, features = self._run(tokens, attend, action_maps, text, features_at)
         velocity = self._velocity(tokens, latents, sigma, clean, latents[:, :, :, :1])
         if features is not None:
             features = rearrange(features, "b (t v h w) d -> b v t h w d", t=frames, v=len(views), h=rows, w=columns)
@@ -171,7 +174,7 @@ class WorldModel(nn.Module):
         sigma: Tensor | float,
         cache: KVCache,
         *,
-        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        action_maps: Float[Tensor, "b v a t #h #w"] | None = None,
         views: Sequence[str] = VIEWS,
     ) -> Float[Tensor, "b v c t h w"]:
         """Velocity of the block that follows the finished blocks in ``cache``, which stays as it is.
@@ -193,7 +196,7 @@ class WorldModel(nn.Module):
         clean: Float[Tensor, "b v c t h w"],
         cache: KVCache,
         *,
-        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        action_maps: Float[Tensor, "b v a t #h #w"] | None = None,
         views: Sequence[str] = VIEWS,
     ) -> None:
         """Put the keys and values of a finished block into ``cache``: one pass over its clean latents, as conditioning.
@@ -219,7 +222,7 @@ class WorldModel(nn.Module):
         clean: Float[Tensor, "b v c t h w"],
         sigma: Float[Tensor, "b blocks"],
         *,
-        action_maps: Float[Tensor, "b v a t h w"] | None = None,
+        action_maps: Float[Tensor, "b v a t #h #w"] | None = None,
         spec: CausalSpec,
         views: Sequence[str] = VIEWS,
         fps: Float[Tensor, " b"] | None = None,
@@ -254,7 +257,8 @@ class WorldModel(nn.Module):
         per_frame = len(views) * rows * columns
         sizes = tuple((stop - start) * per_frame for start, stop in bounds)
         tokens = self._embed(latents, frame_sigma, is_clean, maps, views)
-        tokens, _ = self._run(tokens, TeacherForcingAttention(by, sizes, spec.sink_blocks, spec.recent_blocks))
+        attend = TeacherForcingAttention(by, sizes, spec.sink_blocks, spec.recent_blocks)
+        tokens, _ = self._run(tokens, attend, maps)
         velocity = self._velocity(tokens, latents, frame_sigma, is_clean, clean[:, :, :, :1])
         return torch.cat((torch.zeros_like(velocity[..., :1, :, :]), velocity[..., history:, :, :]), dim=3)
 
@@ -288,7 +292,7 @@ class WorldModel(nn.Module):
         own, window = (torch.arange(count, device=latents.device) for count in (latents.shape[3], cache.frames))
         by = self._rotation(own + cache.frames, latents, views, cache.fps)
         attend = CachedAttention(by, cache.window, self._rotation(window, latents, views, cache.fps), written)
-        return self._run(self._embed(latents, sigma, clean, action_maps, views), attend)[0]
+        return self._run(self._embed(latents, sigma, clean, action_maps, views), attend, action_maps)[0]
 
     def _embed(
         self, latents: Tensor, sigma: Tensor, clean: Tensor, action_maps: Tensor | None, views: Sequence[str]
@@ -307,7 +311,7 @@ class WorldModel(nn.Module):
             chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
             tokens = tokens + chosen.to(tokens.dtype)
         tokens = rearrange(tokens, "b t n d -> b (t n) d")
-        if action_maps is not None:
+        if action_maps is not None and isinstance(self.action_encoder, ActionEncoder):
             tokens = tokens + self.action_encoder(action_maps.to(self.proj_in.weight.dtype)).to(tokens.dtype)
         return tokens
 
@@ -315,6 +319,7 @@ class WorldModel(nn.Module):
         self,
         tokens: Tensor,
         attend: GenerationAttention,
+        action_maps: Tensor | None,
         text: TextContext | None = None,
         features_at: int | None = None,
     ) -> tuple[Tensor, Tensor | None]:
@@ -323,6 +328,8 @@ class WorldModel(nn.Module):
         features: Tensor | None = None
         for index, layer in enumerate(self._mixture()):
             context = None if text is None else text.layers[index]
+            if action_maps is not None and isinstance(self.action_encoder, NativeActionFilm):
+                tokens = self.action_encoder(tokens, action_maps, index)
             if self.gradient_checkpointing and torch.is_grad_enabled():
                 tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
             else:
@@ -335,15 +342,8 @@ class WorldModel(nn.Module):
         self, tokens: Tensor, latents: Tensor, sigma: Tensor, clean: Tensor, reference: Tensor | None
     ) -> Tensor:
         size = self.config.patch_size
-        emitted = rearrange(
-            self.proj_out(tokens),
-            "b (t v h w) (p q c) -> b v c t (h p) (w q)",
-            v=latents.shape[1],
-            t=latents.shape[3],
-            h=latents.shape[-2] // size,
-            p=size,
-            q=size,
-        )
+        axes = {"v": latents.shape[1], "t": latents.shape[3], "h": latents.shape[-2] // size, "p": size, "q": size}
+        emitted = rearrange(self.proj_out(tokens), "b (t v h w) (p q c) -> b v c t (h p) (w q)", **axes)
         per_frame = sigma[:, None] if sigma.ndim == 1 else sigma
         level = rearrange(per_frame.float(), "b t -> b 1 1 t 1 1")
         velocity = velocity_of(self.config, emitted, latents, level, reference)

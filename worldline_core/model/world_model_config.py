@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 
 VIEWS = ("head", "left_wrist", "right_wrist")
+ActionConditioning = Literal["maps", "native_film"]
 
 
 class WorldModelConfig(StrictModel):
@@ -53,6 +54,10 @@ class WorldModelConfig(StrictModel):
     timestep_scale: float = Field(default=0.1, gt=0)
     """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
     action_channels: int = Field(default=9, ge=1)
+    """Channels of the action maps; with ``native_film`` the size that control vectors are padded to."""
+    # Left out of dumps at its default: checkpoints without it stay the same bytes.
+    action_conditioning: ActionConditioning = Field(default="maps", exclude_if=lambda value: value == "maps")
+    """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
     prediction: Literal["velocity", "sample", "first_frame_residual"] = "velocity"
     """What the head emits. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
     ``first_frame_residual``: the clean latents less those of the clean first frame, so that what stands still is free
@@ -78,6 +83,11 @@ class WorldModelConfig(StrictModel):
         if len(self.views) != len(self.view_offsets) or len(set(self.views)) != len(self.views):
             raise ValueError(f"views {self.views} and view_offsets {self.view_offsets} must pair up, without repeats")
         return self
+
+    @property
+    def native_size(self) -> int | None:
+        """Size of the control vectors that a model with FiLM takes; None for a model of action maps."""
+        return self.action_channels if self.action_conditioning == "native_film" else None
 
     @property
     def patch_dim(self) -> int:

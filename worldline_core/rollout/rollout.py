@@ -196,6 +196,8 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], episodes: EpisodeSe
     )
     world.contract.require(where=inputs["episodes"], fps=float(episodes.rows[0].fps))
     world.contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
+    if world.info.config.native_size is not None:
+        tracks.episodes = episodes
     return world
 
 

@@ -80,7 +80,7 @@ class Noise:
 def rollout_full_clip(
     model: WorldModel,
     first_latents: Float[Tensor, "b v c h w"],
-    action_maps: Float[Tensor, "b v a t h w"] | None,
+    action_maps: Float[Tensor, "b v a t #h #w"] | None,
     *,
     noise: Noise,
     steps: int = FULL_STEPS,
@@ -153,7 +153,7 @@ class BlockCausalSimulator:
         self._unwritten: tuple[Tensor, Tensor | None] | None = None
 
     def start(
-        self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 h w"] | None = None
+        self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 #h #w"] | None = None
     ) -> None:
         """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
         rates = None if self.fps is None else torch.full((len(first_latents),), self.fps, device=first_latents.device)
@@ -161,7 +161,7 @@ class BlockCausalSimulator:
         self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
 
     @torch.no_grad()
-    def step(self, action_maps: Float[Tensor, "b v a t h w"] | None) -> Float[Tensor, "b v c t h w"]:
+    def step(self, action_maps: Float[Tensor, "b v a t #h #w"] | None) -> Float[Tensor, "b v c t h w"]:
         """Predict the next block under these controls.
 
         Raises:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
-from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, collate_tracks
+from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -223,8 +223,8 @@ class WorldLine:
         frames: Sequence[int],
         *,
         without_actions: bool = False,
-    ) -> tuple[Float[Tensor, "b v c h w"], Float[Tensor, "b v 9 t h w"]]:
-        """Latents of the first frames, and the controls' maps at their resolution."""
+    ) -> tuple[Float[Tensor, "b v c h w"], Float[Tensor, "b v a t #h #w"]]:
+        """Latents of the first frames, and the controls' maps at their resolution (or vectors, of a model with FiLM)."""
         flat = rearrange(images, "b v c h w -> (b v) c 1 h w").to(self.device)
         with torch.no_grad():
             first = rearrange(self.tokenizer.encode(flat), "(b v) c 1 h w -> b v c h w", v=len(self.views))
@@ -232,12 +232,17 @@ class WorldLine:
         for track, count in zip(tracks, frames, strict=True):
             index = [min(frame, track.num_frames - 1) for frame in latent_frame_indices(count)]
             cut.append(track.clip(index, wrist_projection=self.contract.wrist_projection, start=0))
-        maps = render_action_maps(
-            collate_tracks(cut, views=self.views),
-            cut[0].image_size,
-            grid_size=(first.shape[-2], first.shape[-1]),
-            sigma_px_ref=self.contract.sigma_px_ref,
-        ).to(self.device)
+        size = self.info.config.native_size
+        maps = (
+            native_vectors(cut, self.views, size).to(self.device)
+            if size is not None
+            else render_action_maps(
+                collate_tracks(cut, views=self.views),
+                cut[0].image_size,
+                grid_size=(first.shape[-2], first.shape[-1]),
+                sigma_px_ref=self.contract.sigma_px_ref,
+            ).to(self.device)
+        )
         return first, torch.zeros_like(maps) if without_actions else maps
 
     def simulator(self, seeds: Sequence[int]) -> BlockCausalSimulator:

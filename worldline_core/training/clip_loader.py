@@ -18,7 +18,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, WristProjection, collate_tracks
+from worldline_core.actions.episode_tracks import (
+    ActionTracks,
+    EpisodeTracks,
+    WristProjection,
+    collate_tracks,
+    native_vectors,
+)
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
@@ -160,7 +166,7 @@ class Batch:
     clips: tuple[Clip, ...]
     views: tuple[str, ...]
     latents: Float[Tensor, "b v c t h w"]
-    action_maps: Float[Tensor, "b v 9 t h w"] | None = None
+    action_maps: Float[Tensor, "b v a t #h #w"] | None = None
     text_ids: Int[Tensor, "b n"] | None = None
     text_mask: Bool[Tensor, "b n"] | None = None
     frames: UInt8[Tensor, "b v frames height width 3"] | None = None
@@ -180,6 +186,7 @@ class ClipLoader:
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
         wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
+        native_size: of the control vectors that are given instead of maps, where the model takes these.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
             rate.
     """
@@ -193,6 +200,7 @@ class ClipLoader:
         text: TextEncoder | None = None,
         frame_rates: Mapping[str, float] | None = None,
         wrist_projection: WristProjection | None = None,
+        native_size: int | None = None,
         device: str = "cpu",
     ) -> None:
         self.store = store
@@ -201,6 +209,7 @@ class ClipLoader:
         self.text = text
         self.frame_rates = frame_rates or {}
         self.wrist_projection: WristProjection | None = wrist_projection
+        self.native_size = native_size
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
 
@@ -245,8 +254,8 @@ class ClipLoader:
             raise ArtifactError("The frame rate of an episode is not known.", where=clip.episode_id)
         return rate / clip.stride
 
-    def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v 9 t h w"]:
-        """Maps at latent resolution: latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""
+    def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"]:
+        """Maps at latent resolution (or vectors): latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""
         if self.tracks is None or self.wrist_projection is None:
             raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
         cut = []
@@ -256,6 +265,8 @@ class ClipLoader:
                 self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
             tracks = self._tracks[clip.episode_id]
             cut.append(tracks.clip(frames, wrist_projection=self.wrist_projection, start=clip.start))
+        if self.native_size is not None:
+            return native_vectors(cut, views, self.native_size).to(self.device)
         tensors = collate_tracks(cut, views=views).to(self.device)
         grid_size = self.store.latent_shape[1:]
         return render_action_maps(tensors, cut[0].image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)

@@ -220,14 +220,21 @@ ClipInput = Annotated[LatentInput | FrameInput, Field(discriminator="kind")]
 
 
 def training_rows(
-    source: ClipSource, episodes: EpisodeSet, *, stage: Literal[1, 2], tracks: ActionTracks | None = None
+    source: ClipSource,
+    episodes: EpisodeSet,
+    *,
+    stage: Literal[1, 2],
+    tracks: ActionTracks | None = None,
+    outcomes: Sequence[str] | None = None,
 ) -> list[ClipRow]:
-    """Rows of the source whose episode is in the set, fit for the stage, and (Stage II) has action tracks.
+    """Rows of the source whose episode is in the set, fit for the stage, ended in one of ``outcomes``, and (Stage II) has
+    action tracks.
 
     Raises:
         DataError: if none is left.
     """
-    allowed = {row.episode_id for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)}
+    fit = [row for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)]
+    allowed = {row.episode_id for row in fit if outcomes is None or row.outcome in outcomes}
     # Episodes encoded by their task-facing view alone are for Stage I, however fit their other views are.
     every_view = set(source.description.get("views", ())) if stage == 2 else set()
     rows = [row for row in source.rows if row.episode_id in allowed and every_view <= set(row.views)]

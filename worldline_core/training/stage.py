@@ -57,6 +57,7 @@ class StageConfig(StrictModel):
 
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
     and encodes them during training.
+    ``outcomes``: only episodes that ended so (``[success]``); None takes all. No outcome reaches the model either way.
     """
 
     trainer: TrainerConfig
@@ -65,6 +66,7 @@ class StageConfig(StrictModel):
     clips: ClipSampling = ClipSampling()
     splits: tuple[str, ...] = ("train",)
     validation_splits: tuple[str, ...] = ("validation",)
+    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1, exclude_if=lambda value: value is None)
     sigma: SigmaSampling = Field(default_factory=SigmaSampling)
     weighting: LossWeighting = Field(default_factory=LossWeighting)
 
@@ -115,7 +117,7 @@ class Stage:
         model.to(device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = _open_source(config, inputs, episodes, model.config.views)
-        rows = training_rows(source, episodes, stage=number, tracks=tracks)
+        rows = training_rows(source, episodes, stage=number, tracks=tracks, outcomes=config.outcomes)
         start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
         return cls(config, title, output, model, start, kind, episodes, source, rows)
 
@@ -146,6 +148,7 @@ class Stage:
             self.source,
             views=self.model.config.views,
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
+            native_size=self.model.config.native_size,
             device=self.config.trainer.device,
             **conditions,
         )

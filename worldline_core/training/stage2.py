@@ -12,9 +12,11 @@ from typing import Any, Literal
 from pydantic import Field
 
 from worldline_core.actions.episode_tracks import ActionTracks, WristProjection
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
-from worldline_core.model.contracts import ActionContract
+from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
+from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract
+from worldline_core.model.film import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherFeatures
@@ -30,6 +32,7 @@ class Stage2Config(StageConfig):
 
     ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
     ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
+    ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
     """
 
     start_from: Literal["stage1", "stage2"] = "stage1"
@@ -37,6 +40,7 @@ class Stage2Config(StageConfig):
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
     wrist_projection: WristProjection = "current_camera"
     relational: RelationalConfig | None = RelationalConfig()
+    native_size: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
 
 
 def stage2_groups(model: WorldModel, action_multiplier: float) -> list[ParameterGroup]:
@@ -59,14 +63,24 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     """
     kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
     parent = Path(inputs["stage1"])
-    tracks = ActionTracks.open(Path(inputs["tracks"]))
+    native = config.native_size is not None
+    tracks = ActionTracks.open(Path(inputs["tracks"]), EpisodeSet.open(Path(inputs["episodes"])) if native else None)
+
+    def load_model() -> tuple[WorldModel, CheckpointInfo]:
+        model, info = load_checkpoint(parent, expect_kind=kinds, towers="generation")
+        if config.native_size is not None and model.config.native_size != config.native_size:
+            film = {"action_conditioning": "native_film", "action_channels": config.native_size}
+            model.config = model.config.model_copy(update=film)
+            model.action_encoder = new_action_branch(model.config)
+        return model, info
+
     stage = Stage.open(
         config,
         inputs,
         output,
         number=2,
         title="stage II",
-        load_model=lambda: load_checkpoint(parent, expect_kind=kinds, towers="generation"),
+        load_model=load_model,
         tracks=tracks,
     )
     model = stage.model
@@ -77,10 +91,11 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
         wrist_projection=config.wrist_projection,
         grid_size=stage.source.latent_shape[1:],
         tokenizer=stage.source.description["tokenizer"],
+        **({"maps": NATIVE_VECTORS} if native else {}),
     )
     learnt = read_checkpoint_info(parent).action_contract
     if learnt is not None:
-        kept = {"sigma_px_ref", "wrist_projection", "tokenizer"}
+        kept = {"maps", "sigma_px_ref", "wrist_projection", "tokenizer"}
         learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
     loader = stage.loader(tracks=tracks, wrist_projection=config.wrist_projection)
     objective = FlowMatchingObjective(

@@ -1,0 +1,86 @@
+"""Native control vectors by FiLM: no effect at the start, one modulation a latent frame, the same in all four passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from worldline_core.errors import DataError
+from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
+from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, CausalSpec
+from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import WorldModelConfig
+
+SIZE = 5
+Build = Callable[..., WorldModel]
+
+
+@pytest.fixture
+def build(make_model: Build) -> Build:
+    return partial(make_model, action_conditioning="native_film", action_channels=SIZE)
+
+
+def sample(frames: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    latents = torch.randn(2, 3, 4, frames, 4, 6, generator=generator)
+    vectors = torch.randn(2, 1, SIZE, frames, 1, 1, generator=generator).expand(2, 3, SIZE, frames, 1, 1)
+    return latents, vectors, torch.rand(2, generator=generator) * 0.8 + 0.1
+
+
+def test_a_new_branch_changes_nothing_and_is_trainable(build: Build) -> None:
+    model, (latents, vectors, sigma) = build(), sample()
+    model.initialise(torch.Generator().manual_seed(0))
+    model.proj_out.weight.data.normal_(generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(
+        model(latents, sigma, action_maps=vectors).velocity, model(latents, sigma).velocity, rtol=0, atol=0
+    )
+    model(latents, sigma, action_maps=vectors).velocity.square().mean().backward()
+    assert all(layer.weight.grad.abs().max() > 0 for layer in model.action_encoder.proj)  # type: ignore[union-attr]
+
+
+def test_every_layer_modulates_the_tokens_of_a_frame_by_its_own_vector(build: Build) -> None:
+    """Written out for one layer: x -> x (1 + s) + b with (s, b) linear in SiLU(linear(vector)), frame by frame."""
+    film = build().action_encoder
+    tokens = torch.randn(2, 3 * 8, 24, generator=torch.Generator().manual_seed(3))
+    _, vectors, _ = sample()
+    found = film(tokens, vectors, 1)
+    for frame in range(3):
+        hidden = torch.nn.functional.silu(vectors[:, 0, :, frame, 0, 0] @ film.hidden.weight.T + film.hidden.bias)
+        out = hidden @ film.proj[1].weight.T + film.proj[1].bias
+        own = slice(frame * 8, (frame + 1) * 8)
+        torch.testing.assert_close(found[:, own], tokens[:, own] * (1 + out[:, None, :24]) + out[:, None, 24:])
+
+
+def test_vectors_matter_in_every_pass_and_the_passes_agree(build: Build, make_spec: Callable[..., CausalSpec]) -> None:
+    model, (latents, vectors, sigma) = build(), sample(frames=5)
+    assert not torch.allclose(
+        model(latents, sigma, action_maps=vectors).velocity, model(latents, sigma, action_maps=vectors * 2).velocity
+    )
+    spec, blocks = make_spec(), torch.stack((sigma, sigma), dim=1)
+    whole = model.forward_teacher_forcing(latents, latents, blocks, action_maps=vectors, spec=spec)
+    cache = spec.new_cache()
+    model.write_block(latents[:, :, :, :1], cache, action_maps=vectors[:, :, :, :1])
+    first = model.forward_block(latents[:, :, :, 1:3], sigma, cache, action_maps=vectors[:, :, :, 1:3])
+    torch.testing.assert_close(first, whole[:, :, :, 1:3], atol=1e-4, rtol=1e-4)
+
+
+def test_maps_are_refused(build: Build) -> None:
+    latents, _, sigma = sample()
+    with pytest.raises(DataError, match=r"(?s)Action maps have the wrong shape.*\(2, 3, 5, 3, 1, 1\)"):
+        build()(latents, sigma, action_maps=torch.zeros(2, 3, 9, 3, 4, 6))
+
+
+def test_it_is_saved_and_left_out_of_descriptions_of_models_with_maps(
+    build: Build, make_contract: Callable[..., ActionContract], tmp_path: Path
+) -> None:
+    save_checkpoint(tmp_path, build(), kind="stage2", action_contract=make_contract(maps=NATIVE_VECTORS))
+    model, info = load_checkpoint(tmp_path)
+    assert info.config.native_size == SIZE
+    assert info.contract.maps == NATIVE_VECTORS
+    latents, vectors, sigma = sample()
+    assert model(latents, sigma, action_maps=vectors).velocity.shape == latents.shape
+    assert "action_conditioning" not in WorldModelConfig.model_validate({}).model_dump()
