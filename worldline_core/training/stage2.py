@@ -19,7 +19,7 @@ from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract
 from worldline_core.model.film import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherFeatures
+from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherRelations
 from worldline_core.training.stage import Stage, StageConfig
 from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
 from worldline_core.training.video_teacher import load_teacher
@@ -125,5 +125,5 @@ def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldMo
             next_step="give the teacher's folder, or set relational to null",
         )
     teacher = load_teacher(Path(inputs["teacher"]), device=config.trainer.device)
-    features = TeacherFeatures(teacher, Path(inputs["episodes"]), cached_clips=config.relational.cached_clips)
-    return RelationalTerm(config.relational, features, model.config.num_layers)
+    taught = TeacherRelations(teacher, Path(inputs["episodes"]), config.relational)
+    return RelationalTerm(config.relational, taught, model.config.num_layers)
