@@ -238,6 +238,21 @@ def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
         train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
 
 
+def test_controls_of_whole_intervals_reach_the_model_from_a_checkpoint_that_knew_none(
+    world: Any, stage1_folder: Path, tmp_path: Path
+) -> None:
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2), inputs, tmp_path / "own")
+    train_stage2(
+        stage2(2, start_from="stage2", action_frames=4), {**inputs, "stage1": tmp_path / "own"}, tmp_path / "all"
+    )
+    model, info = load_checkpoint(tmp_path / "all")
+    assert info.contract.temporal.endswith("takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3")
+    assert bool((model.action_encoder.proj.weight[:, model.action_encoder.proj.in_features // 4 :] != 0).any())
+    with pytest.raises(CheckpointError, match=r"(?s)takes the controls of more frames.*action_frames 4"):
+        train_stage2(stage2(2, start_from="stage2"), {**inputs, "stage1": tmp_path / "all"}, tmp_path / "back")
+
+
 def test_wrong_checkpoint_and_missing_teacher_are_named(
     world: Any,
     model_config: MakeConfig,

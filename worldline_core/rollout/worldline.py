@@ -14,7 +14,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
+from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -230,7 +230,9 @@ class WorldLine:
             first = rearrange(self.tokenizer.encode(flat), "(b v) c 1 h w -> b v c h w", v=len(self.views))
         cut = []
         for track, count in zip(tracks, frames, strict=True):
-            index = [min(frame, track.num_frames - 1) for frame in latent_frame_indices(count)]
+            index = [
+                min(frame, track.num_frames - 1) for frame in control_frames(count, self.info.config.action_frames)
+            ]
             cut.append(track.clip(index, wrist_projection=self.contract.wrist_projection, start=0))
         size = self.info.config.native_size
         maps = (
@@ -243,6 +245,7 @@ class WorldLine:
                 sigma_px_ref=self.contract.sigma_px_ref,
             ).to(self.device)
         )
+        maps = stack_controls(maps, self.info.config.action_frames)
         return first, torch.zeros_like(maps) if without_actions else maps
 
     def simulator(self, seeds: Sequence[int]) -> BlockCausalSimulator:
