@@ -32,7 +32,9 @@ from worldline_core.distillation.trajectory_store import (
     TrajectoryStore,
     write_trajectories,
 )
+from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.contracts import TrainedClips
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
@@ -105,6 +107,13 @@ class DistillationRun:
         store, episodes = LatentStore.open(Path(inputs["latents"])), EpisodeSet.open(Path(inputs["episodes"]))
         tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
         contract = info.contract
+        if not set(config.views) <= set(info.views):
+            raise CheckpointError(
+                "A causal model is distilled in views that its Stage II model was trained on",
+                where=f"{inputs['stage2']}: distill.views",
+                expected=info.views,
+                got=config.views,
+            )
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=inputs["latents"], **found)
         contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
@@ -113,7 +122,6 @@ class DistillationRun:
             views=tuple(config.views),
             tracks=tracks,
             wrist_projection=contract.wrist_projection,
-            action_frames=info.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in episodes.rows},
             native_size=native,
             device=device,
@@ -223,6 +231,12 @@ class DistillationRun:
         )
         return loader.load
 
+    def _trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
+        """What the clips show of the model's view slots; None: all, at stride 1."""
+        views = tuple(view for view in slots if view in self.config.views)
+        found = TrainedClips(views=views, strides=tuple(sorted(set(self.config.clips.strides))))
+        return None if found == TrainedClips(views=slots, strides=(1,)) else found
+
     def _train[BatchT: Batch](
         self,
         step: str,
@@ -264,6 +278,7 @@ class DistillationRun:
                 kind="causal",
                 action_contract=self.stage2_info.contract,
                 causal=self.config.spec,
+                trained=self._trained(model.config.views),
                 metadata={
                     "distillation": step,
                     "step": trainer.steps,

@@ -133,6 +133,11 @@ class DistillConfig(StrictModel):
                 "clips.view_weights: distillation clips hold all views; set teacher_forcing.view_weights for the first "
                 "step alone"
             )
+        if self.clips.optional_views:
+            raise ValueError(
+                "clips.optional_views: trajectories hold the same views in every clip; name in `views` those that all "
+                "episodes have"
+            )
         span = TEMPORAL_FACTOR * self.block_size
         odd = [length for length in self.clips.lengths if length <= span or (length - 1) % span]
         if odd:

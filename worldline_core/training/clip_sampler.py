@@ -1,18 +1,13 @@
 """Which clips a step trains on: a pure function of (seed, step, rank), so that a run needs no other state to continue.
 
-Two orders. "weighted" draws clips without end by weights. "epochs" takes every clip once per epoch: clips are numbered
-within their kind (length and stride), and the numbers of an epoch pass through a keyed permutation, so that a corpus of
-10^8 clips needs no table. Batches hold clips of one kind and are always full: what does not fill a batch at the end of
-an epoch (for each kind, fewer clips than a batch has) goes into the next epoch's. Nothing is lost, and no clip comes more
-often than there are epochs.
+Two orders. "weighted" draws clips without end by weights; "epochs" takes every clip once per epoch (`epoch_order.py`).
+Batches hold clips of one kind: one length, one stride, one set of views.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -21,88 +16,12 @@ from pydantic import BeforeValidator, Field, model_validator
 from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.contracts import TrainedClips
 from worldline_core.training.clip_source import Clip, ClipBatch, ClipRow, ClipSource, longest_clip
+from worldline_core.training.epoch_order import EpochOrder
 
 JOINT = "joint"
 """In place of a view's name: all views of the model together."""
-
-_ROUNDS = 6
-_MASK = (1 << 64) - 1
-
-
-def permuted(position: int, count: int, key: int) -> int:
-    """Image of ``position`` under a pseudo-random permutation of 0..count-1 chosen by ``key``.
-
-    A Feistel network over the next even number of bits, walked until it falls below ``count`` (cycle walking; Black and
-    Rogaway 2002, "Ciphers with arbitrary finite domains").
-    """
-    if count <= 1:
-        return position
-    half = max(1, ((count - 1).bit_length() + 1) // 2)
-    low = (1 << half) - 1
-    while True:
-        left, right = position >> half, position & low
-        for turn in range(_ROUNDS):
-            left, right = right, left ^ (_mixed(right + (turn << 32) + key) & low)
-        position = (left << half) | right
-        if position < count:
-            return position
-
-
-def _mixed(value: int) -> int:
-    """The finaliser of splitmix64 (Steele, Lea and Flood 2014)."""
-    value = (value + 0x9E3779B97F4A7C15) & _MASK
-    value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-    value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) & _MASK
-    return value ^ (value >> 31)
-
-
-def mixed_key(*parts: int) -> int:
-    """One 64-bit key of several numbers."""
-    key = 0
-    for part in parts:
-        key = _mixed(key ^ _mixed(part))
-    return key
-
-
-class EpochOrder:
-    """Batches of clip numbers in which every clip comes once per epoch.
-
-    Args:
-        counts: number of clips of each kind.
-        batch: clips per batch, all processes together.
-    """
-
-    def __init__(self, counts: Sequence[int], batch: int, seed: int) -> None:
-        self.counts = list(counts)
-        self.batch = batch
-        self.seed = seed
-
-    def batches_before(self, epoch: int) -> int:
-        """Batches of all epochs before ``epoch``."""
-        return sum(epoch * count // self.batch for count in self.counts)
-
-    def epoch(self, index: int) -> int:
-        """The epoch that batch ``index`` belongs to."""
-        # An epoch lacks, for each kind, at most what does not fill a batch.
-        most = (index + 1 + len(self.counts)) * self.batch // sum(self.counts) + 1
-        return bisect_right(range(most + 1), index, key=self.batches_before) - 1
-
-    def locate(self, index: int) -> tuple[int, list[int]]:
-        """(kind, numbers of the batch's clips within the kind) of batch ``index``."""
-        epoch = self.epoch(index)
-        firsts = [epoch * count // self.batch for count in self.counts]
-        sizes = [(epoch + 1) * count // self.batch - first for count, first in zip(self.counts, firsts, strict=True)]
-        before = self.batches_before(epoch)
-        place = permuted(index - before, sum(sizes), mixed_key(self.seed, epoch))
-        ends = list(accumulate(sizes))
-        kind = bisect_right(ends, place)
-        number = firsts[kind] + place - (ends[kind] - sizes[kind])
-        return kind, [self._clip(kind, item) for item in range(number * self.batch, (number + 1) * self.batch)]
-
-    def _clip(self, kind: int, item: int) -> int:
-        epoch, position = divmod(item, self.counts[kind])
-        return permuted(position, self.counts[kind], mixed_key(self.seed, epoch, kind + 1))
 
 
 def _lengths(value: Any) -> Any:
@@ -132,6 +51,8 @@ class ClipSampling(StrictModel):
     ``order``: "weighted" draws without end by the weights; "epochs" takes every clip (each length and stride at every
     ``hop``-th frame of every episode) once per epoch, and allows no weights of lengths and sources.
     ``hop``: frames between the starts of neighbouring clips of an epoch (default: the smallest that the source has).
+    ``optional_views``: views that an episode may lack. A batch holds clips that have the same of them, so that nothing is
+    padded and a clip is trained as it would be alone.
     """
 
     lengths: Annotated[tuple[int, ...], BeforeValidator(_lengths)] = Field(default=(33,), min_length=1)
@@ -143,6 +64,7 @@ class ClipSampling(StrictModel):
     # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
     order: Literal["weighted", "epochs"] = Field(default="weighted", exclude_if=lambda value: value == "weighted")
     hop: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+    optional_views: tuple[str, ...] = Field(default=(), exclude_if=lambda value: not value)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -161,13 +83,25 @@ class ClipSampling(StrictModel):
             )
         return self
 
+    def needed_views(self, views: Sequence[str]) -> tuple[str, ...]:
+        """Views, of a model's, that every episode must have."""
+        drawn = (
+            None if self.view_weights is None else {name for name, weight in self.view_weights.items() if weight > 0}
+        )
+        shown = [view for view in views if drawn is None or JOINT in drawn or view in drawn]
+        return tuple(view for view in shown if view not in self.optional_views)
+
 
 @dataclass
 class _Kind:
-    """Clips of one length and stride. ``cumulative``: the rows' weights (in epochs: numbers of clips), added up."""
+    """Clips of one length and stride, of episodes that lack the same optional views (``absent``).
+
+    ``cumulative``: the rows' weights (in epochs: numbers of clips), added up.
+    """
 
     length: int
     stride: int
+    absent: tuple[str, ...]
     rows: list[ClipRow]
     cumulative: np.ndarray
 
@@ -227,10 +161,15 @@ class ClipSampler:
         for length, weight in zip(config.lengths, weights, strict=True):
             for stride in config.strides:
                 fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
-                row_weights = [config.source_weights.get(row.source, 1.0) for row in fitting]
-                if weight > 0 and sum(row_weights) > 0:
-                    self._kinds.append(_Kind(length, stride, fitting, np.cumsum(_normalised(row_weights))))
-                    kind_weights.append(weight)
+                total = sum(config.source_weights.get(row.source, 1.0) for row in fitting)
+                lacking = [tuple(view for view in config.optional_views if view not in row.views) for row in fitting]
+                for absent in sorted(set(lacking)):
+                    rows_of = [row for row, missing in zip(fitting, lacking, strict=True) if missing == absent]
+                    row_weights = [config.source_weights.get(row.source, 1.0) for row in rows_of]
+                    if weight > 0 and sum(row_weights) > 0:
+                        cumulative = np.cumsum(_normalised(row_weights))
+                        self._kinds.append(_Kind(length, stride, absent, rows_of, cumulative))
+                        kind_weights.append(weight * (sum(row_weights) / total))
         if not self._kinds:
             longest = max((row.num_frames for row in candidates), default=0)
             raise DataError(
@@ -252,24 +191,36 @@ class ClipSampler:
         """The clips of micro-step ``index`` (of this rank)."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         number = int(random.choice(len(self._kinds), p=self._kind_weights))
-        view = None
-        if self._view_names:
-            name = self._view_names[int(random.choice(len(self._view_names), p=self._view_weights))]
-            view = None if name == JOINT else name
+        places: list[int] = []
         if self._epochs is not None:
             number, places = self._epochs.locate(index)
+        kind, view = self._kinds[number], None
+        if self._view_names:
+            weights = self._weights_of_views(kind)
+            name = self._view_names[int(random.choice(len(self._view_names), p=weights))]
+            view = None if name == JOINT else name
+        if self._epochs is not None:
             mine = places[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
-            return ClipBatch(tuple(self._numbered(self._kinds[number], place) for place in mine), view)
+            return ClipBatch(tuple(self._numbered(kind, place) for place in mine), view, kind.absent)
         size = self.batch_size * (1 if view is None else self.single_view_factor)
-        return ClipBatch(self._drawn(random, self._kinds[number], size), view)
+        return ClipBatch(self._drawn(random, kind, size), view, kind.absent)
+
+    def _weights_of_views(self, kind: _Kind) -> np.ndarray:
+        """Weights of what a step of this kind trains on: of views that its episodes lack, none."""
+        if not kind.absent:
+            return self._view_weights
+        present = [name not in kind.absent for name in self._view_names]
+        return _normalised([w * there for w, there in zip(self._view_weights, present, strict=True)])
 
     def replacement(self, index: int, place: int, attempt: int) -> Clip:
-        """Another clip of the length and stride of micro-step ``index``, for its unreadable clip at ``place``.
+        """Another clip of the length, stride and views of micro-step ``index``, for its unreadable clip at ``place``.
 
         Drawn at random (by the weights; in epochs by the number of clips), from a stream of its own.
         """
-        first = self.clips(index).clips[place]
-        number = [(kind.length, kind.stride) for kind in self._kinds].index((first.num_frames, first.stride))
+        batch = self.clips(index)
+        first = batch.clips[place]
+        kinds = [(kind.length, kind.stride, kind.absent) for kind in self._kinds]
+        number = kinds.index((first.num_frames, first.stride, batch.absent))
         counter = [0, 0, 1 + attempt, 1 + place]
         random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
         if self._epochs is not None:
@@ -291,6 +242,16 @@ class ClipSampler:
     def longest(self) -> int:
         """Frames of the longest clip that is drawn."""
         return max(kind.length for kind in self._kinds)
+
+    def trained(self, views: tuple[str, ...]) -> TrainedClips | None:
+        """What the clips show of a model's view slots, and at which strides; None: all of them, at stride 1."""
+        batches = [ClipBatch((), view, kind.absent) for kind in self._kinds for view, _ in self.batch_kinds]
+        shown = {slot for batch in batches for slot in batch.slots(views)}
+        found = TrainedClips(
+            views=tuple(view for view in views if view in shown),
+            strides=tuple(sorted({kind.stride for kind in self._kinds})),
+        )
+        return None if found == TrainedClips(views=views, strides=(1,)) else found
 
     @property
     def batch_kinds(self) -> list[tuple[str | None, int]]:

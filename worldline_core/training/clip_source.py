@@ -54,15 +54,19 @@ class Clip:
 
 @dataclass(frozen=True)
 class ClipBatch:
-    """Clips of equal length that share their views. ``view`` is None for all views, else one view or "primary"."""
+    """Clips of equal length that share their views.
+
+    ``view`` is None for all views but the ``absent`` ones (which no clip of the batch has), else one view or "primary".
+    """
 
     clips: tuple[Clip, ...]
     view: str | None
+    absent: tuple[str, ...] = ()
 
     def slots(self, views: tuple[str, ...]) -> tuple[str, ...]:
         """The model's view slots, of ``views``, that the clips fill: the task-facing view always takes the first."""
         if self.view is None:
-            return views
+            return tuple(view for view in views if view not in self.absent)
         return (views[0],) if self.view == PRIMARY else (self.view,)
 
 
@@ -226,17 +230,26 @@ def training_rows(
     stage: Literal[1, 2],
     tracks: ActionTracks | None = None,
     outcomes: Sequence[str] | None = None,
+    views: Sequence[str] | None = None,
 ) -> list[ClipRow]:
     """Rows of the source whose episode is in the set, fit for the stage, ended in one of ``outcomes``, and (Stage II) has
     action tracks.
 
+    Args:
+        views: those that an episode needs for Stage II; None: all of the source's.
+
     Raises:
         DataError: if none is left.
     """
-    fit = [row for row in episodes.rows if (row.stage1_ok if stage == 1 else row.stage2_ok)]
+
+    def fit_for_stage2(row: EpisodeRow) -> bool:
+        # Where it is said which views are needed, that another one is missing makes no episode unfit.
+        return row.stage2_ok or (views is not None and row.stage2_reason == "missing_view")
+
+    fit = [row for row in episodes.rows if (row.stage1_ok if stage == 1 else fit_for_stage2(row))]
     allowed = {row.episode_id for row in fit if outcomes is None or row.outcome in outcomes}
     # Episodes encoded by their task-facing view alone are for Stage I, however fit their other views are.
-    every_view = set(source.description.get("views", ())) if stage == 2 else set()
+    every_view = set(source.description.get("views", ()) if views is None else views) if stage == 2 else set()
     rows = [row for row in source.rows if row.episode_id in allowed and every_view <= set(row.views)]
     fitting = [row for row in rows if tracks is None or row.episode_id in tracks]
     if len(fitting) < len(rows):

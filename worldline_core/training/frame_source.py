@@ -70,7 +70,8 @@ class FrameSource(ClipSource):
         primary_alone: bool,
         device: str,
     ) -> FrameSource:
-        """A source over the episodes that have all ``views``, or (``primary_alone``) their task-facing one.
+        """A source over the episodes that have all ``views`` (and perhaps others), or (``primary_alone``) their
+        task-facing one.
 
         Raises:
             CheckpointError: the folder holds no tokenizer.
@@ -162,7 +163,7 @@ class FrameSource(ClipSource):
 
 
 def frame_rows(episodes: EpisodeSet, views: Sequence[str], *, primary_alone: bool) -> list[ClipRow]:
-    """Rows of the episodes that have all ``views``, or (``primary_alone``) at least their task-facing one.
+    """Rows of the episodes that have all ``views`` (and perhaps others), or (``primary_alone``) their task-facing one.
 
     Raises:
         DataError: there is none.

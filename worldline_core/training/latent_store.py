@@ -194,12 +194,15 @@ class EncodeLatentsConfig(StrictModel):
     ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
     ``primary_alone``: also encode, by their task-facing view alone, episodes that lack some of ``views``: Stage I takes
     them (plain videos have one view), Stage II does not.
+    ``optional_views``: of ``views``, those that an episode may lack: its others are encoded.
     ``layout``: "auto" compares both layouts on the first episode and takes ``groups`` only where it is exact.
     """
 
     splits: tuple[str, ...] | None = None
     views: tuple[str, ...] = ("head", "left_wrist", "right_wrist")
     primary_alone: bool = False
+    # Left out of dumps at its default: latents made before it existed keep their key in the store.
+    optional_views: tuple[str, ...] = Field(default=(), exclude_if=lambda value: not value)
     image_size: tuple[int, int] = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
@@ -341,9 +344,9 @@ def encode_latents(config: EncodeLatentsConfig, inputs: Mapping[str, Path], outp
 
 
 def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:
-    """Which views of an episode are encoded: all that are wanted, the task-facing one alone, or none."""
-    if all(view in row.views for view in config.views):
-        return tuple(config.views)
+    """Which views of an episode are encoded: all that are wanted and there, the task-facing one alone, or none."""
+    if all(view in row.views for view in config.views if view not in config.optional_views):
+        return tuple(view for view in config.views if view in row.views)
     return (row.primary_view,) if config.primary_alone and row.stage1_ok and row.primary_view in row.views else ()
 
 

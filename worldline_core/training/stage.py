@@ -117,7 +117,9 @@ class Stage:
         model.to(device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = _open_source(config, inputs, episodes, model.config.views)
-        rows = training_rows(source, episodes, stage=number, tracks=tracks, outcomes=config.outcomes)
+        needed = config.clips.needed_views(model.config.views)
+        views = None if needed == model.config.views else needed
+        rows = training_rows(source, episodes, stage=number, tracks=tracks, outcomes=config.outcomes, views=views)
         start, kind = ("scratch", None) if parent is None else (parent.weights_sha256, parent.kind)
         return cls(config, title, output, model, start, kind, episodes, source, rows)
 
@@ -147,7 +149,6 @@ class Stage:
         return ClipLoader(
             self.source,
             views=self.model.config.views,
-            action_frames=self.model.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
             native_size=self.model.config.native_size,
             device=self.config.trainer.device,
@@ -217,6 +218,7 @@ class Stage:
                 self.model,
                 kind=kind,
                 action_contract=action_contract,
+                trained=self.sampler.trained(self.model.config.views) if kind == "stage2" else None,
                 metadata={
                     "step": trainer.steps,
                     "seed": trainer.seed,
@@ -310,7 +312,7 @@ def _open_source(
         episodes,
         Path(inputs["tokenizer"]),
         config.input,
-        views=views,
+        views=config.clips.needed_views(views),
         primary_alone=set(config.clips.view_weights or {}) == {PRIMARY},
         device=config.trainer.device,
     )
