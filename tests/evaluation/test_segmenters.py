@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,6 +130,22 @@ def test_training_needs_masks(training, tmp_path, monkeypatch):
         train_segmenter(CONFIG, {"episodes": training}, tmp_path)
 
 
+def in_pieces(segmenter: Any, video: np.ndarray, points: np.ndarray) -> np.ndarray:
+    stream = segmenter.stream()
+    return np.concatenate([stream(video[part], points[part]) for part in (slice(2), slice(2, 3), slice(3, None))])
+
+
+def test_videos_are_masked_piece_by_piece_as_at_once(film, training):
+    frames, _, points = film(True, seed=1)
+    learned = LearnedSegmenter(UNet())
+    for segmenter in (ColourSegmenter(), learned):
+        whole = segmenter.segment(frames["head"], points)
+        # Between the pieces of one video others are masked.
+        other = segmenter.stream()
+        other(frames["head"][::-1], points[::-1])
+        assert np.array_equal(in_pieces(segmenter, frames["head"], points), whole)
+
+
 @pytest.mark.slow
 def test_sam3_classes_at_small_random_size(tmp_path):
     """The real tracker and processor classes, random weights: shapes, prompts, loading."""
@@ -177,6 +194,7 @@ def test_sam3_classes_at_small_random_size(tmp_path):
     assert (one.shape, one.dtype) == ((4, 64, 96), bool)
     points[0, 1] = (200, 30)  # outside of the frame: ignored
     assert np.array_equal(segmenter.segment(video, points), one)
+    assert np.array_equal(in_pieces(segmenter, video, points), one)
     segmenter.model.save_pretrained(tmp_path)
     processor.save_pretrained(tmp_path)
     assert np.array_equal(Sam3Segmenter.load(tmp_path).segment(video, points), one)

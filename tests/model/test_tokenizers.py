@@ -238,6 +238,21 @@ def test_wan_latents_are_the_normalised_mode(wan_folder: Path) -> None:
     torch.testing.assert_close(tokenizer.decode(latents), tokenizer.vae.decode(mode).sample, rtol=1e-4, atol=1e-4)
 
 
+@torch.no_grad()
+def test_latents_are_decoded_as_they_arrive(fitted: PatchTokenizer, wan_folder: Path) -> None:
+    """In pieces of 1, 1 and 2 latent frames: the frames of the whole clip's decoding, also after another clip."""
+    for tokenizer, exact in ((fitted, True), (load_tokenizer(wan_folder), False)):
+        video = scenes(count=2, frames=13)
+        latents = tokenizer.encode(video)
+        whole = tokenizer.decode(latents, video[:, :, 0])
+        for _ in range(2):
+            decode = tokenizer.decoder(video[:, :, 0])
+            pieces = [decode(piece) for piece in latents.split([1, 1, 2], dim=2)]
+            assert [piece.shape[2] for piece in pieces] == [1, 4, 8]
+            found = torch.cat(pieces, dim=2)
+            torch.testing.assert_close(found, whole, rtol=0, atol=1e-6 if exact else 1e-4)
+
+
 def test_a_missing_or_damaged_wan_folder_is_named(wan_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(UnavailableError, match="Wan autoencoder is not here"):
         WanTokenizer.load(tmp_path)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,104 +11,17 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
-from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
-from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from tests.rollout.conftest import NAMES, SIZE, SPEC, N, digests, recorded
+from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import CAUSAL_SIGMAS, NATIVE_VECTORS, CausalSpec
-from worldline_core.model.film import new_action_branch
-from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.rollout.rollout import RolloutConfig, rollout, shuffled_partners
+from worldline_core.rollout.predictions import shuffled_partners
+from worldline_core.rollout.rollout import rollout
+from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.artifact_files import digest_folder
-
-SIZE = (32, 48)
-SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)
-N = 33
-NAMES = {"a-0": "ur5e_pair", "a-1": "ur5e_pair", "b/0 x": "aloha_viperx", "b-1": "aloha_viperx", "b-2": "aloha_viperx"}
-
-
-def recorded(seed: int) -> np.ndarray:
-    generator = np.random.default_rng(seed)
-    frames = np.repeat(generator.integers(60, 190, (1, 4, 6, 3)).repeat(8, 1).repeat(8, 2), N, axis=0)
-    for frame in range(N):
-        frames[frame, 8:20, frame : frame + 10] = (220, 40, 40)
-    return frames.astype(np.uint8)
-
-
-def track(name: str, shift: float) -> EpisodeTracks:
-    shape = (N, 3, 2)
-    uv = np.zeros((*shape, 2), np.float32)
-    uv[..., 0] = np.linspace(5, 40, N)[:, None, None] + shift
-    uv[..., 1] = 14
-    eye = np.tile(np.eye(4, dtype=np.float32), (N, 3, 1, 1))
-    return EpisodeTracks(
-        episode_id=name, embodiment=NAMES[name], views=VIEWS, arms=("left", "right"), image_size=SIZE, controls="action",
-        camera_motion=("static", "kinematics", "kinematics"), uv=uv, depth=np.ones(shape, np.float32),
-        rot6d=np.ones((*shape, 6), np.float32), gripper=np.ones(shape, np.float32), valid=np.ones(shape, bool),
-        T_base_tool=eye[:, :2], T_base_camera=eye, K=np.tile(np.eye(3, dtype=np.float32), (3, 1, 1)),
-        capsules=np.zeros((N, 1, 2, 3), np.float32), capsule_radii=np.ones(1, np.float32),
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, make_spec: Callable) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("rollout")
-    K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
-    with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
-        for seed, (name, embodiment) in enumerate(NAMES.items()):
-            joints = np.linspace(np.zeros(14), np.full(14, seed), N, dtype=np.float32)
-            episode = Episode(
-                episode_id=name, source="synthetic", embodiment=embodiment, scene="s", task_family="lift", instruction="lift",
-                outcome="unknown", split="test" if seed else "train", fps=8.0, state=joints, action=joints,
-                timestamps=np.arange(N) / 8.0,
-                cameras={view: CameraTrack(view, K, np.eye(4)[None], SIZE[1], SIZE[0]) for view in VIEWS},
-            )  # fmt: skip
-            writer.add(episode, {view: recorded(seed) for view in VIEWS})
-    shard = write_shard(root / "tracks", 0, [track(n, s) for s, n in enumerate(NAMES)])
-    write_index(root / "tracks", shard, sigma_px_ref=40.0)
-    torch.manual_seed(0)
-    video = torch.from_numpy(np.stack([recorded(s) for s in range(4)])).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
-    tokenizer = fit_patch_tokenizer([video], channels=8, refinement_width=4, refinement_depth=1)
-    tokenizer.save(root / "tokenizer")
-    config = WorldModelConfig(
-        latent_channels=8, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=12, intermediate_size=32,
-        rope_sections=(2, 2, 2), towers="generation",
-    )  # fmt: skip
-    generator = torch.Generator().manual_seed(0)
-    model = WorldModel(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.2)
-    contract = make_contract(grid_size=(4, 6), tokenizer=tokenizer.encoder_digest[:16])
-    save_checkpoint(root / "stage2", model, kind="stage2", action_contract=contract)
-    save_checkpoint(root / "causal", model, kind="causal", action_contract=contract, causal=SPEC)
-    small = make_spec(recent_blocks=1, sigmas=(1.0, 0.5, 0.0))
-    save_checkpoint(root / "small_blocks", model, kind="causal", action_contract=contract, causal=small)
-    film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
-    contract = contract.model_copy(update={"maps": NATIVE_VECTORS})
-    model.config, model.action_encoder = film, new_action_branch(film)
-    torch.nn.init.normal_(model.action_encoder.proj[0].weight, generator=generator)
-    save_checkpoint(root / "film", model, kind="stage2", action_contract=contract)
-    return {
-        "episodes": root / "episodes",
-        "tracks": root / "tracks",
-        "tokenizer": root / "tokenizer",
-        "checkpoint": root / "causal",
-    }
-
-
-def digests(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file() and "run" not in path.relative_to(root).parts
-    }
-
 
 CONFIG = RolloutConfig(method="causal", batch_size=2, seeds=(42, 43))
 

@@ -16,8 +16,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.rollout.rollout import RolloutConfig, rollout
+from worldline_core.rollout.rollout import rollout
+from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 FRAMES = 17
@@ -98,16 +98,6 @@ def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLi
     assert not np.array_equal(first, predict(still))
 
 
-def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them_as_before(
-    observed: Observation, causal: WorldLine, models: Path
-) -> None:
-    model, info = load_checkpoint(models / "causal", action_frames=4)
-    world = WorldLine(model, info.model_copy(update={"config": model.config}), causal.tokenizer)
-    given = (observed.images, observed.controls, observed.cameras)
-    before, after = (simulator.predict(*given, embodiment="ur5e_silver") for simulator in (causal, world))
-    assert all(np.abs(before[view].astype(int) - after[view]).max() <= 2 for view in before)
-
-
 def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:
     """Tools and wrist cameras of the same motion, given instead of the joints: the same maps, so the same video."""
     tracks, _ = compute_tracks(observed.episode, ArmKinematics(load_embodiment("ur5e_silver")))
@@ -144,8 +134,8 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
 
     refused("driven by controls of an embodiment, or by tool poses", embodiment=None)
     refused(r"(?s)1 \+ k \* 16 rows.*got: 16", controls=observed.controls[:16])
-    refused("images are not those of the model's views", images={"head": observed.images["head"]})
-    refused("cameras are not those of the model's views", cameras={})
+    refused("images are not those of the model's views", images={"left_wrist": observed.images["left_wrist"]})
+    refused("cameras are not those of the images", cameras={})
     refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
     refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(np.eye(3))})
     refused("camera pose has a wrong shape", cameras=observed.cameras | {"head": Camera(np.eye(3), np.eye(3))})

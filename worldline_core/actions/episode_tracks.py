@@ -300,6 +300,13 @@ class ActionTracks:
     def __len__(self) -> int:
         return len(self._rows)
 
+    def calibrated_views(self, episode_id: str) -> tuple[str, ...]:
+        """Views of an episode whose camera is known."""
+        row = self._rows[episode_id]
+        return tuple(
+            view for view, motion in zip(row["views"], row["camera_motion"], strict=True) if motion != "absent"
+        )
+
     def __contains__(self, episode_id: str) -> bool:
         return episode_id in self._rows
 

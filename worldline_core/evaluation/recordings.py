@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.frame_decoder import decode_frames
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -20,17 +23,56 @@ TRUE_METHOD = "true"
 HEAD = "head"
 
 
+class Pictures(Protocol):
+    """Frames of a video, uint8 (n, h, w, 3): an array, or a `VideoFrames`."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, indices: list[int]) -> np.ndarray: ...
+
+
+class VideoFrames:
+    """Frames of an encoded video, decoded when they are asked for.
+
+    Args:
+        stride: every how many-th frame of the file is one of these.
+    """
+
+    def __init__(self, clip: VideoClip, stride: int = 1) -> None:
+        self._clip = clip
+        self._stride = stride
+
+    def __len__(self) -> int:
+        return 1 + (self._clip.num_frames - 1) // self._stride
+
+    def __getitem__(self, indices: list[int]) -> np.ndarray:
+        """uint8 (len, h, w, 3) of these frames."""
+        return decode_frames(self._clip, [self._stride * index for index in indices])
+
+    def pieces(self, size: int) -> Iterator[np.ndarray]:
+        """All frames in order, ``size`` (in the end fewer) at a time."""
+        wanted: list[np.ndarray] = []
+        for number, picture in enumerate(read_clip(self._clip)):
+            if number % self._stride == 0:
+                wanted.append(picture.rgb)
+            if len(wanted) == size:
+                yield np.stack(wanted)
+                wanted = []
+        if wanted:
+            yield np.stack(wanted)
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """One recorded or predicted video, as judges and selectors are given it; nothing in it tells the recorded outcome.
 
     Attributes:
-        frames: by view, uint8 (n, h, w, 3); the views are synchronised.
+        frames: by view; the views are synchronised. Only the frames that are asked for are decoded.
         points: (num_frames, arms, 2) projected tool centres in the head view [px], NaN where not valid; or None.
     """
 
     instruction: str
-    frames: Mapping[str, np.ndarray]
+    frames: Mapping[str, Pictures]
     fps: float
     points: np.ndarray | None = None
 
@@ -57,16 +99,20 @@ def rows_of(episodes: EpisodeSet, episode_ids: Iterable[str]) -> list[EpisodeRow
     return [rows[name] for name in wanted]
 
 
-def leading(values: np.ndarray, count: int, where: str) -> np.ndarray:
-    """The first ``count`` recorded frames or masks.
+def stride_of(rollout: RolloutSet, row: EpisodeRow) -> int:
+    """Recorded frames from one frame of a prediction to the next.
 
-    Raises: DataError when fewer were recorded.
+    Raises: DataError where the rate of the predictions is no whole part of the recording's.
     """
-    if len(values) < count:
+    stride = round(row.fps / rollout.fps)
+    if stride < 1 or abs(stride * rollout.fps - row.fps) > 1e-3 * row.fps:
         raise DataError(
-            "A prediction is longer than its recording", where=where, expected=f"<= {len(values)}", got=count
+            "Predictions have another frame rate than their recording",
+            where=f"{rollout.root}, episode {row.episode_id}",
+            expected=f"{row.fps:g} frames per second, or a whole part of it",
+            got=rollout.fps,
         )
-    return values[:count]
+    return stride
 
 
 def trajectory_of(
@@ -78,24 +124,32 @@ def trajectory_of(
     seed: int,
     tracks: ActionTracks | None,
 ) -> Trajectory:
-    """The recorded video of an episode in those of ``views`` that it has, or its prediction in ``rollout``."""
-    position = episodes.position(row.episode_id)
+    """The recorded video of an episode in those of ``views`` that it has, or its prediction in ``rollout``.
+
+    Raises: DataError when it has none of them.
+    """
+    position, name = episodes.position(row.episode_id), row.episode_id
+    present = row.views if rollout is None else rollout.views(name)
+    stride = 1 if rollout is None else stride_of(rollout, row)
     frames = {
-        view: episodes.frames(position, view) if rollout is None else rollout.frames(row.episode_id, view, seed)
+        view: VideoFrames(episodes.clip(position, view) if rollout is None else rollout.clip(name, view, seed))
         for view in views
-        if view in row.views
+        if view in row.views and view in present
     }
+    if not frames:
+        raise DataError("A video has none of the views that are judged", where=name, expected=views, got=present)
     count = min(len(video) for video in frames.values())
-    points = None if tracks is None else tool_points(tracks, row.episode_id, count)
-    return Trajectory(row.instruction, frames, row.fps, points)
+    points = None if tracks is None else tool_points(tracks, name, count, stride)
+    return Trajectory(row.instruction, frames, row.fps / stride, points)
 
 
-def tool_points(tracks: ActionTracks, episode_id: str, num_frames: int) -> np.ndarray:
+def tool_points(tracks: ActionTracks, episode_id: str, num_frames: int, stride: int = 1) -> np.ndarray:
     """Projected tool centres in the head view (n, arms, 2) [px of the recording's frame]; NaN where not valid."""
     track = tracks.tracks(episode_id)
     column = VIEWS.index(HEAD)
-    points = np.array(track.uv[:num_frames, column], dtype=np.float64)
-    points[~np.asarray(track.valid[:num_frames, column], dtype=bool)] = np.nan
+    frames = slice(0, stride * num_frames, stride)
+    points = np.array(track.uv[frames, column], dtype=np.float64)
+    points[~np.asarray(track.valid[frames, column], dtype=bool)] = np.nan
     return points
 
 

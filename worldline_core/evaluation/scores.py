@@ -162,6 +162,9 @@ def summarise(
 ) -> dict[str, Any]:
     """Means with 95 % intervals over trajectories, and paired differences between methods.
 
+    A mean is over the views that a method predicted (``metric@view`` says of how many trajectories each one was); a
+    difference is over the views that both methods predicted of a trajectory.
+
     Args:
         comparisons: pairs (first, second), reported as first - second; None takes every pair of methods.
         by_view: also give every metric per view, as ``metric@view``.
@@ -170,25 +173,44 @@ def summarise(
         {"metrics": {group: {method: {metric: interval}}},
         "differences": {group: [{"first", "second", "metric", mean, low, high, count}]}}
     """
-    values: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    values: dict[tuple[str, str], dict[str, dict[str, list[Score]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(list))
+    )
     for score in sorted(scores):
         names = [score.metric] + ([f"{score.metric}@{score.view}"] if by_view and score.view else [])
         for group in score.groups:
             for name in names:
-                values[group, score.method, name][score.episode_id].append(score.value)
+                values[group, name][score.method][score.episode_id].append(score)
 
+    options = {"resamples": resamples, "seed": seed}
     metrics: dict[str, dict[str, dict[str, Any]]] = defaultdict(lambda: defaultdict(dict))
-    means: dict[tuple[str, str], dict[str, dict[str, float]]] = defaultdict(dict)
-    for (group, method, metric), by_episode in values.items():
-        episode_means = {name: sum(items) / len(items) for name, items in by_episode.items()}
-        means[group, metric][method] = episode_means
-        weights = [len(items) for items in by_episode.values()]
-        interval = bootstrap_mean(list(episode_means.values()), weights=weights, resamples=resamples, seed=seed)
-        metrics[group][method][metric] = asdict(interval)
-
     differences: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for (group, metric), by_method in means.items():
-        rows = method_differences(by_method, metric, comparisons=comparisons, resamples=resamples, seed=seed)
-        if rows:
-            differences[group] += rows
+    for (group, metric), by_method in values.items():
+        for method, by_episode in by_method.items():
+            weights = [len(items) for items in by_episode.values()]
+            interval = bootstrap_mean(list(map(_mean, by_episode.values())), weights=weights, **options)
+            metrics[group][method][metric] = asdict(interval)
+        for pair in combinations(sorted(by_method), 2) if comparisons is None else comparisons:
+            if set(pair) <= set(by_method):
+                means = _in_common_views(*(by_method[method] for method in pair))
+                named = dict(zip(pair, means, strict=True))
+                differences[group] += method_differences(named, metric, comparisons=[pair], **options)
+    differences = {group: rows for group, rows in differences.items() if rows}
     return {"metrics": metrics, "differences": differences}
+
+
+def _in_common_views(
+    first: Mapping[str, Sequence[Score]], second: Mapping[str, Sequence[Score]]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Means of the trajectories that both methods have, over the views that both have of each."""
+    means: tuple[dict[str, float], dict[str, float]] = ({}, {})
+    for name in first.keys() & second.keys():
+        views = {score.view for score in first[name]} & {score.view for score in second[name]}
+        if views:
+            for mean, scores in zip(means, (first[name], second[name]), strict=True):
+                mean[name] = _mean([score for score in scores if score.view in views])
+    return means
+
+
+def _mean(scores: Sequence[Score]) -> float:
+    return sum(score.value for score in scores) / len(scores)

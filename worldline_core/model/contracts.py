@@ -25,12 +25,6 @@ CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
 """Nodes of the paper's four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4, 0."""
 
 
-OWN_FRAME = "latent frame 0 takes frame 0, latent frame j takes frame 4 j"
-INTERVAL = "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3"
-TEMPORAL = {1: OWN_FRAME, 4: INTERVAL}
-"""Which controls a latent frame takes, by the number of control frames (``WorldModelConfig.action_frames``)."""
-
-
 class ActionContract(StrictModel):
     """What the action maps mean; a model understands no other maps than those it was trained with.
 
@@ -49,10 +43,7 @@ class ActionContract(StrictModel):
     depth_unit: Literal["m"]
     rotation: Literal["rot6d, end effector in the camera frame"]
     gripper: Literal["0 closed, 1 open"]
-    temporal: Literal[
-        "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
-        "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3",
-    ]
+    temporal: Literal["latent frame 0 takes frame 0, latent frame j takes frame 4 j"]
     reference_canvas: tuple[Literal[384], Literal[512]]
     sigma_px_ref: float = Field(gt=0)
     wrist_projection: WristProjection
@@ -68,7 +59,7 @@ class ActionContract(StrictModel):
             "depth_unit": "m",
             "rotation": "rot6d, end effector in the camera frame",
             "gripper": "0 closed, 1 open",
-            "temporal": OWN_FRAME,
+            "temporal": "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
             "reference_canvas": REFERENCE_CANVAS,
         }
         return cls.model_validate(conventions | values)
@@ -92,6 +83,18 @@ class ActionContract(StrictModel):
                 got=differing,
                 next_step="make the action tracks and latents as the model's contract says, or use another checkpoint",
             )
+
+
+class TrainedClips(StrictModel):
+    """What the clips of a training showed, where it was less or more than all of the model's views at every frame.
+
+    Attributes:
+        views: that were trained, in the order of the model's slots; the first one is in every clip.
+        strides: recorded frames from one frame of a clip to the next.
+    """
+
+    views: tuple[str, ...] = Field(min_length=1)
+    strides: tuple[int, ...] = Field(min_length=1)
 
 
 class CausalSpec(StrictModel):

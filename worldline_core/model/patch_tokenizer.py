@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.checkpoint import fill, read_description, read_weights
-from worldline_core.model.video_tokenizer import check_latents, check_video
+from worldline_core.model.video_tokenizer import GroupDecoder, check_latents, check_video
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"
@@ -184,6 +184,10 @@ class PatchTokenizer(nn.Module):
         Group ``j`` is decoded from latent frames 0 and ``j`` only, so blocks can be decoded as they arrive.
         """
         return self.refine(self.decode_linear(latents), reference)
+
+    def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> GroupDecoder:
+        """Decode block by block, with the frames of :meth:`decode`."""
+        return GroupDecoder(self.decode, reference)
 
     def refine(
         self, coarse: Float[Tensor, "b 3 t h w"], reference: Float[Tensor, "b 3 h w"] | None = None

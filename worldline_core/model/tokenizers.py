@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -81,6 +81,10 @@ class WanTokenizer(nn.Module):
             codes = (latents.float() * self.std + self.mean).to(self.vae.dtype)
             return self.vae.decode(codes, return_dict=False)[0].to(latents.dtype)
 
+    def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> WanDecoder:
+        """Decode latent frame by latent frame, with the frames of :meth:`decode`."""
+        return WanDecoder(self)
+
     @classmethod
     def load(cls, folder: Path, dtype: torch.dtype = torch.float32) -> WanTokenizer:
         """Read a local diffusers folder (an autoencoder, or a pipeline with a ``vae`` subfolder); nothing is downloaded.
@@ -114,6 +118,35 @@ class WanTokenizer(nn.Module):
         except (OSError, ValueError, RuntimeError, SafetensorError) as error:
             raise CheckpointError("The Wan autoencoder cannot be read", where=root, got=str(error)) from error
         return cls(vae.eval().requires_grad_(False), where=root)
+
+
+class WanDecoder:
+    """Decodes clips as their latents arrive. The autoencoder's convolutions are causal: what they need of earlier frames
+    lies in one cache per convolution, which `AutoencoderKLWan.decode` clears at its end and this keeps.
+    """
+
+    def __init__(self, tokenizer: WanTokenizer) -> None:
+        self._tokenizer = tokenizer
+        self._cache: list[Any] = [None] * tokenizer.vae._cached_conv_counts["decoder"]
+        self._begun = False
+
+    def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
+        """Frames of the next latents."""
+        from diffusers.models.autoencoders.autoencoder_kl_wan import unpatchify
+
+        tokenizer, vae = self._tokenizer, self._tokenizer.vae
+        check_latents(tokenizer, latents)
+        frames: list[Tensor] = []
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            codes = vae.post_quant_conv((latents.float() * tokenizer.std + tokenizer.mean).to(vae.dtype))
+            for code in codes.split(1, dim=2):
+                first = {} if self._begun else {"first_chunk": True}
+                frames.append(vae.decoder(code, feat_cache=self._cache, feat_idx=[0], **first))
+                self._begun = True
+            video = torch.cat(frames, dim=2)
+            if vae.config["patch_size"] is not None:
+                video = unpatchify(video, patch_size=vae.config["patch_size"])
+            return video.clamp(-1.0, 1.0).to(latents.dtype)
 
 
 def load_tokenizer(folder: Path, device: str = "cpu") -> VideoTokenizer:

@@ -7,6 +7,7 @@ Axis legend: b batch, c channel, t frame, h w pixels; ``_l`` marks the latent gr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -34,6 +35,33 @@ class VideoTokenizer(Protocol):
     ) -> Float[Tensor, "b 3 t h w"]:
         """Latents to video; ``reference``, the observed first frame, helps tokenizers that can use it."""
         ...
+
+    def decoder(self, reference: Float[Tensor, "b 3 h w"] | None = None) -> VideoDecoder:
+        """As :meth:`decode`, but for latents that arrive one after the other."""
+        ...
+
+
+class VideoDecoder(Protocol):
+    """Decodes clips as their latents arrive; it keeps no more of them than later frames need."""
+
+    def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
+        """Frames of the next latents, the first of them those of frame 0."""
+        ...
+
+
+class GroupDecoder:
+    """A `VideoDecoder` for tokenizers whose later latent frames are decoded each by itself, beside latent frame 0."""
+
+    def __init__(self, decode: Callable[[Tensor, Tensor | None], Tensor], reference: Tensor | None) -> None:
+        self._decode = decode
+        self._reference = reference
+        self._first: Tensor | None = None
+
+    def __call__(self, latents: Float[Tensor, "b c t_l h_l w_l"]) -> Float[Tensor, "b 3 t h w"]:
+        if self._first is None:
+            self._first = latents[:, :, :1]
+            return self._decode(latents, self._reference)
+        return self._decode(torch.cat((self._first, latents), dim=2), self._reference)[:, :, 1:]
 
 
 def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:

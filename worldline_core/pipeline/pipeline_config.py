@@ -20,7 +20,7 @@ from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.cosmos3 import ImportBackboneConfig
 from worldline_core.report.report import ReportConfig
-from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.clip import VideoClip
+from worldline_core.data.video.encoder import Encoding, VideoEncoder
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.artifact_files import row_schema
@@ -62,13 +64,35 @@ class RolloutSetWriter:
 
     def add(self, episode_id: str, seed: int, frames: Mapping[str, np.ndarray]) -> None:
         """Encode ``uint8 (N, H, W, 3)`` frames of every view."""
-        for view, video in frames.items():
-            path = self.root / video_path(episode_id, seed, view)
-            with atomic_path(path) as temporary:
-                # Full chroma and a low factor: metrics should see the prediction, not the codec.
-                # Predictions are many and small: a slower search of x264 would cost more than sampling them in one step.
-                encode_video(temporary, video, self.fps, crf=self.crf, preset="veryfast", pixel_format="yuv444p")
-            self.register(episode_id, seed, view, video.shape[0], (video.shape[1], video.shape[2]))
+        _, height, width, _ = next(iter(frames.values())).shape
+        with self.video(episode_id, seed, tuple(frames), (height, width)) as add:
+            add(frames)
+
+    @contextmanager
+    def video(
+        self, episode_id: str, seed: int, views: tuple[str, ...], size: tuple[int, int]
+    ) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
+        """Encode a prediction piece by piece: gives a function that takes the next frames, ``uint8 (n, H, W, 3)`` by view.
+
+        The files appear, and are entered, when the block ends without an error.
+        """
+        # Full chroma and a low factor: metrics should see the prediction, not the codec.
+        # Predictions are many and small: a slower search of x264 would cost more than sampling them in one step.
+        encoding = Encoding(self.crf, "veryfast", "yuv444p")
+        with ExitStack() as stack:
+            encoders: dict[str, VideoEncoder] = {}
+            for view in views:
+                temporary = stack.enter_context(atomic_path(self.root / video_path(episode_id, seed, view)))
+                encoders[view] = stack.enter_context(VideoEncoder(temporary, size, self.fps, encoding))
+
+            def add(frames: Mapping[str, np.ndarray]) -> None:
+                for view, pictures in frames.items():
+                    for picture in pictures:
+                        encoders[view].add(picture)
+
+            yield add
+        for view, encoder in encoders.items():
+            self.register(episode_id, seed, view, encoder.count, size)
 
     def register(self, episode_id: str, seed: int, view: str, num_frames: int, size: tuple[int, int]) -> None:
         """Enter a video that an earlier, interrupted call has written."""
@@ -129,7 +153,12 @@ class RolloutSet:
         return list(dict.fromkeys(row.view for row in self.rows if row.episode_id == episode_id))
 
     def frames(self, episode_id: str, view: str, seed: int | None = None) -> np.ndarray:
-        """``uint8 (N, H, W, 3)`` RGB, the conditioning frame first; without a seed, of the smallest one.
+        """``uint8 (N, H, W, 3)`` RGB, the conditioning frame first; raises as :meth:`clip`."""
+        clip = self.clip(episode_id, view, seed)
+        return decode_video(clip.path, expected_frames=clip.num_frames)
+
+    def clip(self, episode_id: str, view: str, seed: int | None = None) -> VideoClip:
+        """The encoded video of a prediction; without a seed, of the smallest one.
 
         Raises:
             DataError: there is no such prediction.
@@ -149,4 +178,4 @@ class RolloutSet:
         path = (self.root / row.path).resolve()
         if not path.is_relative_to(self.root.resolve()):
             raise ArtifactError("A video of the set lies outside of it", where=self.root, got=row.path)
-        return decode_video(path, expected_frames=row.num_frames)
+        return VideoClip.whole_file(path, row.num_frames, row.fps)

@@ -26,7 +26,14 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
-from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, rows_of, trajectory_of
+from worldline_core.evaluation.recordings import (
+    TRUE_METHOD,
+    open_rollouts,
+    open_tracks,
+    rows_of,
+    stride_of,
+    trajectory_of,
+)
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
     Score,
@@ -85,7 +92,8 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     def verdict_on(row: EpisodeRow, method: str, seed: int) -> dict[str, Any]:
         rollout = rollouts.get(method)
         video = trajectory_of(episodes, row, config.views, rollout=rollout, seed=seed, tracks=tracks)
-        return {"num_frames": video.num_frames, **asdict(judge_trajectory(judge, video))}
+        seen = video.num_frames * (1 if rollout is None else stride_of(rollout, row))
+        return {"num_frames": seen, **asdict(judge_trajectory(judge, video))}
 
     decisions: list[dict[str, Any]] = []
     too_short: Counter[str] = Counter()

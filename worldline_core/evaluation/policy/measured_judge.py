@@ -114,11 +114,11 @@ def measure(
 ) -> Measurement | None:
     """Measure what the family's facts need, on chosen frames (n, h, w, 3) of each view.
 
-    None when the instruction does not name what to follow by a colour, or asks for an effect that this cannot measure
+    None without a head view, when the instruction does not name what to follow by a colour, or asks for an effect that this cannot measure
     (it measures holding, lifting, placing one thing on another, closing, and pressing what then lights up).
     """
     things = named_things(instruction)
-    if len(things) == 0 or len(frames[HEAD]) < LATE_COUNT:
+    if len(things) == 0 or HEAD not in frames or len(frames[HEAD]) < LATE_COUNT:
         return None
     if family in ("grasp", "lift"):
         return measure_lift(frames, things[0], _robot_late(segmenter, frames[HEAD], points))

@@ -25,9 +25,10 @@ class VLMJudge:
     ) -> Extracted[Evidence]:
         """P3. Grasps see the views of an instant side by side; lifts and state changes see them as separate images."""
         parts: list[Part] = [Text(PROMPTS["evidence"].format(instruction=trajectory.instruction))]
-        for step, index in enumerate(indices):
+        shown = {_LABELS[view]: frames[list(indices)] for view, frames in trajectory.frames.items()}
+        for step in range(len(indices)):
             instant = f"Time step {step + 1} of {len(indices)}"
-            pictures = {_LABELS[view]: _resized(frames[index], height_px) for view, frames in trajectory.frames.items()}
+            pictures = {label: _resized(frames[step], height_px) for label, frames in shown.items()}
             if family == "grasp":
                 parts.append(Text(f"{instant}, from left to right: {', '.join(pictures)}"))
                 parts.append(Image(np.concatenate(list(pictures.values()), axis=1)))

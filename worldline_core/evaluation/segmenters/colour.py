@@ -7,6 +7,8 @@ colour models of the first frame, so the points are used once only.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -32,35 +34,57 @@ class ColourSegmenter:
 
         Without a valid point in the first frame nothing can be started: all masks are empty.
         """
-        masks = np.zeros(video.shape[:3], dtype=bool)
-        if points is None or len(video) == 0:
-            return masks
-        start = points[0][np.isfinite(points[0]).all(axis=-1)]
-        height, width = video.shape[1:3]
-        start = start[(start >= 0).all(axis=-1) & (start[:, 0] < width) & (start[:, 1] < height)]
-        if len(start) == 0:
-            return masks
-        cv2.setRNGSeed(0)  # GrabCut starts its colour models by k-means
-        foreground, background = np.zeros((1, 65)), np.zeros((1, 65))
-        lab = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2LAB) for frame in video])
-        labels = self._first_labels(lab[0], start)
-        colours = colour_ratio(lab[0], np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)))
-        for index in range(len(video)):
-            if index > 0:
-                labels = self._carried_labels(masks[index - 1], robot_likely(lab[index], colours))
-            if not (
-                np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any()
-                and np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any()
-            ):
-                continue
-            mode = cv2.GC_INIT_WITH_MASK if index == 0 else cv2.GC_EVAL_FREEZE_MODEL
-            rounds = self.iterations if index == 0 else 1
-            frame = np.ascontiguousarray(video[index][..., ::-1])
-            cv2.grabCut(frame, labels, (0, 0, 0, 0), background, foreground, rounds, mode)
-            masks[index] = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
-            if index == 0:
-                colours = colour_ratio(lab[0], masks[0])
-        return masks
+        return self.stream()(video, points)
+
+    def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
+        """Masks of a video that comes piece by piece; the points of its first frame alone are used."""
+        following: _Following | None = None
+
+        def masks_of(video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+            nonlocal following
+            if len(video) == 0:
+                return np.zeros(video.shape[:3], dtype=bool)
+            if following is None:
+                following = _Following(self.iterations, video[0], points)
+            return np.stack([following.mask(frame) for frame in video])
+
+        return masks_of
+
+
+class _Following:
+    """One video: colour models of its first frame, and the mask of the frame before."""
+
+    def __init__(self, iterations: int, first: np.ndarray, points: np.ndarray | None) -> None:
+        self._iterations = iterations
+        self._previous: np.ndarray | None = None
+        self._foreground, self._background = np.zeros((1, 65)), np.zeros((1, 65))
+        start = np.zeros((0, 2)) if points is None else points[0][np.isfinite(points[0]).all(axis=-1)]
+        height, width = first.shape[:2]
+        self._start = start[(start >= 0).all(axis=-1) & (start[:, 0] < width) & (start[:, 1] < height)]
+        self._colours = np.zeros(0)
+
+    def mask(self, frame: np.ndarray) -> np.ndarray:
+        """Bool (h, w) of the next frame."""
+        mask = np.zeros(frame.shape[:2], dtype=bool)
+        if len(self._start) == 0:
+            return mask
+        lab, begins = cv2.cvtColor(frame, cv2.COLOR_RGB2LAB), self._previous is None
+        if self._previous is None:
+            cv2.setRNGSeed(0)  # GrabCut starts its colour models by k-means
+            labels = self._first_labels(lab, self._start)
+            self._colours = colour_ratio(lab, np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)))
+        else:
+            labels = self._carried_labels(self._previous, robot_likely(lab, self._colours))
+        if np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any() and np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
+            mode = cv2.GC_INIT_WITH_MASK if begins else cv2.GC_EVAL_FREEZE_MODEL
+            rounds = self._iterations if begins else 1
+            picture = np.ascontiguousarray(frame[..., ::-1])
+            cv2.grabCut(picture, labels, (0, 0, 0, 0), self._background, self._foreground, rounds, mode)
+            mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+            if begins:
+                self._colours = colour_ratio(lab, mask)
+        self._previous = mask
+        return mask
 
     def _first_labels(self, lab: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Sure robot: what is unlike the table near the points. Likely robot: what hangs together with it.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -105,6 +106,10 @@ class LearnedSegmenter:
                 logits = self.network(frames)
             masks.append((torch.sigmoid(logits.float()) > self.threshold).cpu().numpy())
         return np.concatenate(masks) if masks else np.zeros(video.shape[:3], dtype=bool)
+
+    def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
+        """Every frame is masked by itself."""
+        return self.segment
 
     @classmethod
     def load(cls, folder: Path) -> LearnedSegmenter:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -10,6 +11,10 @@ import numpy as np
 from worldline_core.errors import ArtifactError, UnavailableError
 
 SegmenterName = Literal["learned", "colour", "sam3"]
+
+
+MaskStream = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+"""Masks of the next frames of one video; arguments and result as of `Segmenter.segment`."""
 
 
 class Segmenter(Protocol):
@@ -37,6 +42,10 @@ class Segmenter(Protocol):
         Returns:
             bool (n, h, w).
         """
+        ...
+
+    def stream(self) -> MaskStream:
+        """As :meth:`segment`, but for a video that comes piece by piece."""
         ...
 
 

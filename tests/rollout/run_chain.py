@@ -1,0 +1,43 @@
+"""Rollout, video metrics and policy rules of one set of recordings, in a process of its own: prints its peak memory [MiB].
+
+    python -m tests.rollout.run_chain FOLDER CONFIG.json
+
+CONFIG.json: {"rollout": ..., "inputs": {name: folder}, "segmenter": folder or null}.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from pathlib import Path
+
+import torch
+
+from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig, evaluate_policy
+from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig, evaluate_video
+from worldline_core.rollout.rollout import rollout
+from worldline_core.rollout.rollout_config import RolloutConfig
+
+
+def run_chain(output: Path, given: dict) -> dict[str, dict]:
+    """What each of the three steps returns."""
+    inputs = {name: Path(folder) for name, folder in given["inputs"].items()}
+    predicted = rollout(RolloutConfig.model_validate(given["rollout"]), inputs, output / "rollout")
+    scored = {name: inputs[name] for name in ("episodes", "tracks")} | {"rollouts.model": output / "rollout"}
+    segmenter = "colour" if given["segmenter"] is None else "learned"
+    if given["segmenter"] is not None:
+        scored["segmenter"] = Path(given["segmenter"])
+    video = VideoEvaluationConfig(segmenters=(segmenter,), resamples=100)
+    policy = PolicyEvaluationConfig(segmenter=segmenter, balanced=False, resamples=100)
+    return {
+        "rollout": predicted,
+        "video": evaluate_video(video, scored, output / "video"),
+        "policy": evaluate_policy(policy, scored, output / "policy"),
+    }
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    run_chain(Path(sys.argv[1]), json.loads(Path(sys.argv[2]).read_text()))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

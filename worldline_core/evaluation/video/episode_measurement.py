@@ -1,0 +1,256 @@
+"""All predictions of one episode measured frame by frame, in one pass over its recording.
+
+Videos are read side by side, some frames at a time, so memory depends neither on their length nor on how many there are.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError
+from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
+from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, VideoFrames, stride_of, tool_points
+from worldline_core.evaluation.segmenters.coloured_things import (
+    ColouredThing,
+    OwnColour,
+    named_things,
+    own_colour,
+    thing_share,
+)
+from worldline_core.evaluation.segmenters.segmenter import Segmenter
+from worldline_core.model.lpips import LPIPS
+from worldline_core.rollout.rollout_set import RolloutSet
+
+PIECE_FRAMES = 32
+"""Frames of a video that are in memory at once; at least as many as the colour of a thing is looked for in."""
+MOVED_IOU = 0.5
+"""A thing has moved where less than this of it (IoU) lies where it lay in the first frame."""
+FrameValues = dict[str, list[float | None]]
+"""Values of each frame by metric; None where a frame is left out."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some frames of the recorded head view, and what is known of them."""
+
+    frames: np.ndarray
+    points: np.ndarray
+    masks: Mapping[str, np.ndarray]
+    exact: np.ndarray | None
+    moved: tuple[np.ndarray, np.ndarray] | None
+    """Exact masks of what the task moves, and where they have moved (n,)."""
+
+
+class _Video:
+    """One video on its way: its segmenters follow it, and its values are collected."""
+
+    def __init__(self, pieces: Iterator[np.ndarray], segmenters: Mapping[str, Segmenter], thing: ColouredThing | None):
+        self.pieces = pieces
+        self.values: dict[str, list[float | None]] = defaultdict(list)
+        self._streams = {suffix: segmenter.stream() for suffix, segmenter in segmenters.items()}
+        self._thing = thing
+        self._own: OwnColour | None = None
+        self._begun = False
+
+    def masks(self, frames: np.ndarray, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Robot masks of the next frames, by the suffix of a segmenter's metrics."""
+        return {suffix: stream(frames, points) for suffix, stream in self._streams.items()}
+
+    def add(self, **values: Sequence[float | None]) -> None:
+        """Values of the next frames."""
+        for name, found in values.items():
+            self.values[name] += found
+
+    def add_object(self, frames: np.ndarray, moved: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """IoU of what the task moves; a frame in which it lies where it lay, or is hidden, is left out."""
+        if self._thing is None or moved is None:
+            return
+        if not self._begun:
+            self._own, self._begun = own_colour(frames, self._thing.colour), True
+        masks = thing_share(frames, self._thing.colour, self._own) > 0.5
+        self.add(object_iou_exact=_or_none(np.where(moved[1], frame_iou(moved[0], masks), np.nan)))
+
+
+class EpisodeMeasurement:
+    """Measures predictions of one episode.
+
+    Args:
+        segmenters: by the suffix of their metrics.
+        lpips: None where it is not available.
+    """
+
+    def __init__(
+        self,
+        episodes: EpisodeSet,
+        tracks: ActionTracks,
+        row: EpisodeRow,
+        views: Sequence[str],
+        segmenters: Mapping[str, Segmenter],
+        lpips: LPIPS | None,
+    ) -> None:
+        self.episodes, self.tracks, self.segmenters, self.lpips = episodes, tracks, segmenters, lpips
+        self.row, self.episode_id = row, row.episode_id
+        self.position = episodes.position(row.episode_id)
+        self.views = [view for view in views if view in row.views]
+        self.thing = next(iter(named_things(row.instruction)), None)
+
+    def measure(self, rollouts: Mapping[str, RolloutSet]) -> dict[str, dict[str, Any]]:
+        """Values of every frame, by method, for every view and seed that was predicted; and, as the method ``true``, how
+        good masks of the recording itself are, of robot and moved thing, where the exact ones are known.
+
+        Raises: DataError when a prediction has another frame size, another rate or more frames than the recording.
+        """
+        strides = {method: stride_of(rollout, self.row) for method, rollout in rollouts.items()}
+        found: dict[tuple[str, int, str], FrameValues] = {}
+        accuracy: FrameValues | None = None
+        longest = 0
+        for stride in sorted(set(strides.values())):
+            group = {method: rollout for method, rollout in rollouts.items() if strides[method] == stride}
+            for view in self.views:
+                values, own = self._pass(group, view, stride)
+                found |= values
+                if view == HEAD and accuracy is None:
+                    accuracy = own
+        contents: dict[str, dict[str, Any]] = {}
+        for method, rollout in rollouts.items():
+            measured = [
+                {"view": view, "seed": seed, "frames": found[method, seed, view]}
+                for seed in rollout.seeds(self.episode_id)
+                for view in self.views
+                if (method, seed, view) in found
+            ]
+            frames = max((rollout.clip(self.episode_id, item["view"]).num_frames for item in measured), default=0)
+            contents[method] = {"num_frames": frames, "measured": measured}
+            longest = max(longest, frames)
+        own = {"view": HEAD, "seed": 0, "frames": accuracy or {}}
+        return contents | {TRUE_METHOD: {"num_frames": longest, "measured": [own]}}
+
+    def _pass(
+        self, rollouts: Mapping[str, RolloutSet], view: str, stride: int
+    ) -> tuple[dict[tuple[str, int, str], FrameValues], FrameValues]:
+        """Values of one view's predictions by (method, seed, view), and of the recording's own masks."""
+        segmenters = self.segmenters if view == HEAD else {}
+        recording = VideoFrames(self.episodes.clip(self.position, view), stride)
+        videos: dict[tuple[str, int, str], _Video] = {}
+        longest = 0
+        for method, rollout in rollouts.items():
+            if view not in rollout.views(self.episode_id):
+                continue
+            for seed in rollout.seeds(self.episode_id):
+                predicted = VideoFrames(rollout.clip(self.episode_id, view, seed))
+                if len(predicted) > len(recording):
+                    raise DataError(
+                        "A prediction is longer than its recording",
+                        where=f"method {method}, episode {self.episode_id}, view {view}",
+                        expected=f"<= {len(recording)}",
+                        got=len(predicted),
+                    )
+                longest = max(longest, len(predicted))
+                videos[method, seed, view] = _Video(predicted.pieces(PIECE_FRAMES), segmenters, self.thing)
+        true = _Video(recording.pieces(PIECE_FRAMES), segmenters, self.thing)
+        if not videos:
+            return {}, {}
+        known = self._known(stride, longest) if view == HEAD else None
+        for begin in range(0, longest, PIECE_FRAMES):
+            frames = next(true.pieces)[: longest - begin]
+            piece = None if known is None else known.cut(begin, frames, true)
+            if piece is not None:
+                true.add_object(frames, piece.moved)
+                if piece.exact is not None:
+                    for suffix, masks in piece.masks.items():
+                        true.add(**{f"robot_iou_exact{suffix}": _or_none(frame_iou(piece.exact, masks))})
+            for (method, _, _), video in videos.items():
+                predicted = next(video.pieces, None)
+                if predicted is not None:
+                    where = f"method {method}, episode {self.episode_id}, view {view}"
+                    self._full_frame(video, predicted, frames[: len(predicted)], where)
+                    if piece is not None:
+                        _robot(video, predicted, piece)
+        return {key: dict(video.values) for key, video in videos.items()}, dict(true.values)
+
+    def _full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
+        if predicted.shape != true.shape:
+            raise DataError(
+                "Predicted and recorded frames differ in size",
+                where=where,
+                expected=true.shape,
+                got=predicted.shape,
+                next_step="write the predictions at the recording's frame size",
+            )
+        p, t = (frames_to_unit(torch.from_numpy(np.ascontiguousarray(frames))) for frames in (predicted, true))
+        video.add(psnr=psnr(p, t).tolist(), ssim=ssim(p, t).tolist())
+        if self.lpips is not None:
+            video.add(lpips=self.lpips(p, t).tolist())
+
+    def _known(self, stride: int, count: int) -> _Known:
+        """What is known of the first ``count`` frames of the recorded head view, every ``stride``-th.
+
+        Raises: DataError when fewer exact masks than frames are there.
+        """
+        frames = slice(0, stride * count, stride)
+        exact, labels = (read(self.position, HEAD) for read in (self.episodes.robot_masks, self.episodes.thing_labels))
+        for name, images in (("robot masks", exact), ("labels of things", labels)):
+            if images is not None and len(images[frames]) < count:
+                raise DataError(
+                    "A prediction is longer than its recording",
+                    where=f"{name} of {self.episode_id}, view {HEAD}",
+                    expected=f"<= {len(images[::stride])}",
+                    got=count,
+                )
+        return _Known(
+            tool_points(self.tracks, self.episode_id, count, stride),
+            None if exact is None else exact[frames],
+            None if labels is None else labels[frames] == 1,
+        )
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Of all frames of the recorded head view: projected tool centres, exact masks of the robot and of the moved thing."""
+
+    points: np.ndarray
+    exact: np.ndarray | None
+    thing: np.ndarray | None
+
+    def cut(self, begin: int, frames: np.ndarray, video: _Video) -> _Piece:
+        """What is known of the recorded ``frames`` that begin at ``begin``, with their segmenters' masks."""
+        part = slice(begin, begin + len(frames))
+        points, moved = self.points[part], None
+        if self.thing is not None:
+            now = self.thing[part]
+            stays = frame_iou(now, self.thing[:1].repeat(len(now), 0))
+            moved = now, (stays < MOVED_IOU) & now.any(axis=(1, 2))
+        exact = None if self.exact is None else self.exact[part]
+        return _Piece(frames, points, video.masks(frames, points), exact, moved)
+
+
+def _robot(video: _Video, predicted: np.ndarray, true: _Piece) -> None:
+    """Robot metrics of predicted head frames, as many of the recorded ones as they are."""
+    part = slice(0, len(predicted))
+    points = true.points[part]
+    errors = end_effector_error(true.frames[part], predicted, points)
+    video.add(end_effector_error_px=[finite_mean(row) for row in errors])
+    for suffix, masks in video.masks(predicted, points).items():
+        video.add(**{f"robot_iou{suffix}": _or_none(frame_iou(true.masks[suffix][part], masks))})
+        if true.exact is not None:
+            video.add(**{f"robot_iou_exact{suffix}": _or_none(frame_iou(true.exact[part], masks))})
+    video.add_object(predicted, None if true.moved is None else (true.moved[0][part], true.moved[1][part]))
+
+
+def finite_mean(values: Sequence[float | None] | np.ndarray) -> float | None:
+    """Mean of the values that are there; None without any."""
+    finite = [float(value) for value in values if value is not None and np.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
+
+
+def _or_none(values: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(value) else float(value) for value in values]

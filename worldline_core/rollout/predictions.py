@@ -1,0 +1,213 @@
+"""Which videos a rollout makes: of which episodes, in which views, how long, under whose controls; and why not of others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from worldline_core.actions.episode_tracks import ActionTracks
+from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.rollout.rollout_config import RolloutConfig
+
+
+class Predictor(Protocol):
+    """What a plan asks of whoever predicts.
+
+    Attributes:
+        views: that it knows; the first one must be in every prediction.
+        frames_per_unit: a prediction of a stated length has 1 + k times this many frames.
+        needs_cameras: whether controls are drawn into the views, so that their cameras must be known.
+    """
+
+    views: tuple[str, ...]
+    frames_per_unit: int
+    needs_cameras: bool
+
+    def unit(self, frames: int) -> int:
+        """Frames that a step of a prediction of ``frames`` frames adds."""
+        ...
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One video of every view to make: of an episode, driven by the controls of one, with a seed and a length.
+
+    ``sampled``: frames up to the end of the last unit; those after ``frames`` are not kept.
+    """
+
+    position: int
+    episode_id: str
+    controls_of: str
+    seed: int
+    frames: int
+    sampled: int
+    views: tuple[str, ...]
+
+
+def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
+    """Positions of the episodes to predict, in the order of the set.
+
+    Raises:
+        DataError: none matches.
+    """
+    counts: Counter[str] = Counter()
+    chosen = []
+    limit = config.max_episodes_per_embodiment
+    for position in episodes.select(split=config.splits):
+        row = episodes.rows[position]
+        if config.banks is not None and row.bank not in config.banks:
+            continue
+        if config.embodiments is not None and row.embodiment not in config.embodiments:
+            continue
+        counts[row.embodiment] += 1
+        if limit is None or counts[row.embodiment] <= limit:
+            chosen.append(position)
+    if not chosen:
+        raise DataError(
+            "No episode to predict",
+            where=episodes.root,
+            expected=f"splits {config.splits}, banks {config.banks}, embodiments {config.embodiments}",
+            got=sorted({row.split for row in episodes.rows}),
+        )
+    return chosen
+
+
+def plan_predictions(
+    config: RolloutConfig,
+    episodes: EpisodeSet,
+    tracks: ActionTracks,
+    chosen: Sequence[int],
+    predictor: Predictor,
+    fps: float,
+) -> tuple[list[Prediction], list[QuarantineRow]]:
+    """Every prediction to make, and the chosen episodes of which none can be made, each with its reason.
+
+    Args:
+        fps: rate that recordings must have.
+
+    Raises:
+        ConfigError: views are asked for that the predictor does not know, or without its first one.
+        DataError: no episode can be predicted.
+    """
+    if config.views != "all_present" and not {predictor.views[0]} <= set(config.views) <= set(predictor.views):
+        raise ConfigError(
+            "A rollout is of views that the model was trained on",
+            where="rollout.views",
+            expected=f"{predictor.views[0]}, and any of {predictor.views[1:]}",
+            got=config.views,
+        )
+    fitting: dict[int, tuple[str, ...]] = {}
+    left_out: list[QuarantineRow] = []
+    for position in chosen:
+        row = episodes.rows[position]
+        views, problem = _views(config, row, tracks, predictor)
+        problem = problem or _misfit(config, row, predictor.frames_per_unit, fps)
+        if problem is None:
+            fitting[position] = views
+        else:
+            left_out.append(QuarantineRow(row.episode_id, row.source, *problem))
+    if not fitting:
+        counts = Counter(row.reason for row in left_out)
+        raise DataError(
+            "No episode can be predicted",
+            where=episodes.root,
+            expected="the model's first view and its camera, action tracks, the model's rate, and one unit of frames",
+            got=f"{len(left_out)} left out {dict(counts)}; the first, {left_out[0].episode_id}: {left_out[0].detail}",
+            next_step="see quarantine.parquet of render_actions and filter, or choose other episodes",
+        )
+    partners = {episodes.rows[position].episode_id: episodes.rows[position].episode_id for position in fitting}
+    if config.actions == "shuffled":
+        embodiment_of = {row.episode_id: row.embodiment for row in episodes.rows}
+        partners = shuffled_partners(list(partners), embodiment_of, tracks.episode_ids, config.seeds[0])
+    planned: list[Prediction] = []
+    for position, views in fitting.items():
+        row = episodes.rows[position]
+        frames = _length(config, row, predictor.frames_per_unit)
+        unit = predictor.unit(frames)
+        sampled = 1 + -(-(frames - 1) // unit) * unit
+        partner = partners[row.episode_id]
+        planned += [
+            Prediction(position, row.episode_id, partner, seed, frames, sampled, views) for seed in config.seeds
+        ]
+    return planned, left_out
+
+
+def _views(
+    config: RolloutConfig, row: EpisodeRow, tracks: ActionTracks, predictor: Predictor
+) -> tuple[tuple[str, ...], tuple[str, str] | None]:
+    """The views to predict of an episode, or a reason and what is the matter."""
+    if row.episode_id not in tracks:
+        return (), ("missing_actions", "no action tracks of this episode")
+    recorded = tuple(view for view in predictor.views if view in row.views)
+    known = tracks.calibrated_views(row.episode_id) if predictor.needs_cameras else recorded
+    views = tuple(view for view in recorded if view in known)
+    wanted = (predictor.views[0],) if config.views == "all_present" else config.views
+    for reason, present, what in (
+        ("missing_view", recorded, "no video of"),
+        ("missing_calibration", views, "no camera of"),
+    ):
+        absent = [view for view in wanted if view not in present]
+        if absent:
+            return (), (reason, f"{what} {', '.join(absent)}; there are {', '.join(present) or 'none'}")
+    return (views if config.views == "all_present" else tuple(view for view in views if view in wanted)), None
+
+
+def _misfit(config: RolloutConfig, row: EpisodeRow, unit: int, fps: float) -> tuple[str, str] | None:
+    if row.fps != fps:
+        return "wrong_fps", f"the recording has {row.fps} frames per second, the model knows {fps}"
+    if _length(config, row, unit) < (2 if config.num_frames == "whole" else 1 + unit):
+        return "too_short", f"too short to predict: {row.num_frames} frames, a unit of {unit} is asked for"
+    return None
+
+
+def _length(config: RolloutConfig, row: EpisodeRow, unit: int) -> int:
+    """Frames of a prediction: of the whole recording, or 1 + k units of the length that is asked for."""
+    available = 1 + (row.num_frames - 1) // config.stride
+    if config.num_frames == "whole":
+        return available
+    return 1 + (min(config.num_frames, available) - 1) // unit * unit
+
+
+def batches(planned: Sequence[Prediction], size: int) -> Iterator[list[Prediction]]:
+    """Predictions of equal length and equal views together, in a fixed order."""
+    for key in sorted({(item.sampled, item.views) for item in planned}):
+        same = [item for item in planned if (item.sampled, item.views) == key]
+        for start in range(0, len(same), size):
+            yield same[start : start + size]
+
+
+def shuffled_partners(
+    episodes: Sequence[str], embodiment_of: Mapping[str, str], pool: Sequence[str], seed: int
+) -> dict[str, str]:
+    """For every episode another of the same embodiment, no one its own, as far as possible no two the same.
+
+    Episodes of an embodiment are arranged in a random circle (a function of ``seed`` and the ids only) and each takes
+    its successor's controls. An embodiment with a single chosen episode draws its partner from ``pool``.
+
+    Raises:
+        DataError: an episode has no other of its embodiment.
+    """
+    partners: dict[str, str] = {}
+    for embodiment in sorted({embodiment_of[episode] for episode in episodes}):
+        members = sorted(episode for episode in episodes if embodiment_of[episode] == embodiment)
+        generator = np.random.default_rng([seed, *embodiment.encode()])
+        if len(members) == 1:
+            others = sorted(e for e in pool if embodiment_of.get(e) == embodiment and e not in members)
+            if not others:
+                raise DataError(
+                    "No other episode of this embodiment to take controls from",
+                    where=members[0],
+                    expected="at least two episodes with tracks",
+                    got=embodiment,
+                )
+            partners[members[0]] = others[int(generator.integers(len(others)))]
+            continue
+        circle = [members[int(i)] for i in generator.permutation(len(members))]
+        partners.update(zip(circle, [*circle[1:], circle[0]], strict=True))
+    return partners

@@ -1,0 +1,168 @@
+"""A prediction that goes on: what the cameras see now, then unit after unit, each under controls given after the last.
+
+A causal model goes on block by block: what it keeps is a window of constant size, whose positions are those of a trained
+clip however long the rollout is. A Stage II model goes on by chaining: it predicts a clip, and the last predicted picture
+of every view is the observed one of the next clip (they overlap by this one frame). Pictures are decoded unit by unit, so
+memory does not grow with the length.
+
+Axis legend: b clips, v views, a channels of the action maps, t latent frames, n frames, h w pixels or latent cells.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from worldline_core.model.video_tokenizer import VideoDecoder, VideoTokenizer, frames_to_video, video_to_frames
+from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout_full_clip
+from worldline_core.rollout.speed import timed
+
+Frames = list[dict[str, np.ndarray]]
+"""Of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
+
+
+class UnitSampler(Protocol):
+    """Samples latents unit by unit. ``chained``: every unit is a clip of its own, which begins where the last one ended."""
+
+    views: tuple[str, ...]
+    chained: bool
+
+    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
+        """Begin a clip at observed latents."""
+        ...
+
+    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
+        """Latents of the next ``n = t - 1`` latent frames, under controls that begin with the last known frame's."""
+        ...
+
+
+class BlockSampler:
+    """The causal model, a block a step; ``seconds``: wall seconds of each block so far."""
+
+    chained = False
+
+    def __init__(self, simulator: BlockCausalSimulator, device: str) -> None:
+        self.views = simulator.views
+        self.seconds: list[float] = []
+        self._simulator = simulator
+        self._device = device
+        self._first: Tensor | None = None
+
+    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
+        self._first = first
+
+    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
+        if self._first is not None:
+            self._simulator.start(self._first, maps[:, :, :, :1])
+            self._first = None
+        latents, elapsed = timed(partial(self._simulator.step, maps[:, :, :, 1:]), self._device)
+        self.seconds.append(elapsed.wall)
+        return latents
+
+
+class ClipSampler:
+    """A Stage II model, a clip a step."""
+
+    chained = True
+
+    def __init__(
+        self,
+        model: WorldModel,
+        noise: Noise,
+        *,
+        steps: int,
+        shift: float,
+        views: tuple[str, ...],
+        fps: float,
+        bfloat16: bool,
+    ) -> None:
+        self.views = views
+        self._sample = partial(
+            rollout_full_clip, model, noise=noise, steps=steps, shift=shift, views=views, fps=fps, bfloat16=bfloat16
+        )
+        self._first: Tensor
+
+    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
+        self._first = first
+
+    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
+        return self._sample(self._first, maps)[:, :, :, 1:]
+
+
+class Session:
+    """One running prediction of a batch of clips that share their views.
+
+    Args:
+        images: what each view sees now, in [-1, 1] at the model's size.
+
+    Attributes:
+        observed: the given images as the tokenizer shows them, one frame a view.
+    """
+
+    def __init__(
+        self,
+        sampler: UnitSampler,
+        tokenizer: VideoTokenizer,
+        images: Float[Tensor, "b v 3 h w"],
+        *,
+        device: str,
+        bfloat16: bool,
+    ) -> None:
+        self._sampler = sampler
+        self._tokenizer = tokenizer
+        self._device = device
+        self._bfloat16 = bfloat16
+        self._decoders: list[VideoDecoder]
+        self._ended: Frames | None = None
+        self.observed = self._observe(images)
+
+    @torch.no_grad()
+    def step(self, maps: Float[Tensor, "b v a t h w"]) -> Frames:
+        """Predict the next unit.
+
+        Args:
+            maps: of the last latent frame that is known, and of those to predict.
+
+        Returns:
+            The predicted frames, without the known one.
+
+        Raises:
+            DataError: a causal model is not given the controls of one block.
+        """
+        if self._ended is not None:
+            self._observe(torch.stack([self._last_pictures(clip) for clip in self._ended]))
+        frames = self._decode(self._sampler.step(maps))
+        self._ended = frames if self._sampler.chained else None
+        return frames
+
+    @torch.no_grad()
+    def _observe(self, images: Tensor) -> Frames:
+        """Begin a clip at these images."""
+        images = images.to(self._device)
+        first = encode_images(self._tokenizer, images)
+        self._sampler.begin(first)
+        self._decoders = [self._tokenizer.decoder(clip) for clip in images]
+        return self._decode(rearrange(first, "b v c h w -> b v c 1 h w"))
+
+    def _last_pictures(self, clip: dict[str, np.ndarray]) -> Float[Tensor, "v 3 h w"]:
+        return torch.stack([frames_to_video(clip[view][-1:])[:, 0] for view in self._sampler.views])
+
+    def _decode(self, latents: Tensor) -> Frames:
+        with torch.autocast(self._device.split(":")[0], torch.bfloat16, enabled=self._bfloat16):
+            # One clip at a time: the decoder works on whole images, which take a hundred times the memory of latents.
+            videos = (decode(clip) for decode, clip in zip(self._decoders, latents, strict=True))
+            return [{view: video_to_frames(clip[v]) for v, view in enumerate(self._sampler.views)} for clip in videos]
+
+
+@torch.no_grad()
+def encode_images(tokenizer: VideoTokenizer, images: Float[Tensor, "b v 3 h w"]) -> Float[Tensor, "b v c h_l w_l"]:
+    """Latents of single frames."""
+    latents = tokenizer.encode(rearrange(images, "b v c h w -> (b v) c 1 h w"))
+    return rearrange(latents, "(b v) c 1 h w -> b v c h w", v=images.shape[1])
