@@ -49,7 +49,7 @@ def measure(
     channels, frames = model.config.latent_channels, 1 + 4 * spec.block_size * 2
     latent_frames = 1 + (frames - 1) // 4
     first = torch.randn(1, len(views), channels, *GRID, device=device)
-    maps = torch.randn(1, len(views), model.config.action_channels, latent_frames, *GRID, device=device)
+    maps = torch.randn(1, len(views), model.config.map_channels, latent_frames, *GRID, device=device)
 
     def decode(latents: torch.Tensor) -> torch.Tensor:
         with torch.autocast(device.split(":")[0], torch.bfloat16):

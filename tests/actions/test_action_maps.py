@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from worldline_core.actions.action_maps import NUM_CHANNELS, grid_sigma, latent_frame_indices, render_action_maps
-from worldline_core.actions.episode_tracks import TrackBatch
+from worldline_core.actions.action_maps import (
+    NUM_CHANNELS,
+    control_frames,
+    grid_sigma,
+    latent_frame_indices,
+    render_action_maps,
+    stack_controls,
+)
+from worldline_core.actions.episode_tracks import SAMPLES, TrackBatch
 from worldline_core.errors import ConfigError
 
 
@@ -162,6 +169,32 @@ def test_latent_frames_take_every_fourth_frame():
     assert latent_frame_indices(33) == [0, 4, 8, 12, 16, 20, 24, 28, 32]
     assert latent_frame_indices(1) == [0]
     assert len(latent_frame_indices(129)) == 33
+
+
+def test_controls_of_a_whole_interval_begin_with_those_of_the_latent_frame_itself():
+    assert control_frames(9) == latent_frame_indices(9)
+    assert control_frames(9, 4) == [0, 0, 0, 0, 4, 3, 2, 1, 8, 7, 6, 5]
+
+
+def test_a_gripper_that_closes_and_opens_between_latent_frames_is_seen_in_the_whole_interval_alone():
+    still, moved = batch(b=1, t=9, v=2, a=1), batch(b=1, t=9, v=2, a=1)
+    for tracks in (still, moved):
+        tracks.valid[:] = True
+        tracks.uv[:] = torch.tensor([300.0, 200.0])
+        tracks.gripper[:] = 1.0
+    moved.gripper[:, 6] = 0.0
+
+    def maps(tracks: TrackBatch, per_latent_frame: int) -> torch.Tensor:
+        frames = control_frames(9, per_latent_frame)
+        cut = TrackBatch(*(getattr(tracks, name)[:, frames] for name in SAMPLES))
+        return stack_controls(render_action_maps(cut, (480, 640), (30, 40)), per_latent_frame)
+
+    assert torch.equal(maps(still, 1), maps(moved, 1))
+    between = maps(still, 4) - maps(moved, 4)
+    changed = between.abs().amax(dim=(0, 1, 4, 5)) > 0.5
+    # Frame 6 is the third of latent frame 2's: 8, 7, 6, 5; the gripper is the ninth channel.
+    assert changed.nonzero().tolist() == [[2 * 9 + 8, 2]]
+    assert torch.equal(maps(still, 4)[:, :, :9], maps(still, 1))
 
 
 @pytest.mark.parametrize("num_frames", [0, 16, 34])

@@ -22,7 +22,8 @@ from worldline_core.distillation.trajectory_regression import TrajectoryObjectiv
 from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
-from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.contracts import TEMPORAL
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
@@ -232,6 +233,16 @@ def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[
     columns = torch.arange(4.0)
     centre = [(masks[0, 0, t].amax(0) * columns).sum() / masks[0, 0, t].amax(0).sum() for t in (0, 4)]
     assert centre[1] > centre[0]
+
+
+def test_controls_of_whole_intervals_reach_every_step(
+    inputs: dict[str, Path], tmp_path: Path, make_model: Callable[..., WorldModel], make_contract: Callable
+) -> None:
+    contract = make_contract(sigma_px_ref=40.0, temporal=TEMPORAL[4])
+    save_checkpoint(inputs["stage2"], make_model(0, action_frames=4), kind="stage2", action_contract=contract)
+    distill(config(), inputs, tmp_path / "out")
+    model, info = load_checkpoint(tmp_path / "out", expect_kind="causal")
+    assert (info.contract, model.config.map_channels) == (contract, 36)
 
 
 def test_clips_must_be_whole_blocks() -> None:

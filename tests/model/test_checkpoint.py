@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import ActionContract, CausalSpec
+from worldline_core.model.contracts import TEMPORAL, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 
@@ -111,6 +111,32 @@ def test_a_missing_unknown_or_other_field_of_a_contract_is_named(part: str, tmp_
     path.write_text(json.dumps({key: value for key, value in whole.items() if key != part}))
     with pytest.raises(CheckpointError, match=part):
         read_checkpoint_info(tmp_path)
+
+
+@torch.no_grad()
+def test_a_model_that_takes_the_controls_of_whole_intervals_computes_what_it_computed_before(
+    tmp_path: Path, make_model: Callable[..., WorldModel]
+) -> None:
+    save_checkpoint(tmp_path / "own", make_model(), kind="stage2", action_contract=CONTRACT)
+    assert "action_frames" not in (tmp_path / "own" / "checkpoint.json").read_text()
+    own, _ = load_checkpoint(tmp_path / "own")
+    interval, _ = load_checkpoint(tmp_path / "own", action_frames=4)
+    latents, maps = torch.randn(2, 3, 4, 5, 4, 4), torch.randn(2, 3, 36, 5, 4, 4)
+    sigma = torch.tensor([0.3, 0.9])
+    before = own(latents, sigma, action_maps=maps[:, :, :9]).velocity
+    torch.testing.assert_close(interval(latents, sigma, action_maps=maps).velocity, before)
+    with torch.enable_grad():
+        interval(latents, sigma, action_maps=maps).velocity.square().sum().backward()
+    gradient = interval.action_encoder.proj.weight.grad
+    assert gradient is not None
+    assert bool((gradient.unflatten(1, (4, -1)).abs().amax(dim=(0, 2)) > 0).all())
+    with pytest.raises(CheckpointError, match=r"action_contract.temporal: a model with action_frames 4 needs"):
+        save_checkpoint(tmp_path / "all", interval, kind="stage2", action_contract=CONTRACT)
+    contract = CONTRACT.model_copy(update={"temporal": TEMPORAL[4]})
+    save_checkpoint(tmp_path / "all", interval, kind="stage2", action_contract=contract)
+    assert load_checkpoint(tmp_path / "all")[1].config.map_channels == 36
+    with pytest.raises(CheckpointError, match=r"(?s)takes the controls of more frames.*action_frames 4"):
+        load_checkpoint(tmp_path / "all", action_frames=1)
 
 
 def test_maps_of_other_conventions_are_refused(folder: Path) -> None:

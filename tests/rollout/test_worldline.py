@@ -16,6 +16,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -96,6 +97,16 @@ def test_the_seed_and_the_controls_decide(observed: Observation, causal: WorldLi
     assert not np.array_equal(first, predict(observed.controls, seed=43))
     still = np.repeat(observed.controls[:1], FRAMES, axis=0)
     assert not np.array_equal(first, predict(still))
+
+
+def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them_as_before(
+    observed: Observation, causal: WorldLine, models: Path
+) -> None:
+    model, info = load_checkpoint(models / "causal", action_frames=4)
+    world = WorldLine(model, info.model_copy(update={"config": model.config}), causal.tokenizer)
+    given = (observed.images, observed.controls, observed.cameras)
+    before, after = (simulator.predict(*given, embodiment="ur5e_silver") for simulator in (causal, world))
+    assert all(np.abs(before[view].astype(int) - after[view]).max() <= 2 for view in before)
 
 
 def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -237,6 +238,21 @@ def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
         train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
 
 
+def test_controls_of_whole_intervals_reach_the_model_from_a_checkpoint_that_knew_none(
+    world: Any, stage1_folder: Path, tmp_path: Path
+) -> None:
+    inputs = {**world.inputs, "stage1": stage1_folder}
+    train_stage2(stage2(2), inputs, tmp_path / "own")
+    train_stage2(
+        stage2(2, start_from="stage2", action_frames=4), {**inputs, "stage1": tmp_path / "own"}, tmp_path / "all"
+    )
+    model, info = load_checkpoint(tmp_path / "all")
+    assert info.contract.temporal.endswith("takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3")
+    assert bool((model.action_encoder.proj.weight[:, model.action_encoder.proj.in_features // 4 :] != 0).any())
+    with pytest.raises(CheckpointError, match=r"(?s)takes the controls of more frames.*action_frames 4"):
+        train_stage2(stage2(2, start_from="stage2"), {**inputs, "stage1": tmp_path / "all"}, tmp_path / "back")
+
+
 def test_wrong_checkpoint_and_missing_teacher_are_named(
     world: Any,
     model_config: MakeConfig,
@@ -285,17 +301,23 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
     from worldline_core.training.clip_source import Clip
-    from worldline_core.training.relational import TeacherFeatures
+    from worldline_core.training.relational import RelationalConfig, TeacherRelations, relations
     from worldline_core.training.video_teacher import load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())
     assert description["metrics"]["validation/loss"] > 0
     loaded = load_teacher(teacher)
-    features = TeacherFeatures(loaded, world.episodes, cached_clips=4)
-    clip = Clip("episode-003", 0, 9, 1)
-    first = features.features((clip,), ("head", "left_wrist"))
-    assert first.shape == (1, 2, 3, 4, 4, 64)
-    assert torch.equal(features.features((clip,), ("head", "left_wrist")), first)
-    later = features.features((replace(clip, start=8),), ("head", "left_wrist"))
-    assert not torch.equal(later, first)
+    taught = TeacherRelations(loaded, world.episodes, RelationalConfig(cached_clips=1))
+    clip, views = Clip("episode-003", 0, 9, 1), ("head", "left_wrist")
+    first = taught.relations((clip,), views, (3, 2, 2))
+    assert (first.shape, first.intra.shape, first.cross.shape) == ((3, 2, 2), (1, 2, 2, 4, 4), (1, 1, 3, 4, 4))
+    assert taught.relations((clip,), views, (3, 2, 2)).intra is not first.intra
+    assert torch.equal(taught.relations((clip,), views, (3, 2, 2)).intra, first.intra)
+    later = taught.relations((replace(clip, start=8),), views, (3, 2, 2))
+    assert not torch.equal(later.intra, first.intra)
+    # What is kept is what the unpooled features, in half precision, give.
+    position = taught.episodes.position("episode-003")
+    frames = torch.from_numpy(np.stack([taught.episodes.frames(position, view, list(clip.frames)) for view in views]))
+    features = loaded.features((frames.float() / 255).permute(0, 4, 1, 2, 3)).half().float()
+    assert torch.equal(relations(features[None], (3, 2, 2)).cross, first.cross)
     assert not any(parameter.requires_grad for parameter in loaded.parameters())  # type: ignore[attr-defined]

@@ -1,21 +1,24 @@
-"""Teacher features inside of a training step's autocast."""
+"""The teacher's relations inside of a training step's autocast."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import Any, cast
 
+import pytest
 import torch
 
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.relational import TeacherFeatures
+from worldline_core.training.relational import TeacherRelations, relations
 
 
-def test_cached_features_are_handed_on_in_single_precision_under_autocast() -> None:
-    features = TeacherFeatures.__new__(TeacherFeatures)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_batch_of_cached_relations_is_what_was_kept_under_autocast(dtype: torch.dtype) -> None:
+    taught = TeacherRelations.__new__(TeacherRelations)
     clips = [Clip("a", 0, 5, 1), Clip("b", 0, 5, 1)]
-    stored = {(clip, ("head",)): torch.randn(1, 2, 4, 6, 8).half() for clip in clips}
-    features._cache = OrderedDict(stored)
-    with torch.autocast("cpu", torch.bfloat16):
-        result = features.features(clips, ("head",))
-    assert result.dtype == torch.float32
-    assert torch.equal(result[1].half(), stored[clips[1], ("head",)])
+    with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+        stored = {(clip, ("head",)): relations(torch.randn(1, 1, 2, 4, 6, 8), (2, 2, 3)) for clip in clips}
+        cast("Any", taught)._cache = OrderedDict(stored)
+        result = taught.relations(clips, ("head",), (2, 4, 6))
+    assert result.intra.dtype == dtype
+    assert torch.equal(result.intra[1], stored[clips[1], ("head",)].intra[0])

@@ -46,6 +46,23 @@ def latent_frame_indices(num_frames: int, temporal_factor: int = TEMPORAL_FACTOR
     return list(range(0, num_frames, temporal_factor))
 
 
+def control_frames(num_frames: int, per_latent_frame: int = 1) -> list[int]:
+    """RGB frames whose controls the latent frames take, latest first: for latent frame j, frame 4 j and as many before it
+    as are wanted. With four of them nothing that happens between two latent frames is left out; latent frame 0, before
+    which nothing happened, repeats frame 0.
+
+    Raises: ConfigError when num_frames is not 1 + a multiple of four.
+    """
+    return [max(0, frame - back) for frame in latent_frame_indices(num_frames) for back in range(per_latent_frame)]
+
+
+def stack_controls(
+    maps: Float[Tensor, "b v c frames h w"], per_latent_frame: int
+) -> Float[Tensor, "b v channels t h w"]:
+    """Maps of :func:`control_frames`, those of one latent frame stacked as channels: the first nine are of frame 4 j."""
+    return rearrange(maps, "b v c (t k) h w -> b v (k c) t h w", k=per_latent_frame)
+
+
 def grid_sigma(
     grid_size: tuple[int, int], sigma_px_ref: float = SIGMA_PX_REFERENCE, ref: tuple[int, int] = REFERENCE_CANVAS
 ) -> tuple[float, float]:

@@ -122,6 +122,7 @@ class DistillationRun:
             views=tuple(config.views),
             tracks=tracks,
             wrist_projection=contract.wrist_projection,
+            action_frames=info.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in episodes.rows},
             native_size=native,
             device=device,

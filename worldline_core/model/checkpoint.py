@@ -16,7 +16,7 @@ from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
-from worldline_core.model.contracts import ActionContract, CausalSpec, TrainedClips
+from worldline_core.model.contracts import TEMPORAL, ActionContract, CausalSpec, TrainedClips
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
@@ -26,6 +26,7 @@ CheckpointKind = Literal["base", "stage1", "stage2", "causal"]
 FORMAT = "worldline.checkpoint"
 VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "checkpoint.json"
+MAPS_IN = "action_encoder.proj.weight"
 
 
 class CheckpointInfo(StrictModel):
@@ -57,6 +58,11 @@ class CheckpointInfo(StrictModel):
     def _complete(self) -> Self:
         if self.kind in ("stage2", "causal") and self.action_contract is None:
             raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
+        if self.action_contract is not None and self.action_contract.temporal != TEMPORAL[self.config.action_frames]:
+            frames = self.config.action_frames
+            raise ValueError(
+                f"action_contract.temporal: a model with action_frames {frames} needs {TEMPORAL[frames]!r}"
+            )
         if (self.kind == "causal") != (self.causal is not None):
             raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
         unknown = [view for view in self.views if view not in self.config.views]
@@ -170,6 +176,7 @@ def load_checkpoint(
     *,
     expect_kind: CheckpointKind | tuple[CheckpointKind, ...] | None = None,
     towers: Literal["both", "generation"] | None = None,
+    action_frames: Literal[1, 4] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> tuple[WorldModel, CheckpointInfo]:
     """Build the model and fill it; nothing may be missing, left over, or of another shape.
@@ -177,6 +184,8 @@ def load_checkpoint(
     Args:
         expect_kind: kind or kinds the caller can use.
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
+        action_frames: control frames per latent frame that the model shall take. Those that the checkpoint does not
+            know start with weights of zero, so that the model computes what it computed; None keeps what is stored.
 
     Raises:
         CheckpointError: anything that does not fit, saying what was expected and what was found.
@@ -194,8 +203,20 @@ def load_checkpoint(
         )
     if towers == "generation":
         config = config.model_copy(update={"towers": "generation"})
+    if (action_frames or config.action_frames) < config.action_frames:
+        raise CheckpointError(
+            "The checkpoint takes the controls of more frames",
+            where=folder,
+            expected=f"action_frames {config.action_frames}",
+            got=action_frames,
+            next_step=f"set action_frames to {config.action_frames}, or start from another checkpoint",
+        )
     path = folder / WEIGHTS
     tensors = read_weights(path, info.weights_sha256)
+    if action_frames not in (None, config.action_frames) and MAPS_IN in tensors:
+        added = (action_frames - config.action_frames) * config.action_channels * config.patch_size**2
+        tensors[MAPS_IN] = torch.nn.functional.pad(tensors[MAPS_IN], (0, added))
+        config = config.model_copy(update={"action_frames": action_frames})
     if config.towers == "generation":
         tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory

@@ -25,6 +25,12 @@ CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
 """Nodes of the paper's four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4, 0."""
 
 
+OWN_FRAME = "latent frame 0 takes frame 0, latent frame j takes frame 4 j"
+INTERVAL = "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3"
+TEMPORAL = {1: OWN_FRAME, 4: INTERVAL}
+"""Which controls a latent frame takes, by the number of control frames (``WorldModelConfig.action_frames``)."""
+
+
 class ActionContract(StrictModel):
     """What the action maps mean; a model understands no other maps than those it was trained with.
 
@@ -43,7 +49,10 @@ class ActionContract(StrictModel):
     depth_unit: Literal["m"]
     rotation: Literal["rot6d, end effector in the camera frame"]
     gripper: Literal["0 closed, 1 open"]
-    temporal: Literal["latent frame 0 takes frame 0, latent frame j takes frame 4 j"]
+    temporal: Literal[
+        "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
+        "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3",
+    ]
     reference_canvas: tuple[Literal[384], Literal[512]]
     sigma_px_ref: float = Field(gt=0)
     wrist_projection: WristProjection
@@ -59,7 +68,7 @@ class ActionContract(StrictModel):
             "depth_unit": "m",
             "rotation": "rot6d, end effector in the camera frame",
             "gripper": "0 closed, 1 open",
-            "temporal": "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
+            "temporal": OWN_FRAME,
             "reference_canvas": REFERENCE_CANVAS,
         }
         return cls.model_validate(conventions | values)

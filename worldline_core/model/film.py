@@ -47,4 +47,4 @@ def new_action_branch(config: WorldModelConfig) -> ActionEncoder | NativeActionF
     """The branch through which controls reach a model of this configuration; it starts without effect."""
     if config.action_conditioning == "native_film":
         return NativeActionFilm(config.action_channels, config.hidden_size, config.num_layers)
-    return ActionEncoder(config.action_channels, config.patch_size, config.hidden_size)
+    return ActionEncoder(config)

@@ -243,7 +243,7 @@ def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str]
         raise DataError("Latents have the wrong shape", expected=expected, got=tuple(latents.shape))
     if action_maps is not None:
         grid = latents.shape[4:] if config.action_conditioning == "maps" else (1, 1)
-        wanted = (*latents.shape[:2], config.action_channels, latents.shape[3], *grid)
+        wanted = (*latents.shape[:2], config.map_channels, latents.shape[3], *grid)
         if action_maps.shape != wanted:
             raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
 
@@ -251,25 +251,27 @@ def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str]
 class ActionEncoder(nn.Module):
     """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
 
-    Because the last layer starts at zero, a model that gains this branch computes what it computed before.
+    Because the last layer starts at zero, a model that gains this branch computes what it computed before. Maps of
+    several control frames (``map_channels``) pass the convolution one by one and meet in the linear layer.
     """
 
-    def __init__(self, channels: int, patch_size: int, hidden_size: int) -> None:
+    def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
-        self.patch_size = patch_size
-        self.conv = nn.Conv3d(channels, channels, kernel_size=(1, 3, 3), padding=(0, 1, 1))
-        self.proj = nn.Linear(channels * patch_size**2, hidden_size)
+        self.frames, self.patch_size = config.action_frames, config.patch_size
+        self.conv = nn.Conv3d(config.action_channels, config.action_channels, (1, 3, 3), padding=(0, 1, 1))
+        self.proj = nn.Linear(config.map_channels * config.patch_size**2, config.hidden_size)
         nn.init.zeros_(self.proj.weight)
         nn.init.zeros_(self.proj.bias)
 
     def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
         """Residuals for the video tokens, in order ``(t v h w)``."""
-        flat = rearrange(maps, "b v c t h w -> (b v) c t h w")
+        flat = rearrange(maps, "b v (k c) t h w -> (b v k) c t h w", k=self.frames)
         flat = flat + self.conv(flat)
         patches = rearrange(
             flat,
-            "(b v) c t (h p) (w q) -> b (t v h w) (p q c)",
+            "(b v k) c t (h p) (w q) -> b (t v h w) (k p q c)",
             v=maps.shape[1],
+            k=self.frames,
             p=self.patch_size,
             q=self.patch_size,
         )

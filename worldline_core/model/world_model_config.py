@@ -54,8 +54,10 @@ class WorldModelConfig(StrictModel):
     timestep_scale: float = Field(default=0.1, gt=0)
     """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
     action_channels: int = Field(default=9, ge=1)
-    """Channels of the action maps; with ``native_film`` the size that control vectors are padded to."""
-    # Left out of dumps at its default: checkpoints without it stay the same bytes.
+    """Channels of the map of one control frame; with ``native_film`` the size that control vectors are padded to."""
+    # Left out of dumps at their defaults: checkpoints without them stay the same bytes.
+    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
+    """Control frames whose maps a latent frame takes: its own (the paper), or all four of its interval."""
     action_conditioning: ActionConditioning = Field(default="maps", exclude_if=lambda value: value == "maps")
     """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
     prediction: Literal["velocity", "sample", "first_frame_residual"] = "velocity"
@@ -80,9 +82,16 @@ class WorldModelConfig(StrictModel):
             raise ValueError(f"rope_sections {self.rope_sections}: height and width interleave by three and do not fit")
         if self.num_heads % self.num_kv_heads:
             raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
+        if self.action_conditioning == "native_film" and self.action_frames != 1:
+            raise ValueError("action_frames: control vectors by FiLM are those of one frame, not of a whole interval")
         if len(self.views) != len(self.view_offsets) or len(set(self.views)) != len(self.views):
             raise ValueError(f"views {self.views} and view_offsets {self.view_offsets} must pair up, without repeats")
         return self
+
+    @property
+    def map_channels(self) -> int:
+        """Channels of the action maps (or vectors) of one latent frame."""
+        return self.action_channels * self.action_frames
 
     @property
     def native_size(self) -> int | None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.action_maps import render_action_maps
+from worldline_core.actions.action_maps import render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
@@ -233,7 +233,7 @@ class WorldLine:
             index = [stride * frame for frame in range(begin, begin + unit + 1, self.tokenizer.temporal_compression)]
             # A Stage II model begins a clip at every step; a causal one goes on with the first.
             start = 0 if self.causal is not None else index[0]
-            maps = self.action_maps(tracks, index, start=start, views=chosen)
+            maps = self.action_maps(tracks, index, start=start, views=chosen, stride=stride)
             clips = session.step(torch.zeros_like(maps) if without_actions else maps)
             yield [{view: video[: frames - 1 - begin] for view, video in clip.items()} for clip in clips]
 
@@ -265,27 +265,38 @@ class WorldLine:
         return -(-(longest - 1) // self.frames_per_unit) * self.frames_per_unit
 
     def action_maps(
-        self, tracks: Sequence[EpisodeTracks], frames: Sequence[int], *, start: int, views: Sequence[str]
+        self,
+        tracks: Sequence[EpisodeTracks],
+        frames: Sequence[int],
+        *,
+        start: int,
+        views: Sequence[str],
+        stride: int = 1,
     ) -> Float[Tensor, "b v a t h w"]:
-        """Maps of the controls at these frames (or vectors, of a model with FiLM); past the end of a track its last
-        controls stay.
+        """Maps of the controls of the latent frames at these recorded frames (or vectors, of a model with FiLM); past the
+        end of a track its last controls stay.
 
         Args:
             start: first frame of the clip that the frames belong to.
         """
         cut = []
+        count, native = self.info.config.action_frames, self.info.config.native_size
         for track in tracks:
-            index, last = [min(frame, track.num_frames - 1) for frame in frames], track.num_frames - 1
+            # Of every latent frame, and of those between it and the one before: `control_frames`.
+            drawn = [max(start, frame - stride * back) for frame in frames for back in range(count)]
+            index, last = [min(frame, track.num_frames - 1) for frame in drawn], track.num_frames - 1
             cut.append(track.clip(index, wrist_projection=self.contract.wrist_projection, start=min(start, last)))
-        if self.info.config.native_size is not None:
-            return native_vectors(cut, views, self.info.config.native_size).to(self.device)
-        maps = render_action_maps(
-            collate_tracks(cut, views=views),
-            cut[0].image_size,
-            grid_size=self.contract.grid_size,
-            sigma_px_ref=self.contract.sigma_px_ref,
+        maps = (
+            native_vectors(cut, views, native)
+            if native is not None
+            else render_action_maps(
+                collate_tracks(cut, views=views),
+                cut[0].image_size,
+                grid_size=self.contract.grid_size,
+                sigma_px_ref=self.contract.sigma_px_ref,
+            )
         )
-        return maps.to(self.device)
+        return stack_controls(maps.to(self.device), count)
 
     def simulator(
         self, seeds: Sequence[int], views: Sequence[str] | None = None, stride: int = 1

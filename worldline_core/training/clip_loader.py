@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
+from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import (
     ActionTracks,
     EpisodeTracks,
@@ -187,6 +187,7 @@ class ClipLoader:
         tracks: controls; the maps get the width that the tracks were made for.
         wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
         native_size: of the control vectors that are given instead of maps, where the model takes these.
+        action_frames: control frames whose maps a latent frame takes.
         frame_rates: frame rate of each episode [1/s]; needed with ``text``, and for temporal positions by each clip's own
             rate.
     """
@@ -201,6 +202,7 @@ class ClipLoader:
         frame_rates: Mapping[str, float] | None = None,
         wrist_projection: WristProjection | None = None,
         native_size: int | None = None,
+        action_frames: int = 1,
         device: str = "cpu",
     ) -> None:
         self.store = store
@@ -210,6 +212,7 @@ class ClipLoader:
         self.frame_rates = frame_rates or {}
         self.wrist_projection: WristProjection | None = wrist_projection
         self.native_size = native_size
+        self.action_frames = action_frames
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
 
@@ -255,12 +258,12 @@ class ClipLoader:
         return rate / clip.stride
 
     def action_maps(self, clips: tuple[Clip, ...], views: tuple[str, ...]) -> Float[Tensor, "b v a t h w"]:
-        """Maps at latent resolution (or vectors): latent frame j takes the control of video frame 4 j (docs/method.md section 2)."""
+        """Maps at latent resolution (or vectors) of the controls that each latent frame takes (docs/method.md section 2)."""
         if self.tracks is None or self.wrist_projection is None:
             raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
         cut = []
         for clip in clips:
-            frames = [clip.frames[index] for index in latent_frame_indices(clip.num_frames)]
+            frames = [clip.frames[index] for index in control_frames(clip.num_frames, self.action_frames)]
             if clip.episode_id not in self._tracks:
                 self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
             tracks = self._tracks[clip.episode_id]
@@ -269,4 +272,5 @@ class ClipLoader:
             return native_vectors(cut, views, self.native_size).to(self.device)
         tensors = collate_tracks(cut, views=views).to(self.device)
         grid_size = self.store.latent_shape[1:]
-        return render_action_maps(tensors, cut[0].image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)
+        maps = render_action_maps(tensors, cut[0].image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)
+        return stack_controls(maps, self.action_frames)

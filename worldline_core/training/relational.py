@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ class RelationalConfig(StrictModel):
     bins: int = Field(default=8, ge=2)
     grid: tuple[int, int] = (8, 8)
     student_layer: int | None = Field(default=None, ge=1, description="None: the middle block")
-    cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher features stay in memory")
+    cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher's relations stay in memory")
 
 
 def common_shape(config: RelationalConfig, *grids: tuple[int, ...]) -> tuple[int, int, int]:
@@ -65,32 +66,47 @@ def relation(first: Float[Tensor, "*batch n d"], second: Float[Tensor, "*batch m
     return functional.normalize(first, dim=-1) @ functional.normalize(second, dim=-1).transpose(-1, -2)
 
 
-def intra_relations(pooled: Float[Tensor, "b v t n d"], view: int) -> Float[Tensor, "b s n n"]:
-    """Relations between adjacent bins of one view."""
-    return relation(pooled[:, view, :-1], pooled[:, view, 1:])
+@dataclass(frozen=True)
+class Relations:
+    """All that the terms need of a clip's teacher: half a megabyte at full size, where its features are a gigabyte.
+
+    Attributes:
+        shape: (bins, rows, columns) that features are pooled to.
+        intra: relations between adjacent bins of each view.
+        cross: relations between the head and each wrist view in the same bin (no wrists: an empty axis).
+    """
+
+    shape: tuple[int, int, int]
+    intra: Float[Tensor, "b v s n n"]
+    cross: Float[Tensor, "b w t n n"]
 
 
-def cross_relations(pooled: Float[Tensor, "b v t n d"], wrist: int) -> Float[Tensor, "b t n n"]:
-    """Relations between the head view (0) and a wrist view in the same bin."""
-    return relation(pooled[:, 0], pooled[:, wrist])
+def relations(features: Float[Tensor, "b v t h w d"], shape: tuple[int, int, int]) -> Relations:
+    """Of every view and wrist, after pooling."""
+    pooled = pool_features(features, shape)
+    return Relations(
+        shape,
+        relation(pooled[:, :, :-1], pooled[:, :, 1:]),
+        relation(pooled[:, :1].expand_as(pooled[:, 1:]), pooled[:, 1:]),
+    )
 
 
 def relational_losses(
-    student: Float[Tensor, "b v t n d"], teacher: Float[Tensor, "b v t n e"], step: int
+    student: Float[Tensor, "b v t n d"], teacher: Relations, step: int
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """(intra, cross) L1 distances. The view goes round robin with the step; the wrist alternates left and right.
 
     The teacher is detached: gradients reach the student only. With a single view, the cross term is zero.
     """
     views = student.shape[1]
-    teacher = teacher.detach()
     view = step % views
-    intra = (intra_relations(student, view) - intra_relations(teacher, view)).abs().mean()
+    intra = relation(student[:, view, :-1], student[:, view, 1:]) - teacher.intra[:, view].detach()
+    intra = intra.abs().mean()
     if views == 1:
         return intra, intra.new_zeros(())
-    wrist = 1 + step % (views - 1)
-    cross = (cross_relations(student, wrist) - cross_relations(teacher, wrist)).abs().mean()
-    return intra, cross
+    wrist = step % (views - 1)
+    cross = relation(student[:, 0], student[:, 1 + wrist]) - teacher.cross[:, wrist].detach()
+    return intra, cross.abs().mean()
 
 
 class RelationalScales:
@@ -119,30 +135,43 @@ class RelationalScales:
         return scales[0], scales[1]
 
 
-class TeacherFeatures:
-    """Teacher features of clips, from the recordings' frames, kept in memory (half precision)."""
+class TeacherRelations:
+    """The teacher's relations of clips, from the recordings' frames, kept in memory as they were computed."""
 
-    def __init__(self, teacher: VideoTeacher, episodes: Path, *, cached_clips: int) -> None:
+    def __init__(self, teacher: VideoTeacher, episodes: Path, config: RelationalConfig) -> None:
         self.teacher = teacher
         self.episodes = EpisodeSet.open(episodes)
-        self.cached_clips = cached_clips
-        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Tensor] = OrderedDict()
+        self.config = config
+        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Relations] = OrderedDict()
 
-    def features(
-        self, clips: Sequence[Clip], views: Sequence[str], frames: UInt8[Tensor, "b v n height width 3"] | None = None
-    ) -> Float[Tensor, "b v t h w d"]:
-        """Features of every clip and view.
+    def relations(
+        self,
+        clips: Sequence[Clip],
+        views: Sequence[str],
+        grid: tuple[int, int, int],
+        frames: UInt8[Tensor, "b v n height width 3"] | None = None,
+    ) -> Relations:
+        """Relations of every clip.
 
         Args:
+            grid: the student's (t, h, w) of these clips.
             frames: of these clips, where they are read already; else they are decoded here, at the size of the recording.
         """
         given = [None] * len(clips) if frames is None else list(frames)
-        # Half precision does not survive a stack under CPU autocast.
-        return torch.stack([self._clip(c, tuple(views), f).float() for c, f in zip(clips, given, strict=True)])
+        each = [self._clip(clip, tuple(views), grid, read) for clip, read in zip(clips, given, strict=True)]
+        # Half precision does not survive a concatenation under CPU autocast.
+        with torch.autocast(each[0].intra.device.type, enabled=False):
+            return Relations(
+                each[0].shape, torch.cat([one.intra for one in each]), torch.cat([one.cross for one in each])
+            )
 
     def _clip(
-        self, clip: Clip, views: tuple[str, ...], frames: UInt8[Tensor, "v n height width 3"] | None
-    ) -> Float[Tensor, "v t h w d"]:
+        self,
+        clip: Clip,
+        views: tuple[str, ...],
+        grid: tuple[int, int, int],
+        frames: UInt8[Tensor, "v n height width 3"] | None,
+    ) -> Relations:
         key = (clip, views)
         if key in self._cache:
             self._cache.move_to_end(key)
@@ -152,31 +181,44 @@ class TeacherFeatures:
             decoded = [self.episodes.frames(position, view, list(clip.frames)) for view in views]
             frames = torch.from_numpy(np.stack(decoded))
         video = rearrange(frames.float() / 255.0, "v t h w c -> v c t h w")
-        features = self.teacher.features(video).to("cpu", torch.float16)
-        # Computed and cached values must be the same bits, so that a resumed run equals an undisturbed one.
-        if self.cached_clips:
-            self._cache[key] = features
-            if len(self._cache) > self.cached_clips:
+        # Rounded to half precision, as they always were; pooled where they are computed.
+        features = self.teacher.features(video).to(torch.float16)
+        found = relations(features[None], common_shape(self.config, grid, features.shape[1:4]))
+        if self.config.cached_clips:
+            self._cache[key] = found
+            if len(self._cache) > self.config.cached_clips:
                 self._cache.popitem(last=False)
-        return features
+        return found
 
 
 class RelationalTerm:
-    """Teacher features, student layer and running scales of the relational terms."""
+    """The teacher's relations, student layer and running scales of the relational terms."""
 
-    def __init__(self, config: RelationalConfig, teacher: TeacherFeatures, num_layers: int) -> None:
+    def __init__(self, config: RelationalConfig, teacher: TeacherRelations, num_layers: int) -> None:
         self.config = config
         self.teacher = teacher
         self.layer = config.student_layer or max(1, num_layers // 2)
         self.scales = RelationalScales(config)
 
+    def taught(self, batch: Batch, grid: tuple[int, int, int]) -> Relations:
+        """What the teacher says of a batch, on its device: asked before the student runs, whose activations fill memory.
+
+        Args:
+            grid: the student's (t, h, w).
+        """
+        found = self.teacher.relations(batch.clips, batch.views, grid, batch.frames)
+        device = batch.latents.device
+        return replace(found, intra=found.intra.to(device), cross=found.cross.to(device))
+
     def add(
-        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], batch: Batch, step: int
+        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], taught: Relations, step: int
     ) -> tuple[Tensor, dict[str, float]]:
-        """The flow-matching loss plus the weighted relational terms."""
-        taught = self.teacher.features(batch.clips, batch.views, batch.frames).to(features.device)
-        shape = common_shape(self.config, features.shape[2:5], taught.shape[2:5])
-        intra, cross = relational_losses(pool_features(features, shape), pool_features(taught, shape), step)
+        """The flow-matching loss plus the weighted relational terms.
+
+        Args:
+            features: the student's; taught: of the same clips.
+        """
+        intra, cross = relational_losses(pool_features(features, taught.shape), taught, step)
         # Over all processes, so that their scales stay equal and one saved state is everyone's.
         seen = average_values({"flow": flow.item(), "intra": intra.item(), "cross": cross.item()})
         scale_intra, scale_cross = self.scales.update(seen["flow"], seen["intra"], seen["cross"], step)

@@ -149,6 +149,7 @@ class Stage:
         return ClipLoader(
             self.source,
             views=self.model.config.views,
+            action_frames=self.model.config.action_frames,
             frame_rates={row.episode_id: row.fps for row in self.episodes.rows},
             native_size=self.model.config.native_size,
             device=self.config.trainer.device,
