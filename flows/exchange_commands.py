@@ -8,8 +8,11 @@ from pathlib import Path
 
 def add_exchange_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add them to the command line's parser."""
-    card = commands.add_parser("card", help="write the dataset card of an EpisodeSet: README.md, index.html, pictures")
-    card.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered")
+    card = commands.add_parser("card", help="write the card of an EpisodeSet or a checkpoint: README.md, and pictures")
+    card.add_argument(
+        "artifact", type=Path, metavar="FOLDER", help="an EpisodeSet, curated or filtered, or a checkpoint"
+    )
+    card.add_argument("--license", metavar="NAME", help="of a checkpoint's weights, as the hub writes it (apache-2.0)")
     card.add_argument("--output", type=Path, default=None, help="where the card goes (default: FOLDER/run/card)")
     card.add_argument("--title", default=None, help="its heading (default: EpisodeSet and the folder's name)")
     card.set_defaults(run=_card)
@@ -48,6 +51,14 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
 
 
 def _card(arguments: argparse.Namespace) -> None:
+    if (arguments.artifact / "checkpoint.json").is_file():
+        from worldline_core.model.checkpoint import read_checkpoint_info
+        from worldline_core.model.model_card import write_model_card
+
+        print(
+            f"wrote {write_model_card(arguments.artifact, read_checkpoint_info(arguments.artifact), arguments.license)}"
+        )
+        return
     from worldline_core.report.dataset_card import write_card
 
     for path in write_card(

@@ -273,6 +273,17 @@ def test_tracks_of_another_width_are_refused(inputs: dict[str, Path], tmp_path: 
         distill(config(), inputs, tmp_path / "out")
 
 
+def test_controls_of_another_meaning_are_refused_before_the_first_step(inputs: dict[str, Path], tmp_path: Path) -> None:
+    """A Stage II model of measured joints, tracks of commands."""
+    path = inputs["stage2"] / "checkpoint.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"action_contract": content["action_contract"] | {"controls": "state"}}))
+    with pytest.raises(
+        CheckpointError, match=r"(?s)contract differs.*episode a: controls.*expected: .*state.*got: .*action"
+    ):
+        distill(config(), inputs, tmp_path / "out")
+
+
 def test_distribution_matching_runs_whole_cycles() -> None:
     with pytest.raises(ValidationError, match="multiples of 6"):
         DistillConfig.model_validate({"distribution_matching": {"trainer": trainer(10)}})

@@ -1,4 +1,4 @@
-"""A small hub on the loopback: the HTTP endpoints that huggingface_hub's client uses for dataset repositories.
+"""A small hub on the loopback: the HTTP endpoints that huggingface_hub's client uses for dataset repositories, and those it fetches models by.
 
 Repositories live in memory. Large files go through the LFS batch protocol, small ones inside of the commit, as on the real
 hub; the newer chunk storage (xet) is switched off in the client. Faults are put in by `refuse`.
@@ -100,7 +100,9 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
 
         def repository(self, path: str) -> tuple[str, str]:
             """ORG/NAME, and what comes after it."""
-            pieces = path.removeprefix("/api").removeprefix("/datasets/").split("/", 2)
+            pieces = (
+                path.removeprefix("/api").removeprefix("/datasets").removeprefix("/models").lstrip("/").split("/", 2)
+            )
             pieces += [""] * (3 - len(pieces))
             return f"{pieces[0]}/{pieces[1].removesuffix('.git')}", pieces[2]
 

@@ -227,14 +227,24 @@ def test_outcomes_do_not_reach_the_model(world: Any, stage1_folder: Path, tmp_pa
     assert digested(tmp_path / "one") == digested(tmp_path / "two")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [("sigma_px_ref", 10.0, "60\\.0"), ("controls", "state", "action"), ("fps", 30.0, "8\\.0")],
+)
 def test_stage2_goes_on_with_maps_of_the_same_meaning_only(
-    world: Any, model_config: MakeConfig, make_contract: Callable[..., ActionContract], tmp_path: Path
+    world: Any,
+    model_config: MakeConfig,
+    make_contract: Callable[..., ActionContract],
+    tmp_path: Path,
+    name: str,
+    value: Any,
+    found: str,
 ) -> None:
     model = WorldModel(model_config(towers="generation"))
     model.initialise(torch.Generator().manual_seed(0))
-    narrow = make_contract(sigma_px_ref=10.0, tokenizer="synthetic")
-    save_checkpoint(tmp_path / "stage2", model, kind="stage2", action_contract=narrow)
-    with pytest.raises(CheckpointError, match=r"(?s)action contract differs.*'sigma_px_ref': 10\.0.*60\.0"):
+    other = make_contract(**({"sigma_px_ref": 60.0, "tokenizer": "synthetic"} | {name: value}))
+    save_checkpoint(tmp_path / "stage2", model, kind="stage2", action_contract=other)
+    with pytest.raises(CheckpointError, match=rf"(?s)action contract differs.*{name}.*{value}.*{found}"):
         train_stage2(stage2(2, start_from="stage2"), {**world.inputs, "stage1": tmp_path / "stage2"}, tmp_path / "out")
 
 

@@ -313,6 +313,10 @@ class ActionTracks:
     def __iter__(self) -> Iterator[EpisodeTracks]:
         return (self.tracks(episode_id) for episode_id in self._rows)
 
+    def controls(self, episode_id: str) -> str:
+        """What was projected for an episode that has tracks: commands, measured joints, or recorded tool poses."""
+        return self._rows[episode_id]["controls"]
+
     def tracks(self, episode_id: str) -> EpisodeTracks:
         """Tracks of one episode.
 

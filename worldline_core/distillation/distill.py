@@ -116,7 +116,8 @@ class DistillationRun:
             )
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=inputs["latents"], **found)
-        contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
+        rows = training_rows(store, episodes, stage=2, tracks=tracks)
+        contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
             store,
             views=tuple(config.views),
@@ -133,7 +134,7 @@ class DistillationRun:
             stage2_info=info,
             store=store,
             loader=loader,
-            rows=training_rows(store, episodes, stage=2, tracks=tracks),
+            rows=rows,
             output=output,
             perceptual=_perceptual(config, Path(inputs["tokenizer"]), device),
         )

@@ -1,26 +1,24 @@
-"""Checkpoints: ``model.safetensors`` and ``checkpoint.json``, read strictly."""
+"""Checkpoints: ``model.safetensors`` (or several files with an index) and ``checkpoint.json``, read strictly."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import torch
 from pydantic import ValidationError, field_validator, model_validator
-from safetensors import SafetensorError
-from safetensors.torch import load, save
 from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 from worldline_core.model.contracts import TEMPORAL, ActionContract, CausalSpec, TrainedClips
 from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.weight_files import MAX_SHARD_BYTES, read_weights, write_weights
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import write_json_atomic
 
 CheckpointKind = Literal["base", "stage1", "stage2", "causal"]
 FORMAT = "worldline.checkpoint"
@@ -103,10 +101,12 @@ def save_checkpoint(
     metadata: Mapping[str, Any] | None = None,
     dtype: torch.dtype = torch.float16,
     state_dict: Mapping[str, Tensor] | None = None,
+    max_shard_bytes: int = MAX_SHARD_BYTES,
 ) -> None:
     """Write a model. Equal weights and metadata give equal bytes.
 
     Args:
+        max_shard_bytes: weights above this go into several files with an index.
         state_dict: weights to store instead of the model's own (an averaged copy).
 
     Raises:
@@ -120,7 +120,6 @@ def save_checkpoint(
             raise CheckpointError(
                 "A weight is not finite", where=name, next_step=f"it may overflow {dtype}; check training"
             )
-    weights = save(tensors)
     info = _checked(
         {
             "kind": kind,
@@ -130,12 +129,13 @@ def save_checkpoint(
             "trained": trained,
             "metadata": dict(metadata or {}),
             "dtype": str(dtype).removeprefix("torch."),
-            "weights_sha256": hashlib.sha256(weights).hexdigest(),
+            "weights_sha256": "",
         },
         where=folder,
     )
-    write_bytes_atomic(folder / WEIGHTS, weights)
-    write_description(folder, info)
+    # The description goes last: until then the folder is no checkpoint.
+    digest = write_weights(folder / WEIGHTS, tensors, max_shard_bytes)
+    write_description(folder, info.model_copy(update={"weights_sha256": digest}))
 
 
 def write_description(folder: Path, info: CheckpointInfo) -> None:
@@ -171,17 +171,19 @@ def _checked(content: Mapping[str, Any], *, where: object) -> CheckpointInfo:
         ) from error
 
 
-def load_checkpoint(
+def load_checkpoint[Model: WorldModel](
     folder: Path,
     *,
     expect_kind: CheckpointKind | tuple[CheckpointKind, ...] | None = None,
     towers: Literal["both", "generation"] | None = None,
     action_frames: Literal[1, 4] | None = None,
     dtype: torch.dtype = torch.float32,
-) -> tuple[WorldModel, CheckpointInfo]:
+    model_class: Callable[[WorldModelConfig], Model] = WorldModel,
+) -> tuple[Model, CheckpointInfo]:
     """Build the model and fill it; nothing may be missing, left over, or of another shape.
 
     Args:
+        model_class: what is built.
         expect_kind: kind or kinds the caller can use.
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
         action_frames: control frames per latent frame that the model shall take. Those that the checkpoint does not
@@ -221,7 +223,7 @@ def load_checkpoint(
         tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
         _check_fit({name: tuple(t.shape) for name, t in WorldModel(config).state_dict().items()}, tensors, path)
-    model = WorldModel(config)
+    model = model_class(config)
     fill(model, tensors, where=path, dtype=dtype)
     return model, info
 
@@ -247,27 +249,6 @@ def read_description(path: Path, form: str, noun: str, *, version: int | None = 
     if not isinstance(content, dict) or found != (form, version):
         raise CheckpointError(f"Not a {noun} of this version", where=path, expected=(form, version), got=found)
     return content
-
-
-def read_weights(path: Path, sha256: str | None) -> dict[str, Tensor]:
-    """The tensors of a safetensors file.
-
-    Args:
-        sha256: digest that the description gives; None where it gives none.
-
-    Raises:
-        CheckpointError: the file is missing or damaged, or holds other weights.
-    """
-    if not path.is_file():
-        raise CheckpointError("The checkpoint has no weights", where=path)
-    content = path.read_bytes()
-    digest = hashlib.sha256(content).hexdigest()
-    if sha256 not in (None, digest):
-        raise CheckpointError("The weights are not those that are described", where=path, expected=sha256, got=digest)
-    try:
-        return load(content)
-    except SafetensorError as error:
-        raise CheckpointError("The weights file is damaged", where=path, got=str(error)) from error
 
 
 def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object, dtype: torch.dtype) -> None:

@@ -7,13 +7,14 @@ refused by the field's name.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import Literal, Self
 
 from pydantic import Field, field_validator
 from torch import Tensor
 
 from worldline_core.actions.action_maps import REFERENCE_CANVAS
-from worldline_core.actions.episode_tracks import WristProjection
+from worldline_core.actions.episode_tracks import ActionTracks, WristProjection
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
@@ -92,6 +93,17 @@ class ActionContract(StrictModel):
                 got=differing,
                 next_step="make the action tracks and latents as the model's contract says, or use another checkpoint",
             )
+
+    def require_tracks(self, episode_ids: Iterable[str], tracks: ActionTracks) -> None:
+        """Refuse action tracks before the first step where maps would be drawn of other controls or at another width.
+
+        Raises:
+            CheckpointError: naming the first episode that differs, and the field.
+        """
+        self.require(where=tracks.root, sigma_px_ref=tracks.sigma_px_ref)
+        for episode_id in episode_ids:
+            if episode_id in tracks:
+                self.require(where=f"{tracks.root}, episode {episode_id}", controls=tracks.controls(episode_id))
 
 
 class TrainedClips(StrictModel):

@@ -9,20 +9,18 @@ from typing import Any, Literal
 
 import torch
 from pydantic import Field, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file
-from torch import Tensor
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, save_checkpoint
 from worldline_core.model.layers import is_text_parameter
+from worldline_core.model.weight_files import read_weights
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_nano_config
 from worldline_core.store.artifact_files import read_json
 
 CLASS_NAME = "Cosmos3OmniTransformer"
-SINGLE, INDEX = "diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.safetensors.index.json"
+SINGLE = "diffusion_pytorch_model.safetensors"
 UNUSED_PARAMETERS = (
     "lm_head.",
     "audio_proj_in.",
@@ -123,7 +121,7 @@ def load_cosmos3(
     raw = read_json(root / "config.json")
     config = config_from_diffusers(raw, where=root / "config.json", fps=fps)
     config = WorldModelConfig.model_validate(config.model_dump() | {"towers": towers} | dict(changes or {}))
-    tensors = _read_tensors(root)
+    tensors = read_weights(root / SINGLE, None)
     without_text = towers == "generation"
     ignored = {
         name for name in tensors if name.startswith(UNUSED_PARAMETERS) or (without_text and is_text_parameter(name))
@@ -134,21 +132,6 @@ def load_cosmos3(
     new = sorted(name for name in own if name.startswith("action_encoder.") or name == "view_embedding")
     fill(model, kept | {name: own[name] for name in new}, where=root, dtype=dtype)
     return model, Cosmos3Report(tuple(sorted(ignored)), tuple(new))
-
-
-def _read_tensors(root: Path) -> dict[str, Tensor]:
-    names = [SINGLE]
-    if (root / INDEX).is_file():
-        names = sorted(set(read_json(root / INDEX).get("weight_map", {}).values()))
-    tensors: dict[str, Tensor] = {}
-    for path in (root / Path(name).name for name in names):
-        if not path.is_file():
-            raise CheckpointError("A weight file is missing", where=path, next_step="download the folder again")
-        try:
-            tensors |= load_file(path)
-        except SafetensorError as error:
-            raise CheckpointError("A weight file is damaged", where=path, got=str(error)) from error
-    return tensors
 
 
 class ImportBackboneConfig(StrictModel):

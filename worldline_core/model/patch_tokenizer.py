@@ -24,8 +24,9 @@ from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.model.checkpoint import fill, read_description, read_weights
+from worldline_core.model.checkpoint import fill, read_description
 from worldline_core.model.video_tokenizer import GroupDecoder, check_latents, check_video
+from worldline_core.model.weight_files import read_weights
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"

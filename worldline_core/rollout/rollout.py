@@ -96,11 +96,13 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     chosen = choose_episodes(config, episodes)
     rates = [float(episodes.rows[position].fps) for position in chosen]
     copying = config.sampler == "copy_first_frame"
-    world = FirstFrameCopy(episodes) if copying else _load(config, inputs, rates, tracks)
+    world = FirstFrameCopy(episodes) if copying else _load(config, inputs, rates)
     if isinstance(world, WorldLine) and world.info.config.native_size is not None:
         tracks.episodes = episodes
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
     planned, left_out = plan_predictions(config, episodes, tracks, chosen, world, fps)
+    if isinstance(world, WorldLine):
+        world.contract.require_tracks(dict.fromkeys(item.controls_of for item in planned), tracks)
     if left_out:
         write_quarantine(output, left_out)
     writer = RolloutSetWriter(output, config.method, fps / config.stride, crf=config.crf)
@@ -150,11 +152,11 @@ def _account(
     return {name: value for name, value in account.items() if value}
 
 
-def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[float], tracks: ActionTracks) -> WorldLine:
+def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[float]) -> WorldLine:
     """The model for recordings of these rates.
 
     Raises:
-        CheckpointError: it is of the wrong kind for the sampler, or was trained with other controls.
+        CheckpointError: it is of the wrong kind for the sampler, or was trained at another rate than any of these.
     """
     world = WorldLine.from_pretrained(
         Path(inputs["checkpoint"]),
@@ -170,7 +172,6 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
     )
     if world.contract.fps not in rates:
         world.contract.require(where=inputs["episodes"], fps=rates[0])
-    world.contract.require(where=inputs["tracks"], sigma_px_ref=tracks.sigma_px_ref)
     return world
 
 
@@ -183,21 +184,6 @@ def _observed(
         frames = [episodes.frames(item.position, view, [0]) for view in item.views]
         firsts.append(torch.stack([frames_to_video(frame, world.image_size)[:, 0] for frame in frames]))
     return torch.stack(firsts)
-
-
-def _driven(
-    world: WorldLine | FirstFrameCopy, tracks: ActionTracks, batch: Sequence[Prediction]
-) -> list[EpisodeTracks]:
-    """Tracks that drive a batch.
-
-    Raises:
-        CheckpointError: the model was trained with other controls than these.
-    """
-    driven = [tracks.tracks(item.controls_of) for item in batch]
-    if isinstance(world, WorldLine):
-        for track in driven:
-            world.contract.require(where=f"{tracks.root}, episode {track.episode_id}", controls=track.controls)
-    return driven
 
 
 def _predict(
@@ -216,7 +202,7 @@ def _predict(
         if pieces is None:
             pieces = world.stream(
                 _observed(world, episodes, batch),
-                _driven(world, tracks, batch),
+                [tracks.tracks(item.controls_of) for item in batch],
                 max(item.frames for item in batch),
                 [item.seed for item in batch],
                 views=batch[0].views,
@@ -247,5 +233,5 @@ def _timed_blocks(
 ) -> dict[str, list[float]]:
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
-    maps = world.action_maps(_driven(world, tracks, [item]), index, start=0, views=item.views)
+    maps = world.action_maps([tracks.tracks(item.controls_of)], index, start=0, views=item.views)
     return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, config.timed_blocks)

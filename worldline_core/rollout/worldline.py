@@ -15,6 +15,7 @@ from worldline_core.actions.action_maps import render_action_maps, stack_control
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import CheckpointError, DataError
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
+from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
@@ -96,6 +97,7 @@ class WorldLine:
         """Load a Stage II or causal checkpoint and the tokenizer that it was trained with.
 
         Args:
+            folder: of the checkpoint, or ORG/NAME of the hub (safetensors and JSON files are fetched, nothing else).
             tokenizer: its folder; by default ``tokenizer`` in the checkpoint's folder, else beside it.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder.
@@ -107,9 +109,10 @@ class WorldLine:
 
         Raises:
             CheckpointError: a folder is not what it should be, or the tokenizer is not the model's.
+            UnavailableError: the hub does not give it.
             ConfigError: fewer than one step.
         """
-        folder = Path(folder)
+        folder = pretrained_folder(folder)
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation")
         places = [Path(tokenizer)] if tokenizer is not None else [folder / "tokenizer", folder.parent / "tokenizer"]

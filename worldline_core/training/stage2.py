@@ -108,7 +108,8 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     )
     learnt = read_checkpoint_info(parent).action_contract
     if learnt is not None:
-        kept = {"maps", "sigma_px_ref", "wrist_projection", "tokenizer"}
+        kept = {"maps", "sigma_px_ref", "wrist_projection", "tokenizer", "fps"}
+        learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
         learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
     loader = stage.loader(tracks=tracks, wrist_projection=config.wrist_projection)
     objective = FlowMatchingObjective(

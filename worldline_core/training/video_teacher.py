@@ -20,7 +20,8 @@ from torch.nn import functional
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.checkpoint import fill, read_description, read_weights
+from worldline_core.model.checkpoint import fill, read_description
+from worldline_core.model.weight_files import read_weights
 
 DESCRIPTION, WEIGHTS = "teacher.json", "teacher.safetensors"
 FORMAT = "worldline.small_video_teacher"

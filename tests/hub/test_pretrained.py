@@ -1,0 +1,129 @@
+"""Models from a folder and from a hub: the same model, safetensors and JSON alone, clear words where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.hub.conftest import Hub, Repository
+from worldline_core import WorldLine, WorldModel
+from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
+from worldline_core.model.checkpoint import save_checkpoint
+from worldline_core.model.pretrained import pretrained_folder
+from worldline_core.store.artifact_files import write_manifest
+
+
+@pytest.fixture
+def folder(tmp_path: Path, make_model: Callable[..., Any], make_contract: Callable[..., Any]) -> Path:
+    facts = {"episodes": 3, "sources": {"agibot": 2, "galaxea": 1}, "step": 20, "seed": 0, "metrics": {"loss": 0.25}}
+    path = tmp_path / "model"
+    save_checkpoint(path, make_model(), kind="stage2", action_contract=make_contract(), metadata=facts)
+    return path
+
+
+def publish(hub: Hub, folder: Path, name: str = "ORG/NAME") -> Repository:
+    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    hub.repositories[name] = Repository(private=True, files={path: (content, False) for path, content in files.items()})
+    return hub.repositories[name]
+
+
+def test_a_model_is_saved_as_it_was_opened(folder: Path, tmp_path: Path) -> None:
+    model = WorldModel.from_pretrained(folder)
+    assert (model.info.kind, model.training) == ("stage2", False)
+    model.save_pretrained(tmp_path / "one")
+    for name in ("model.safetensors", "checkpoint.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (folder / name).read_bytes()
+    model.save_pretrained(tmp_path / "many", max_shard_bytes=8_000)
+    assert len(list((tmp_path / "many").glob("model-*.safetensors"))) > 2
+    again = WorldModel.from_pretrained(tmp_path / "many", expect_kind="stage2")
+    assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
+    with pytest.raises(CheckpointError, match="wrong kind"):
+        WorldModel.from_pretrained(folder, expect_kind="causal")
+
+
+def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path, folder: Path) -> None:
+    store = tmp_path / "artifacts"
+    trained, filtered, curated = (store / step / "0" for step in ("train_stage2", "filter", "curate"))
+    curated.mkdir(parents=True)
+    filtered.mkdir(parents=True)
+    (curated / "sources.json").write_text(
+        '[{"label": "agibot", "kind": "lerobot_v3", "license": "CC-BY-NC-SA-4.0", "redistribution": "no", "names": ["agibot"],'
+        ' "found": 2, "kept": 2, "reasons": {}, "image_size": null, "fps": null, "stride": null, "conventions": {}}]'
+    )
+    write_manifest(filtered, {"inputs": {"episodes": {"path": "curate/0", "digest": "1"}}})
+    trained.parent.mkdir(parents=True)
+    folder.rename(trained)
+    environment = {"packages": {"torch": "2.11"}}
+    inputs = {"episodes": {"path": "filter/0", "digest": "2"}}
+    write_manifest(trained, {"step": "train_stage2", "version": 1, "inputs": inputs, "environment": environment})
+    WorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert card.startswith("---\nlibrary_name: worldline\n")
+    for said in (
+        "A Stage II model", "source agibot: 2 episodes, licence CC-BY-NC-SA-4.0", "source galaxea: 1 episodes, licence not stated",
+        "steps: 20, seed 0", "- loss: 0.25", "- sigma_px_ref: 40.0", "- fps: 8.0", "torch 2.11", "Of the weights: not stated",
+    ):  # fmt: skip
+        assert said in card
+
+
+def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folder: Path) -> None:
+    (folder / "pytorch_model.bin").write_bytes(b"\x80\x04cos\nsystem\n")
+    (folder / "modeling.py").write_text("raise SystemExit")
+    publish(hub, folder)
+    found = pretrained_folder("ORG/NAME")
+    assert sorted(path.name for path in found.iterdir()) == ["checkpoint.json", "model.safetensors"]
+    model = WorldModel.from_pretrained("ORG/NAME", revision="main")
+    here = WorldModel.from_pretrained(folder)
+    assert all(torch.equal(value, here.state_dict()[name]) for name, value in model.state_dict().items())
+    assert hub.tokens == {"hf_test"}
+    assert not any(path.endswith((".bin", ".py")) for _, path in hub.requests if "resolve" in path)
+    with pytest.raises(CheckpointError, match="tokenizer is not here"):
+        WorldLine.from_pretrained("ORG/NAME")
+
+
+def test_a_repository_with_its_tokenizer_predicts(hub: Hub, project_root: Path, tmp_path: Path) -> None:
+    models = project_root / "artifacts" / "shipped" / "models"
+    (tmp_path / "repository").mkdir()
+    for name in ("checkpoint.json", "model.safetensors"):
+        (tmp_path / "repository" / name).symlink_to(models / "causal" / name)
+    (tmp_path / "repository" / "tokenizer").symlink_to(models / "tokenizer", target_is_directory=True)
+    files = [
+        path for name in (".", "tokenizer") for path in (tmp_path / "repository" / name).iterdir() if path.is_file()
+    ]
+    names = {path.relative_to(tmp_path / "repository").as_posix(): (path.read_bytes(), True) for path in files}
+    hub.repositories["ORG/NAME"] = Repository(private=False, files=names)
+    world, here = WorldLine.from_pretrained("ORG/NAME"), WorldLine.from_pretrained(models / "causal")
+    assert (world.info, world.causal) == (here.info, here.causal)
+
+
+def test_without_the_hub_it_is_said_what_to_do(
+    hub: Hub, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    publish(hub, folder)
+    with pytest.raises(
+        UnavailableError, match=r"(?s)hub does not give this model.*ORG/OTHER.*next step: check the name"
+    ):
+        WorldModel.from_pretrained("ORG/OTHER")
+    WorldModel.from_pretrained("ORG/NAME")
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    WorldModel.from_pretrained("ORG/NAME")  # of the local cache
+    with pytest.raises(UnavailableError, match=r"(?s)hub does not give this model.*ORG/UNSEEN.*offline"):
+        WorldModel.from_pretrained("ORG/UNSEEN")
+    with pytest.raises(CheckpointError, match="No model here"):
+        WorldModel.from_pretrained(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match="No model here"):
+        WorldModel.from_pretrained("three/part/name")
+    with pytest.raises(ConfigError, match="no revisions"):
+        WorldModel.from_pretrained(folder, revision="main")
+
+
+def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
+    repository = publish(hub, folder)
+    content, large = repository.files["model.safetensors"]
+    repository.files["model.safetensors"] = (content[:-1], large)
+    with pytest.raises(CheckpointError, match="not those that are described"):
+        WorldModel.from_pretrained("ORG/NAME")
