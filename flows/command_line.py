@@ -9,6 +9,8 @@ from importlib import metadata
 from pathlib import Path
 
 from flows.exchange_commands import add_exchange_commands
+from flows.rehearsal import add_rehearse_command
+from tasks.temporary_server import prepare_prefect
 from worldline_core.pipeline.steps import STEPS
 
 
@@ -80,6 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     verify.add_argument("--json", action="store_true", help="print JSON")
     verify.set_defaults(run=_verify)
     add_exchange_commands(commands)
+    add_rehearse_command(commands)
     _add_embodiment(commands)
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
@@ -149,30 +152,25 @@ def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
     add_task_arguments(parser)
 
 
-def _prepare_prefect(artifacts: Path) -> None:
-    """Prefect's cache records belong to the artifacts that they speak of. Must happen before Prefect is imported."""
-    from tasks.temporary_server import set_up_temporary_server
-
-    os.environ.setdefault("PREFECT_LOCAL_STORAGE_PATH", str((artifacts / "prefect").resolve()))
-    set_up_temporary_server()
-
-
-def _checked_preset(arguments: argparse.Namespace) -> str | None:
-    """The preset of a run whose configuration is sound: a mistake is reported before Prefect and its server start."""
+def _checked_preset(arguments: argparse.Namespace, *, weights: bool = False) -> str | None:
+    """The preset of a run whose configuration is sound, and whose ``weights`` are there: mistakes are reported before
+    Prefect and its server start."""
     from worldline_core.config import load_config, preset_path
 
     preset = arguments.preset or (None if arguments.config else "demo")
     if preset is not None:
         preset_path(preset)  # answers before torch is imported
-    from worldline_core.pipeline.pipeline_config import PipelineConfig
+    from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 
-    load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    config = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=arguments.overrides)
+    if weights:
+        check_weights(config, Path.cwd())
     return preset
 
 
 def _pipeline(arguments: argparse.Namespace) -> None:
-    preset = _checked_preset(arguments)
-    _prepare_prefect(arguments.artifacts)
+    preset = _checked_preset(arguments, weights=True)
+    prepare_prefect(arguments.artifacts)
     from flows.pipeline import pipeline
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
@@ -188,7 +186,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
         print(f"later nights are held against {arguments.accept}")
         return
     preset = _checked_preset(arguments)
-    _prepare_prefect(arguments.artifacts)
+    prepare_prefect(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
 
     history = nightly_evaluation(
@@ -198,8 +196,9 @@ def _nightly(arguments: argparse.Namespace) -> None:
 
 
 def _task(arguments: argparse.Namespace) -> None:
-    _prepare_prefect(arguments.artifacts)
     from tasks.command_line import print_artifact, run_task
+
+    prepare_prefect(arguments.artifacts)
 
     print_artifact(run_task(arguments.step, arguments), as_json=arguments.json)
 

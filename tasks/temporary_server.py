@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 _SETTINGS = {
     # On a busy machine the server takes its time.
@@ -27,3 +28,9 @@ def set_up_temporary_server() -> None:
     """
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
+
+
+def prepare_prefect(artifacts: Path) -> None:
+    """Prefect's cache records belong to the artifacts that they speak of. Must happen before Prefect is imported."""
+    os.environ.setdefault("PREFECT_LOCAL_STORAGE_PATH", str((artifacts / "prefect").resolve()))
+    set_up_temporary_server()

@@ -16,85 +16,16 @@ from worldline_core.evaluation.policy.evidence import GraspEvidence, MotionEvide
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, Qwen3VLModel, Text, Video, VLMConfig, open_vlm
+from worldline_core.rehearsal.outside_models import write_qwen3_vl
 
-SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>",
-           "<|video_pad|>")  # fmt: skip
-TEMPLATE = (
-    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n{% for part in message['content'] %}"
-    "{% if part['type'] == 'image' %}<|vision_start|><|image_pad|><|vision_end|>"
-    "{% elif part['type'] == 'video' %}<|vision_start|><|video_pad|><|vision_end|>"
-    "{% else %}{{ part['text'] }}{% endif %}{% endfor %}<|im_end|>\n{% endfor %}"
-    "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
-)
 HEIGHT_PX = 64
-
-
-def write_processor(folder: Path) -> dict[str, int]:
-    """Image and video processors with their own settings, a tokenizer of single bytes; the special tokens' ids."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
-    from transformers import PreTrainedTokenizerFast, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
-
-    letters = {letter: index for index, letter in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
-    tokenizer = Tokenizer(models.BPE(letters, []))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        eos_token="<|im_end|>",  # noqa: S106
-        pad_token="<|endoftext|>",  # noqa: S106
-        additional_special_tokens=list(SPECIAL),
-    )
-    sizes = {"patch_size": 8, "temporal_patch_size": 2, "merge_size": 2}
-    pixels = {"shortest_edge": 16 * 16, "longest_edge": 512 * 512}
-    processor = Qwen3VLProcessor(
-        image_processor=Qwen2VLImageProcessor(**sizes, size=pixels),
-        tokenizer=fast,
-        video_processor=Qwen3VLVideoProcessor(**sizes, size=pixels),
-        chat_template=TEMPLATE,
-    )
-    processor.save_pretrained(folder)
-    return {token: int(fast.convert_tokens_to_ids(token)) for token in SPECIAL}
-
-
-def write_model(folder: Path, ids: dict[str, int]) -> None:
-    from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
-
-    config = Qwen3VLConfig(
-        text_config={
-            "vocab_size": 272,
-            "hidden_size": 32,
-            "intermediate_size": 48,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "num_key_value_heads": 1,
-            "head_dim": 16,
-            "rope_parameters": {"rope_type": "default", "rope_theta": 5e6, "mrope_section": [4, 2, 2]},
-        },
-        vision_config={
-            "depth": 2,
-            "hidden_size": 32,
-            "intermediate_size": 48,
-            "num_heads": 2,
-            "patch_size": 8,
-            "out_hidden_size": 32,
-            "num_position_embeddings": 64,
-            "deepstack_visual_indexes": [0, 1],
-        },
-        image_token_id=ids["<|image_pad|>"],
-        video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"],
-        vision_end_token_id=ids["<|vision_end|>"],
-        eos_token_id=ids["<|im_end|>"],
-        pad_token_id=ids["<|endoftext|>"],
-    )
-    torch.manual_seed(0)
-    Qwen3VLForConditionalGeneration(config).save_pretrained(folder)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("qwen3-vl")
-    write_model(folder, write_processor(folder))
+    torch.manual_seed(0)
+    write_qwen3_vl(folder)
     return folder
 
 

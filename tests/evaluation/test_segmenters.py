@@ -10,6 +10,7 @@ from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.metrics import video_iou
 from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
+from worldline_core.evaluation.segmenters.sam3 import Sam3Segmenter
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.evaluation.segmenters.train_segmenter import (
     MaskBatch,
@@ -18,6 +19,7 @@ from worldline_core.evaluation.segmenters.train_segmenter import (
     augment,
     train_segmenter,
 )
+from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.training import trainer
 
 CONFIG = SegmenterConfig(
@@ -148,44 +150,10 @@ def test_videos_are_masked_piece_by_piece_as_at_once(film, training):
 
 @pytest.mark.slow
 def test_sam3_classes_at_small_random_size(tmp_path):
-    """The real tracker and processor classes, random weights: shapes, prompts, loading."""
-    sam3 = pytest.importorskip("transformers.models.sam3_tracker_video")
-    from transformers import Sam3ImageProcessor
-    from transformers.models.sam2_video.video_processing_sam2_video import Sam2VideoVideoProcessor
-
-    from worldline_core.evaluation.segmenters.sam3 import Sam3Segmenter
-
-    size = 112
-    vision = {
-        "model_type": "sam3_vision_model",
-        "fpn_hidden_size": 128,
-        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
-        "backbone_config": {
-            "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,
-            "num_attention_heads": 2, "image_size": size, "patch_size": 14, "window_size": 4,
-            "global_attn_indexes": [1], "pretrain_image_size": size,
-        },
-    }  # fmt: skip
-    config = sam3.Sam3TrackerVideoConfig(
-        vision_config=vision,
-        prompt_encoder_config={"hidden_size": 128, "image_size": size},
-        mask_decoder_config={"hidden_size": 128, "mlp_dim": 64, "num_attention_heads": 2, "iou_head_hidden_dim": 64},
-        memory_attention_hidden_size=128,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=64,
-        memory_encoder_hidden_size=128,
-        memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128,
-        memory_fuser_embed_dim=128,
-        memory_fuser_intermediate_dim=64,
-        image_size=size,
-    )
+    """The real tracker and processor classes out of a folder as published, random weights: shapes, prompts, loading."""
     torch.manual_seed(0)
-    square = {"height": size, "width": size}
-    processor = sam3.Sam3TrackerVideoProcessor(
-        Sam3ImageProcessor(size=square, mask_size={"height": 32, "width": 32}), Sam2VideoVideoProcessor(size=square)
-    )
-    segmenter = Sam3Segmenter(sam3.Sam3TrackerVideoModel(config), processor)
+    write_sam3(tmp_path)
+    segmenter = Sam3Segmenter.load(tmp_path)
     video = np.random.default_rng(0).integers(0, 256, (4, 64, 96, 3), dtype=np.uint8)
     points = np.full((4, 2, 2), np.nan)
     assert not segmenter.segment(video, points).any()
@@ -195,6 +163,4 @@ def test_sam3_classes_at_small_random_size(tmp_path):
     points[0, 1] = (200, 30)  # outside of the frame: ignored
     assert np.array_equal(segmenter.segment(video, points), one)
     assert np.array_equal(in_pieces(segmenter, video, points), one)
-    segmenter.model.save_pretrained(tmp_path)
-    processor.save_pretrained(tmp_path)
     assert np.array_equal(Sam3Segmenter.load(tmp_path).segment(video, points), one)

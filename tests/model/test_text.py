@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,13 +9,14 @@ import pytest
 
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 from worldline_core.model.text import VISION_START, ClipFacts, Cosmos3Text, video_prompt
+from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 
 CLIP = ClipFacts(num_frames=129, fps=24.0, image_size=(480, 640))
 
 
 @pytest.fixture
-def folder(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> Path:
-    write_text_tokenizer(tmp_path / "tokenizer")
+def folder(tmp_path: Path) -> Path:
+    write_qwen2_tokenizer(tmp_path / "tokenizer")
     return tmp_path / "tokenizer"
 
 
@@ -29,9 +29,9 @@ def test_prompt_carries_duration_and_resolution() -> None:
 def test_ids_follow_the_chat_template_and_end_with_the_start_of_vision(folder: Path) -> None:
     text = Cosmos3Text(folder)
     decoded = text.tokenizer.decode(text.ids("lift the red cube", CLIP))
-    assert decoded.startswith("<|im_start|> system You are a helpful assistant")
-    assert "<|im_start|> user lift the red cube" in decoded
-    assert decoded.endswith("<|im_start|> assistant <|im_end|> <|vision_start|>")
+    assert decoded.startswith("<|im_start|>system\nYou are a helpful assistant")
+    assert "<|im_start|>user\nlift the red cube" in decoded
+    assert decoded.endswith("<|im_start|>assistant\n<|im_end|><|vision_start|>")
     ids, mask = text(["lift the red cube", "lift the red cube put it down"], [CLIP, CLIP])
     assert mask.sum(dim=1).tolist() == [len(text.ids("lift the red cube", CLIP)), ids.shape[1]]
     assert ids[0, mask[0]].tolist() == text.ids("lift the red cube", CLIP)
@@ -71,9 +71,11 @@ def test_a_long_instruction_loses_its_last_words_and_nothing_else(folder: Path) 
         Cosmos3Text(folder, max_length=10).ids("lift", CLIP)
 
 
-def test_missing_or_foreign_tokenizers_are_named(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> None:
+def test_missing_or_foreign_tokenizers_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnavailableError, match="text tokenizer is not here"):
         Cosmos3Text(tmp_path / "nothing")
-    write_text_tokenizer(tmp_path, vision=False)
+    write_qwen2_tokenizer(tmp_path)
+    for path in tmp_path.glob("tokenizer*.json"):
+        path.write_text(path.read_text().replace("<|vision_start|>", "<|vision_begin|>"))
     with pytest.raises(CheckpointError, match="Not the tokenizer of a Cosmos3 model"):
         Cosmos3Text(tmp_path)

@@ -14,6 +14,7 @@ from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_tokenizer
 from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
+from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.frame_source import RecordedView
 from worldline_core.training.train_tokenizer import TokenizerConfig, decoder_batch, disturb, train_decoder
 
@@ -210,16 +211,9 @@ def test_videos_and_latents_of_another_layout_are_refused(fitted: PatchTokenizer
 
 @pytest.fixture(scope="module")
 def wan_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from diffusers import AutoencoderKLWan
-
     torch.manual_seed(0)
-    vae = AutoencoderKLWan(
-        base_dim=8, decoder_base_dim=8, z_dim=48, dim_mult=[1, 1, 1, 1], num_res_blocks=1, is_residual=True,
-        in_channels=12, out_channels=12, patch_size=2, scale_factor_spatial=16,
-        temperal_downsample=[False, True, True], latents_mean=list(WAN22_MEAN), latents_std=list(WAN22_STD),
-    )  # fmt: skip
     folder = tmp_path_factory.mktemp("wan")
-    vae.save_pretrained(folder / "vae")
+    small_wan_autoencoder().save_pretrained(folder / "vae")
     return folder
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
 from worldline_core.model.text import ClipFacts, Cosmos3Text, TextConfig, load_text_encoder
+from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_source import Clip, ClipBatch
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -24,14 +24,13 @@ CLIP = ClipFacts(17, 8.0, (32, 32))
 def test_stage1_feeds_the_chat_prompt_of_each_clip(
     world: Any,
     tiny_model: dict[str, Any],
-    write_text_tokenizer: Callable[..., None],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    write_text_tokenizer(tmp_path / "tokenizer")
+    write_qwen2_tokenizer(tmp_path / "tokenizer")
     config = Stage1Config.model_validate(
         {
-            "model": tiny_model,
+            "model": tiny_model | {"vocab_size": 1024},
             "text": {"kind": "cosmos3", "path": str(tmp_path / "tokenizer"), "max_length": 200},
             "text_dropout": 0.0,
             "clips": {"lengths": [9], "view_weights": {"primary": 1}},
@@ -106,11 +105,11 @@ def test_the_full_size_preset_reads_the_backbones_tokenizer() -> None:
         load_text_encoder(config.text, 151_936)
 
 
-def test_text_that_does_not_fit_the_model_is_refused(tmp_path: Path, write_text_tokenizer: Callable[..., None]) -> None:
+def test_text_that_does_not_fit_the_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="vocabulary is too small"):
         load_text_encoder(TextConfig(), 100)
     with pytest.raises(ConfigError, match="needs a folder"):
         load_text_encoder(TextConfig(kind="cosmos3"), 300)
-    write_text_tokenizer(tmp_path)
+    write_qwen2_tokenizer(tmp_path)
     with pytest.raises(ConfigError, match="vocabulary is too small"):
         load_text_encoder(TextConfig(kind="cosmos3", path=str(tmp_path)), 20)

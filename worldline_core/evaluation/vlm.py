@@ -331,8 +331,12 @@ class Qwen3VLModel:
             }
             for video in shown
         ]
+        thinks = "enable_thinking" in str(self.processor.chat_template)  # a template that lacks the word gets a warning
         text = self.processor.apply_chat_template(
-            [{"role": "user", "content": content}], tokenize=False, add_generation_prompt=True, enable_thinking=False
+            [{"role": "user", "content": content}],
+            tokenize=False,
+            add_generation_prompt=True,
+            **({"enable_thinking": False} if thinks else {}),
         )
         inputs = self.processor(
             text=[text],

@@ -21,7 +21,7 @@ BACKBONE_FILE = "alexnet-owt-7be5be79.pth"
 HEADS_FILE = "alex.pth"
 
 # index in torchvision's AlexNet.features, in, out, kernel, stride, padding; "pool before" of the five taps
-_LAYERS = (
+LAYERS = (
     ("0", 3, 64, 11, 4, 2, False),
     ("3", 64, 192, 5, 1, 2, True),
     ("6", 192, 384, 3, 1, 1, True),
@@ -41,9 +41,9 @@ class LPIPS(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(cin, cout, kernel, stride, padding) for _, cin, cout, kernel, stride, padding, _ in _LAYERS
+            nn.Conv2d(cin, cout, kernel, stride, padding) for _, cin, cout, kernel, stride, padding, _ in LAYERS
         )
-        self.heads = nn.ModuleList(nn.Conv2d(cout, 1, 1, bias=False) for _, _, cout, *_ in _LAYERS)
+        self.heads = nn.ModuleList(nn.Conv2d(cout, 1, 1, bias=False) for _, _, cout, *_ in LAYERS)
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(_SCALE).view(1, 3, 1, 1))
 
@@ -53,7 +53,7 @@ class LPIPS(nn.Module):
         distance = torch.zeros(predicted.shape[0], device=predicted.device)
         a = (2 * predicted.float() - 1 - self.mean) / self.scale
         b = (2 * true.float() - 1 - self.mean) / self.scale
-        for layer, convolution, head in zip(_LAYERS, self.convolutions, self.heads, strict=True):
+        for layer, convolution, head in zip(LAYERS, self.convolutions, self.heads, strict=True):
             if layer[-1]:
                 a, b = functional.max_pool2d(a, 3, 2), functional.max_pool2d(b, 3, 2)
             a, b = functional.relu(convolution(a)), functional.relu(convolution(b))
@@ -83,7 +83,7 @@ def load_lpips(folder: Path | None) -> LPIPS:
     backbone = torch.load(folder / BACKBONE_FILE, map_location="cpu", weights_only=True)
     heads = torch.load(folder / HEADS_FILE, map_location="cpu", weights_only=True)
     state: dict[str, Tensor] = {}
-    for index, layer in enumerate(_LAYERS):
+    for index, layer in enumerate(LAYERS):
         sources = {
             f"convolutions.{index}.weight": (backbone, f"features.{layer[0]}.weight"),
             f"convolutions.{index}.bias": (backbone, f"features.{layer[0]}.bias"),

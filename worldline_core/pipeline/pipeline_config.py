@@ -14,6 +14,7 @@ from worldline_core.actions.render_actions import RenderActionsConfig
 from worldline_core.config import StrictModel
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill import DistillConfig
+from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
 from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
@@ -84,6 +85,56 @@ class PipelineConfig(StrictModel):
             if run.checkpoint in shipped and shipped[run.checkpoint] is None:
                 raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
         return self
+
+
+_OUTSIDE = {
+    "models.tokenizer": "download the folder vae of nvidia/Cosmos3-Nano, in diffusers format",
+    "models.base": "worldline task import_backbone --preset cosmos3-nano --input diffusers=weights/Cosmos3-Nano, and link "
+    "the printed folder there",
+    "models.teacher": "download facebook/vjepa2-vitg-fpc64-384, or set train_stage2.relational and models.teacher to null",
+    "train_stage1.text.path": "download the folder text_tokenizer of nvidia/Cosmos3-Nano",
+    "distill.lpips_weights": "download alexnet-owt-7be5be79.pth (torchvision) and alex.pth (lpips), or set it to null",
+    "evaluate_video.lpips_weights": "download alexnet-owt-7be5be79.pth (torchvision) and alex.pth (lpips), or set it to null",
+    "evaluate_video.sam3_weights": "accept the licence of facebook/sam3 and download it, or choose other segmenters",
+    "evaluate_policy.sam3_weights": "accept the licence of facebook/sam3 and download it, or choose another segmenter",
+    "evaluate_policy.vlm.weights": "download Qwen/Qwen3-VL-8B-Instruct, or choose judge: openai or measured",
+}
+"""Folders of weights that a run reads, by the key that names each, and how to come by the published ones."""
+
+
+def check_weights(config: PipelineConfig, project: Path) -> None:
+    """Refuse a run that would end for want of weights, before its first step: some of them are opened days later.
+
+    Raises:
+        UnavailableError: a folder that the configuration names is not there, or empty; the message lists all of them.
+    """
+    missing: list[str] = []
+    advice: list[str] = []
+    named = {f"models.{name}": path for name, path in config.models.model_dump().items()}
+    named |= {
+        "train_stage1.text.path": None if config.train_stage1 is None else config.train_stage1.text.path,
+        "distill.lpips_weights": config.distill.lpips_weights,
+        "evaluate_video.lpips_weights": config.evaluate_video.lpips_weights,
+        "evaluate_video.sam3_weights": config.evaluate_video.sam3_weights,
+        "evaluate_policy.sam3_weights": config.evaluate_policy.sam3_weights,
+        "evaluate_policy.vlm.weights": config.evaluate_policy.vlm.weights,
+    }
+    for key, path in named.items():
+        if path is None:
+            continue
+        folder = project_path(project, Path(path))
+        if not folder.is_dir() or not any(folder.iterdir()):
+            missing.append(f"{key}: {path}")
+            step = _OUTSIDE.get(key, "check the path")
+            advice += [step] if step not in advice else []
+    if missing:
+        raise UnavailableError(
+            "Weights that this run reads are not here",
+            where=project,
+            expected="a folder with files for each",
+            got="; ".join(missing),
+            next_step="; ".join(advice),
+        )
 
 
 def source_inputs(config: StrictModel, project: Path) -> dict[str, Path]:

@@ -1,0 +1,51 @@
+"""`worldline rehearse`: the whole of a full-size preset at small size, on the processor, before it runs on many GPUs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from tasks.temporary_server import prepare_prefect
+
+
+def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add it to the command line's parser."""
+    rehearse = commands.add_parser(
+        "rehearse",
+        help="run a full-size preset at small size, with small random versions of every outside model",
+        description="Make small random-weight versions of every outside model and small recordings in a folder, and run"
+        " the preset's own plan on them, from the import of the backbone to the report. Sizes alone change; each change"
+        " is printed. Nothing is learnt: what ends with an error here ends with it on many GPUs too.",
+    )
+    choice = rehearse.add_mutually_exclusive_group()
+    choice.add_argument("--preset", help="a preset in configs/ (default: cosmos3-nano)")
+    choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
+    rehearse.add_argument(
+        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+    )
+    rehearse.add_argument(
+        "--output", type=Path, default=Path("rehearsal"), help="folder of weights, recordings and artifacts"
+    )
+    rehearse.add_argument("--processes", type=int, default=2, help="that share each training (default: 2)")
+    rehearse.set_defaults(run=rehearse_command)
+
+
+def rehearse_command(arguments: argparse.Namespace) -> None:
+    """Prepare the folder, train in several processes, let the flow do the rest, and report."""
+    from tasks.rehearse import train_in_processes
+    from worldline_core.rehearsal.rehearsal import prepare, table
+
+    path = None if arguments.config is None else arguments.config.resolve()
+    preset = arguments.preset or (None if path else "cosmos3-nano")
+    changes = prepare(arguments.output, preset, path, arguments.overrides)
+    print(table(changes))
+    overrides = (*arguments.overrides, *(change.override for change in changes))
+    os.chdir(arguments.output)
+    artifacts = Path("artifacts")
+    train_in_processes(preset, path, overrides, artifacts, arguments.processes)
+    prepare_prefect(artifacts)
+    from flows.pipeline import pipeline
+
+    report = pipeline(preset, path, overrides, artifacts)
+    print(f"report: {report.path / 'index.html'}")

@@ -1,0 +1,61 @@
+"""The steps of a rehearsal that a run takes outside of its flow: the import of the backbone, and training in processes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import worldline_core
+from worldline_core.config import load_config
+from worldline_core.errors import TrainingError
+from worldline_core.model.cosmos3 import ImportBackboneConfig
+from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
+from worldline_core.pipeline.plan import find_artifacts, plan, run_node
+from worldline_core.pipeline.steps import get_step, run_step
+from worldline_core.store.store import ArtifactStore
+
+
+def import_base(config: PipelineConfig, store: ArtifactStore) -> None:
+    """Import the backbone beside its autoencoder and link it to the folder that the configuration names, as a user does."""
+    if config.models.base is None or config.models.base.exists():
+        return
+    source = config.models.tokenizer.parent
+    settings = config.import_backbone or ImportBackboneConfig.model_validate({})
+    imported = run_step(store, "import_backbone", settings, {"diffusers": source})
+    config.models.base.parent.mkdir(parents=True, exist_ok=True)
+    config.models.base.symlink_to(imported.path.resolve(), target_is_directory=True)
+
+
+def train_in_processes(
+    preset: str | None, path: Path | None, overrides: Sequence[str], artifacts: Path, processes: int
+) -> None:
+    """Every node up to the last training, in the working folder: trainings through torchrun, the others in this process.
+
+    Raises:
+        UnavailableError: a folder of weights is missing.
+        TrainingError: the processes of a training ended with an error, which they have printed.
+    """
+    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
+    chosen = ["--config", str(path)] if path else ["--preset", str(preset)]
+    chosen += [argument for override in overrides for argument in ("--set", override)]
+    store = ArtifactStore(artifacts, config.runner.verify)
+    import_base(config, store)
+    check_weights(config, Path.cwd())
+    nodes = plan(config, Path.cwd())
+    last = max(number for number, node in enumerate(nodes) if get_step(node.step).distributed)
+    for node in nodes[: last + 1]:
+        if not get_step(node.step).distributed or node.name in find_artifacts(nodes, store):
+            run_node(node.name, nodes, store)
+            continue
+        launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+        command = [*launcher, "-m", f"tasks.{node.step}", *chosen, "--artifacts", str(store.root)]
+        code = Path(worldline_core.__file__).parents[1]
+        search = os.pathsep.join([str(code), *filter(None, [os.environ.get("PYTHONPATH")])])
+        ended = subprocess.run(command, env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603
+        if ended.returncode:
+            raise TrainingError(
+                "A training ended with an error", where=node.name, got=f"exit status {ended.returncode}; see above"
+            )

@@ -1,0 +1,152 @@
+"""The rehearsal of the full-size preset: what it changes, what it refuses, and (slow) the whole of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldline_core.config import load_config
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError, UnavailableError
+from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
+from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, OutsideModel, write_outside_models
+from worldline_core.rehearsal.recordings import TWO_VIEWS, write_recordings
+from worldline_core.rehearsal.rehearsal import changes_of, table
+
+PRESET = "cosmos3-nano"
+SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
+         "sources"}  # fmt: skip
+FOLDERS = ("Cosmos3-Nano/vae", "Cosmos3-Nano/text_tokenizer", "base", "vjepa2-vitg-fpc64-384", "lpips", "sam3",
+           "Qwen3-VL-8B-Instruct")  # fmt: skip
+
+
+def test_sizes_are_the_only_change_and_each_is_listed() -> None:
+    changes = changes_of(PRESET, None, ())
+    assert {change.key.rpartition(".")[2] for change in changes} == SIZES
+    before = load_config(PipelineConfig, preset=PRESET).model_dump(mode="json")
+    after = load_config(PipelineConfig, preset=PRESET, overrides=[change.override for change in changes])
+    values = after.model_dump(mode="json")
+    for change in changes:
+        *path, last = change.key.split(".")
+        place, original = values, before
+        for name in path:
+            place, original = place[name], original[name]
+        assert place[last] != original[last]
+        place[last] = original[last]
+        assert f"| {change.key} " in table(changes)
+    assert values == before
+    assert [source.path for source in after.curate.sources] == [Path("recordings"), Path("recordings_two_views")]
+    assert after.rollouts["causal"].config.num_frames == 129
+    assert after.train_stage2.relational is not None
+
+
+def test_what_is_small_already_stays_as_it_is() -> None:
+    overrides = [
+        "train_stage1.trainer.steps=2",
+        "rollouts.stage2.config.seeds=[7]",
+        "rollouts.causal.config.timed_blocks=0",
+    ]
+    keys = {change.key for change in changes_of(PRESET, None, overrides)}
+    assert not keys & {
+        "train_stage1.trainer.steps",
+        "rollouts.stage2.config.seeds",
+        "rollouts.causal.config.timed_blocks",
+    }
+    with pytest.raises(ConfigError, match="unknown key"):
+        changes_of(PRESET, None, ["train_stage1.trainer.stepps=2"])
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    for name in FOLDERS:
+        (tmp_path / "weights" / name).mkdir(parents=True)
+        (tmp_path / "weights" / name / "config.json").write_text("{}")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_missing_folder_of_weights_is_named_before_the_first_step(name: str, project: Path) -> None:
+    config = load_config(PipelineConfig, preset=PRESET)
+    check_weights(config, project)
+    shutil.rmtree(project / "weights" / name)
+    advice = "import_backbone" if name == "base" else "download"
+    with pytest.raises(
+        UnavailableError, match=rf"(?s)Weights.*not here.*got: [^\n]*weights/{name}.*next step:.*{advice}"
+    ):
+        check_weights(config, project)
+    (project / "weights" / name).mkdir()
+    with pytest.raises(UnavailableError, match=rf"weights/{name}"):
+        check_weights(config, project)
+
+
+def test_what_cannot_be_made_small_is_named(tmp_path: Path) -> None:
+    def write(folder: Path) -> None:
+        raise TypeError("__init__() got an unexpected keyword argument")
+
+    with pytest.raises(UnavailableError, match=r"(?s)Other cannot be made small.*unexpected keyword.*uv\.lock"):
+        write_outside_models(tmp_path, [OutsideModel("Other", "org/other", "other", write)])
+
+
+def test_recordings_are_those_of_a_robot_at_thirty_frames_a_second(tmp_path: Path) -> None:
+    write_recordings(tmp_path / "two", TWO_VIEWS, split="test")
+    episodes = EpisodeSet.open(tmp_path / "two")
+    assert [(row.fps, row.num_frames, row.views, row.split) for row in episodes.rows] == [
+        (30.0, 129, ("head", "right_wrist"), "test")
+    ] * 2
+    episode = episodes.episode(0)
+    assert np.abs(np.diff(episode.state[:, :-1], axis=0)).max() * 30 < 7  # rad/s: no arm moves faster
+    rotations = episode.cameras["right_wrist"].T_base_camera[:, :3, :3]
+    assert np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project_root: Path) -> None:
+    """About five minutes of two cores."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(project_root),
+        "OMP_NUM_THREADS": "1",
+        "PREFECT_HOME": str(tmp_path / "p"),
+    }
+    environment.pop("PREFECT_API_URL", None)
+    command = [sys.executable, "-m", "flows.command_line", "rehearse", "--preset", PRESET, "--output", "rehearsal"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=890, check=False
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
+    folder = tmp_path / "rehearsal"
+    assert "train_stage2.relational.student_layer" in (folder / "changes.md").read_text()
+    assert (folder / "artifacts" / "report" / "latest" / "index.html").is_file()
+    for model in OUTSIDE_MODELS:
+        assert any((folder / "weights" / model.folder).iterdir())
+    manifests = {}
+    for path in (folder / "artifacts").glob("*/*/manifest.json"):
+        manifests.setdefault(path.parts[-3], []).append(json.loads(path.read_text()))
+    for step in ("train_stage1", "train_stage2", "distill"):
+        assert manifests[step][0]["environment"]["processes"] == 2
+    assert manifests["train_stage2"][0]["metrics"]["relational_intra"] > 0
+    assert manifests["distill"][0]["metrics"]["lpips"] == "on"
+    assert len(manifests["rollout"]) == 4
+    (video,) = (folder / "artifacts" / "evaluate_video").glob("*/summary.json")
+    assert {"lpips", "robot_iou", "psnr"} <= set(json.dumps(json.loads(video.read_text())).replace('"', " ").split())
+    assert manifests["evaluate_policy"][0]["config"]["judge"] == "qwen3_vl"
+    for rollout in manifests["rollout"]:  # of three views and of two, none left out
+        assert rollout["metrics"]["episodes"] == 4
+        assert rollout["metrics"]["without_view"] == {"left_wrist": 2 * len(rollout["config"]["seeds"])}
+
+
+@pytest.mark.slow
+def test_the_same_small_models_every_time(tmp_path: Path) -> None:
+    for name in "ab":
+        write_outside_models(tmp_path / name)
+    files = [path.relative_to(tmp_path / "a") for path in sorted((tmp_path / "a").rglob("*")) if path.is_file()]
+    assert len([path for path in files if path.suffix == ".safetensors"]) >= 8
+    for path in files:
+        assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes(), path

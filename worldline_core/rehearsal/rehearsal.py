@@ -1,0 +1,145 @@
+"""A preset at small size: the same file with sizes changed, each change listed, over small models and recordings."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from worldline_core.config import load_config
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.rehearsal.outside_models import write_outside_models
+from worldline_core.rehearsal.recordings import THREE_VIEWS, TWO_VIEWS, write_recordings
+from worldline_core.store.atomic import atomic_path
+
+CHANGES_FILE = "changes.md"
+RECORDINGS, TWO_VIEW_RECORDINGS = "recordings", "recordings_two_views"
+
+WEIGHTS = "weights"
+_LPIPS, _SAM3 = f"{WEIGHTS}/lpips", f"{WEIGHTS}/sam3"
+_SMALL = "its small version"
+SIZES: tuple[tuple[str, Any, str], ...] = (
+    (
+        "curate.sources",
+        [{"kind": "episode_set", "path": name, "name": name} for name in (RECORDINGS, TWO_VIEW_RECORDINGS)],
+        "small recordings of three views, and of two for evaluation",
+    ),
+    ("models.tokenizer", f"{WEIGHTS}/Cosmos3-Nano/vae", _SMALL),
+    ("models.base", f"{WEIGHTS}/base", _SMALL),
+    ("models.teacher", f"{WEIGHTS}/vjepa2-vitg-fpc64-384", _SMALL),
+    ("train_stage1.text.path", f"{WEIGHTS}/Cosmos3-Nano/text_tokenizer", _SMALL),
+    ("*.lpips_weights", _LPIPS, _SMALL),
+    ("*.sam3_weights", _SAM3, _SMALL),
+    ("evaluate_policy.vlm.weights", f"{WEIGHTS}/Qwen3-VL-8B-Instruct", _SMALL),
+    ("*image_size", [64, 96], "pictures of the recordings"),
+    ("*device", "cpu", "no accelerator"),
+    ("*.workers", 1, "two cores"),
+    ("distill.distribution_matching.trainer.steps", 6, "one cycle"),
+    ("*.trainer.steps", 4, "long enough for a log, a state and an average"),
+    ("*.trajectories.clips", 2, "one batch a process"),
+    ("*.relational.student_layer", 2, "the model has 4 layers where 36 are published"),
+    ("encode_latents.start_step", 48, "starts of cached clips"),
+    ("rollouts.*.seeds", [42, 43], "enough for a mean over seeds"),
+    ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
+    ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
+)
+"""Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""
+
+
+ALWAYS = ("curate.sources", "encode_latents.start_step")
+"""Changed whatever they are; of the others nothing is made larger, and what is off stays off."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One value of the preset that the rehearsal changes."""
+
+    key: str
+    published: Any
+    rehearsed: Any
+    why: str
+
+    @property
+    def override(self) -> str:
+        """As it is given to ``--set``."""
+        return f"{self.key}={json.dumps(self.rehearsed)}"
+
+
+def changes_of(preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
+    """The values that a rehearsal of this configuration changes.
+
+    Raises:
+        ConfigError: the configuration is not valid, or not with its changes.
+    """
+    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
+    before = dict(_leaves(config.model_dump(mode="json")))
+    small: list[Change] = []
+    for key, value in before.items():
+        fitting = next((size for size in SIZES if fnmatchcase(key, size[0])), None)
+        if fitting is not None and (key in ALWAYS or _larger(value, fitting[1])):
+            small.append(Change(key, value, *fitting[1:]))
+    changed = [*overrides, *(change.override for change in small)]
+    after = dict(
+        _leaves(load_config(PipelineConfig, preset=preset, path=path, overrides=changed).model_dump(mode="json"))
+    )
+    return [change for change in small if after[change.key] != change.published]
+
+
+def _larger(value: Any, small: Any) -> bool:
+    """Whether a rehearsal makes it smaller."""
+    if isinstance(value, int) and isinstance(small, int):
+        return value > small
+    longer = not (isinstance(value, list) and isinstance(small, list) and len(value) < len(small))
+    return value is not None and value != small and longer
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def table(changes: Sequence[Change]) -> str:
+    """The changes as a table in Markdown."""
+    rows = [("key", "preset", "rehearsal", "why"), ("---",) * 4]
+    rows += [(c.key, _shown(c.published), _shown(c.rehearsed), c.why) for c in changes]
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def _shown(value: Any) -> str:
+    """A value as JSON; of recordings their folders alone."""
+    sources = isinstance(value, list) and all(isinstance(item, Mapping) and "path" in item for item in value)
+    return json.dumps([item["path"] for item in value] if sources else value)
+
+
+def prepare(folder: Path, preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
+    """Write outside models, recordings and the list of changes into ``folder``; what is there already is kept.
+
+    Raises:
+        ConfigError: the configuration is not valid, or not with its changes.
+        UnavailableError: an outside model cannot be made small; the message names it.
+    """
+    changes = changes_of(preset, path, overrides)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / CHANGES_FILE) as temporary:
+        temporary.write_text(
+            f"# {preset or path}\n\nWhat the rehearsal changes; all else is as the file says.\n\n{table(changes)}\n"
+        )
+    if not (folder / WEIGHTS).is_dir():
+        shutil.rmtree(folder / f"{WEIGHTS}.partial", ignore_errors=True)
+        write_outside_models(folder / f"{WEIGHTS}.partial")
+        (folder / f"{WEIGHTS}.partial").rename(folder / WEIGHTS)
+    for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
+        if not (folder / name / "index.parquet").is_file():
+            write_recordings(folder / name, episodes, split=split)
+    return changes
