@@ -17,7 +17,7 @@ demo: install
 test: install-scale
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -n auto --dist worksteal
 
-# Deployment against a real server and worker, and the largest model classes: minutes.
+# Deployment against a real server and worker, the rehearsal of the full size, the largest model classes: minutes.
 test-slow: install-scale
 	$(RUN) pytest -m slow --timeout=600
 

@@ -49,8 +49,10 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
         help="where work on many episodes runs (short for: --set runner.kind=...)",
     )  # fmt: skip
     parser.add_argument(
-        "--node", help="which node of the run, when a step occurs more than once (rollout.shipped_stage2)"
-    )
+        "--node", "--plan-node", dest="node",
+        help="which node of the run, when a step occurs more than once (rollout.shipped_stage2); torchrun, which has a"
+        " --node-rank of its own, takes --plan-node alone",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the artifact and its metrics as JSON")
 
 

@@ -26,6 +26,7 @@ def import_base(config: PipelineConfig, store: ArtifactStore) -> None:
     settings = config.import_backbone or ImportBackboneConfig.model_validate({})
     imported = run_step(store, "import_backbone", settings, {"diffusers": source})
     config.models.base.parent.mkdir(parents=True, exist_ok=True)
+    config.models.base.unlink(missing_ok=True)  # a link to an artifact that is gone
     config.models.base.symlink_to(imported.path.resolve(), target_is_directory=True)
 
 
@@ -51,7 +52,16 @@ def train_in_processes(
             run_node(node.name, nodes, store)
             continue
         launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-        command = [*launcher, "-m", f"tasks.{node.step}", *chosen, "--artifacts", str(store.root)]
+        command = [
+            *launcher,
+            "-m",
+            f"tasks.{node.step}",
+            *chosen,
+            "--artifacts",
+            str(store.root),
+            "--plan-node",
+            node.name,
+        ]
         code = Path(worldline_core.__file__).parents[1]
         search = os.pathsep.join([str(code), *filter(None, [os.environ.get("PYTHONPATH")])])
         ended = subprocess.run(command, env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from flows.command_line import main
 from tests.hub.conftest import Hub, Repository
 from worldline_core import WorldLine, WorldModel
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
@@ -43,6 +44,12 @@ def test_a_model_is_saved_as_it_was_opened(folder: Path, tmp_path: Path) -> None
     assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
     with pytest.raises(CheckpointError, match="wrong kind"):
         WorldModel.from_pretrained(folder, expect_kind="causal")
+    with pytest.raises(CheckpointError, match="no description to save"):
+        WorldModel(model.config).save_pretrained(tmp_path / "none")
+    main(["card", str(folder), "--license", "apache-2.0"])
+    card = (folder / "run" / "card" / "README.md").read_text()
+    assert "license: apache-2.0" in card
+    assert "Of the weights: apache-2.0." in card
 
 
 def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path, folder: Path) -> None:

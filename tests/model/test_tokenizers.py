@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_tokenizer
-from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer
+from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.frame_source import RecordedView
@@ -245,6 +246,19 @@ def test_latents_are_decoded_as_they_arrive(fitted: PatchTokenizer, wan_folder: 
             assert [piece.shape[2] for piece in pieces] == [1, 4, 8]
             found = torch.cat(pieces, dim=2)
             torch.testing.assert_close(found, whole, rtol=0, atol=1e-6 if exact else 1e-4)
+
+
+def test_the_fingerprint_of_a_pipeline_is_its_autoencoders(wan_folder: Path, tmp_path: Path) -> None:
+    """A backbone of 30 GB beside it is neither read nor part of the name."""
+    shutil.copytree(wan_folder / "vae", tmp_path / "vae")
+    tokenizer = load_tokenizer(tmp_path)
+    alone = tokenizer_fingerprint(tokenizer, tmp_path / "vae")
+    (tmp_path / "transformer").mkdir()
+    (tmp_path / "transformer" / "diffusion_pytorch_model.safetensors").write_bytes(b"other")
+    assert tokenizer_fingerprint(tokenizer, tmp_path) == alone
+    path = tmp_path / "vae" / "diffusion_pytorch_model.safetensors"
+    path.write_bytes(path.read_bytes() + b" ")
+    assert tokenizer_fingerprint(tokenizer, tmp_path) != alone
 
 
 def test_a_missing_or_damaged_wan_folder_is_named(wan_folder: Path, tmp_path: Path) -> None:

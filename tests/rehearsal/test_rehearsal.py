@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tasks.command_line import add_task_arguments
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, UnavailableError
@@ -106,7 +108,19 @@ def test_recordings_are_those_of_a_robot_at_thirty_frames_a_second(tmp_path: Pat
     assert np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < 1e-6
 
 
+def test_torchrun_hands_the_node_on_to_the_step() -> None:
+    """It takes a `--node` for a short form of options of its own."""
+    from torch.distributed.run import parse_args
+
+    given = ["--plan-node", "train_stage2.head_only"]
+    handed = parse_args(["--nproc-per-node", "2", "-m", "tasks.train_stage2", *given]).training_script_args
+    parser = argparse.ArgumentParser()
+    add_task_arguments(parser)
+    assert parser.parse_args(handed).node == "train_stage2.head_only"
+
+
 @pytest.mark.slow
+@pytest.mark.timeout(960)
 def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project_root: Path) -> None:
     """About five minutes of two cores."""
     environment = {

@@ -110,9 +110,16 @@ class WorldModel(world_model.WorldModel):
             max_shard_bytes: weights above this go into several files with an index.
 
         Raises:
-            CheckpointError: a weight is not finite in the type of the checkpoint.
+            CheckpointError: a weight is not finite in the type of the checkpoint, or the model was not opened from one.
         """
-        target, info = Path(folder), self.info
+        target, info = Path(folder), self.__dict__.get("info")
+        if info is None:
+            raise CheckpointError(
+                "The model has no description to save",
+                expected="a model of WorldModel.from_pretrained",
+                got="one that was built from a configuration",
+                next_step="write it with save_checkpoint, which is told its kind and contract",
+            )
         save_checkpoint(
             target,
             self,

@@ -113,7 +113,7 @@ class WanTokenizer(nn.Module):
             raise CheckpointError("Not a Wan autoencoder", where=root, expected=AutoencoderKLWan.__name__, got=name)
         try:
             vae = AutoencoderKLWan.from_pretrained(
-                str(root), local_files_only=True, use_safetensors=True, torch_dtype=dtype
+                str(root), local_files_only=True, use_safetensors=True, torch_dtype=dtype, low_cpu_mem_usage=False
             )
         except (OSError, ValueError, RuntimeError, SafetensorError) as error:
             raise CheckpointError("The Wan autoencoder cannot be read", where=root, got=str(error)) from error
@@ -169,8 +169,11 @@ def tokenizer_fingerprint(tokenizer: VideoTokenizer, folder: Path) -> str:
     if isinstance(tokenizer, PatchTokenizer):
         return tokenizer.encoder_digest[:16]
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
+    root = folder / "vae" if (folder / "vae").is_dir() else folder  # a pipeline's other models do not encode
+    for path in sorted(root.rglob("*")):
         if path.suffix in {".safetensors", ".json"} and path.name != "manifest.json":
-            digest.update(path.relative_to(folder).as_posix().encode())
-            digest.update(path.read_bytes())
+            digest.update(path.relative_to(root).as_posix().encode())
+            with path.open("rb") as stream:
+                while chunk := stream.read(1 << 24):
+                    digest.update(chunk)
     return digest.hexdigest()[:16]
