@@ -33,7 +33,8 @@ class WorldModelConfig(StrictModel):
     rope_theta: float = Field(default=100.0, gt=1)
     """Small grids need high frequencies: with 5e6 most of them would not turn over 4 x 6 patches."""
     fps: float | None = Field(default=None, gt=0)
-    """When given, temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation)."""
+    """When given, temporal positions advance by ``base_fps / fps`` per latent frame (Cosmos3's fps modulation), with the
+    rate of each clip itself where it is known. None counts latent frames, whatever the rate."""
     base_fps: float = Field(default=24.0, gt=0)
     temporal_margin: float = Field(default=16.0, ge=0)
     """Gap on the temporal axis between the last text token and the first video token."""
