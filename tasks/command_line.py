@@ -6,6 +6,7 @@ import argparse
 import errno
 import json
 import logging
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from safetensors import SafetensorError
 
 from tasks.supervisor import run_supervised
 from worldline_core.config import load_config
-from worldline_core.errors import ConfigError, WorldLineError
+from worldline_core.errors import ConfigError, StoppedError, WorldLineError
 from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.store.store import Artifact, ArtifactStore
 from worldline_core.untrusted_text import shown, visible, without_credentials
@@ -125,6 +126,9 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
     sys.excepthook = _print_traceback
     try:
         action()
+    except StoppedError as stopped:
+        print(stopped, file=sys.stderr)
+        raise SystemExit(128 + signal.SIGTERM) from stopped
     except WorldLineError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error

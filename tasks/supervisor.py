@@ -12,6 +12,8 @@ from types import FrameType
 
 GRACE_SECONDS = 3.0
 """How long the work may take to say goodbye, to Prefect's server for example, before it is killed."""
+SAVE_SECONDS = 27.0
+"""The same where a scheduler asks (SIGTERM): a training saves its state. Less than the 30 s after which torchrun kills."""
 
 
 class _StoppedError(BaseException):
@@ -24,8 +26,8 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
     """Do the work in a process group of its own, and end with its exit status.
 
     Processes of a pool and Prefect's temporary server belong to that group. Ctrl-C in a terminal reaches this process
-    alone; otherwise the server would end first and the flow wait minutes for it. SIGINT and SIGTERM end the whole group
-    within `GRACE_SECONDS`, with exit status 130 or 143. Finished work is safe whenever that happens: outputs are written
+    alone; otherwise the server would end first and the flow wait minutes for it. SIGINT ends the whole group within
+    `GRACE_SECONDS`, SIGTERM within `SAVE_SECONDS`, with exit status 130 or 143. Finished work is safe whenever that happens: outputs are written
     atomically, training goes on from its last state.
 
     Args:
@@ -58,7 +60,7 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
     except _StoppedError as stopped:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-        _end_group(child)
+        _end_group(child, GRACE_SECONDS if stopped.number == signal.SIGINT else SAVE_SECONDS)
         print(f"stopped{again}", file=sys.stderr)
         raise SystemExit(128 + stopped.number) from None
     code = os.waitstatus_to_exitcode(status)
@@ -81,9 +83,9 @@ def end_with_parent(end: Callable[[], object]) -> None:
     threading.Thread(target=watch, name="end with parent", daemon=True).start()
 
 
-def _end_group(child: int) -> None:
+def _end_group(child: int, seconds: float) -> None:
     os.kill(child, signal.SIGTERM)
-    deadline = time.monotonic() + GRACE_SECONDS
+    deadline = time.monotonic() + seconds
     while os.waitpid(child, os.WNOHANG) == (0, 0):
         if time.monotonic() > deadline:
             _kill_group(child)

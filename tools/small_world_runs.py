@@ -16,9 +16,9 @@ from torch._dynamo import config as compiler
 from worldline_core.config import StrictModel
 from worldline_core.errors import TrainingError
 from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.flow_matching import SigmaSampling
 from worldline_core.training.trainer import ParameterGroup
-from worldline_core.training.training_state import ExponentialAverage
 
 
 class Timed(StrictModel):

@@ -304,3 +304,12 @@ class StrictModel(BaseModel):
     """Frozen; an unknown key is an error, never ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
+
+
+def what_is_made(config: Any) -> Any:
+    """JSON values of a configuration without its sections ``sharding`` and ``saving``: how work is shared out among
+    processes and kept while it goes on names neither a training nor its artifact.
+    """
+    if isinstance(config, Mapping):
+        return {name: what_is_made(part) for name, part in config.items() if name not in ("sharding", "saving")}
+    return [what_is_made(part) for part in config] if isinstance(config, list | tuple) else config

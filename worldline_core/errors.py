@@ -71,6 +71,10 @@ class TrainingError(WorldLineError):
     """Training cannot go on (for example, a loss that is not finite)."""
 
 
+class StoppedError(WorldLineError):
+    """A training was asked to stop, and its state is saved."""
+
+
 class RegressionError(WorldLineError):
     """An evaluation found models worse than they were."""
 

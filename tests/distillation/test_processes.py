@@ -96,7 +96,7 @@ def test_two_processes_distill_one_artifact_and_go_on_after_a_kill(
     assert all(parameter.isfinite().all() for parameter in model.parameters())
 
     kill_once_there(
-        start(project_root, inputs, parts, log), parts, "distill/*.partial/run/teacher_forcing/run/*/state.*"
+        start(project_root, inputs, parts, log), parts, "distill/*.partial/run/teacher_forcing/run/*/step-*/state.*"
     )
     (partial,) = (parts / "distill").glob("*.partial")
     assert not (partial / "checkpoint.json").exists()

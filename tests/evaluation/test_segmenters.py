@@ -41,15 +41,15 @@ def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeyp
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     result = train_segmenter(CONFIG, {"episodes": training}, whole)
     assert result["videos"] == 4
-    save = trainer.save_training_state
+    save = trainer.TrainingStates.save
 
-    def killed(*arguments):
-        save(*arguments)
-        if arguments[-1]["step"] == 2:
+    def killed(states, facts):
+        save(states, facts)
+        if facts["step"] == 2:
             raise KeyboardInterrupt("killed")
 
     with monkeypatch.context() as patch:
-        patch.setattr(trainer, "save_training_state", killed)
+        patch.setattr(trainer.TrainingStates, "save", killed)
         with pytest.raises(KeyboardInterrupt, match="killed"):
             train_segmenter(CONFIG, {"episodes": training}, resumed)
     train_segmenter(CONFIG, {"episodes": training}, resumed)

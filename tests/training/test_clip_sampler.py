@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.processes import BatchPlan
 from worldline_core.training.stage1 import Stage1Config
 
 
@@ -46,9 +47,35 @@ def test_clips_fit_their_episodes_share_a_length_and_cover_all_starts(store: Lat
 
 def test_ranks_share_the_global_batch(store: LatentStore) -> None:
     whole = make(store, batch_size=4)
-    parts = [make(store, batch_size=2, rank=rank, world_size=2) for rank in range(2)]
+    parts = [make(store, batch_size=2, plan=BatchPlan(2, 2, rank, 2)) for rank in range(2)]
     for index in range(10):
         assert whole.clips(index).clips == parts[0].clips(index).clips + parts[1].clips(index).clips
+
+
+@pytest.mark.parametrize(("together", "world_size"), [(2, 1), (1, 2), (4, 2), (2, 4)])
+@pytest.mark.parametrize("order", ["weighted", "epochs"])
+def test_another_number_of_processes_goes_on_with_the_same_clips(
+    store: LatentStore, together: int, world_size: int, order: str
+) -> None:
+    config = ClipSampling.model_validate({"lengths": (5, 9), "order": order})
+    before = [
+        make(store, config, batch_size=2, plan=BatchPlan(4, together, rank, together)) for rank in range(together)
+    ]
+    after = [
+        make(store, config, batch_size=2, plan=BatchPlan(4, together, rank, world_size)) for rank in range(world_size)
+    ]
+    for step in range(3):
+        clips = [
+            sorted(
+                (clip.episode_id, clip.start, clip.num_frames)
+                for sampler in samplers
+                for part in range(sampler.plan.accumulation)
+                for clip in sampler.clips(step * sampler.plan.accumulation + part).clips
+            )
+            for samplers in (before, after)
+        ]
+        assert clips[0] == clips[1]
+        assert len(clips[0]) == 8
 
 
 def test_sources_and_views_follow_their_weights(store: LatentStore) -> None:
@@ -68,7 +95,7 @@ def test_sources_and_views_follow_their_weights(store: LatentStore) -> None:
 def test_single_view_steps_take_larger_batches(store: LatentStore) -> None:
     config = ClipSampling(lengths=(9,), view_weights={"joint": 0.5, "head": 0.5}, single_view_factor=3)
     whole = make(store, config, batch_size=4)
-    parts = [make(store, config, batch_size=2, rank=rank, world_size=2) for rank in range(2)]
+    parts = [make(store, config, batch_size=2, plan=BatchPlan(2, 2, rank, 2)) for rank in range(2)]
     sizes = Counter()
     for index in range(60):
         batch = whole.clips(index)
@@ -102,7 +129,8 @@ def test_an_epoch_holds_every_clip_once_over_all_ranks(store: LatentStore, world
     config = ClipSampling(lengths=(5, 9, 17), order="epochs", hop=hop)
     expected = every_clip(store, (5, 9, 17), hop or 4)
     samplers = [
-        make(store, config, batch_size=6 // world_size, rank=rank, world_size=world_size) for rank in range(world_size)
+        make(store, config, batch_size=6 // world_size, plan=BatchPlan(world_size, world_size, rank, world_size))
+        for rank in range(world_size)
     ]
     batches = len(expected) // 6
     for epoch in range(2):

@@ -1,13 +1,15 @@
-"""Training on two processes (gloo): one model, the batch shared out, one writer, and the same bytes after a kill."""
+"""Training on several processes (gloo): one model in parts, one writer, the same weights on any number of them."""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ def run_processes(project: Path, folder: Path, runs: list[dict[str, Any]], count
     request = folder / f"request-{len(list(folder.glob('request-*')))}.json"
     request.write_text(json.dumps(runs, default=str))
     shared = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),
-              "OMP_NUM_THREADS": "1", "PYTHONPATH": str(project)}  # fmt: skip
+              "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(project), os.environ.get("EXTRA", "")])}  # fmt: skip
     command = [sys.executable, str(Path(__file__).with_name("run_process.py")), str(request)]
     with (folder / "log").open("ab") as log:
         processes = [
@@ -40,16 +42,28 @@ def run_processes(project: Path, folder: Path, runs: list[dict[str, Any]], count
             )
             for rank in range(count)
         ]
-        last = processes[-1].wait(timeout=280)
-        if last != 0:
-            # What torchrun does: when one process is gone, it ends the others.
+        last = processes[-1].wait(timeout=200)
+        try:
+            # Where one process is gone, the others must end by themselves within a minute.
+            return [process.wait(timeout=60 if last else 200) for process in processes[:-1]] + [last]
+        finally:
             for process in processes:
                 process.kill()
-        return [process.wait(timeout=280) for process in processes[:-1]] + [last]
 
 
-def weights(output: Path, rank: int) -> dict[str, torch.Tensor]:
-    return load_file(output.with_name(f"{output.name}.rank{rank}.safetensors"))
+def weights(output: Path) -> dict[str, torch.Tensor]:
+    return load_file(output.with_name(f"{output.name}.safetensors"))
+
+
+def difference(first: Path, second: Path) -> float:
+    """The largest difference between the weights of two runs."""
+    one, other = weights(first), weights(second)
+    assert one.keys() == other.keys()
+    return max(float((one[name] - other[name]).abs().max()) for name in one)
+
+
+def losses(output: Path) -> list[float]:
+    return [row["loss"] for row in read_json_lines(output / "metrics.jsonl") if "loss" in row]
 
 
 def trainer(steps: int, batch_size: int, **changes: Any) -> dict[str, Any]:
@@ -60,8 +74,8 @@ def trainer(steps: int, batch_size: int, **changes: Any) -> dict[str, Any]:
         "log_every": 2,
         "validation_batches": 1,
         "save_every_seconds": 1000.0,
-        "save_every_steps": 2,
-        "optimizer": {"learning_rate": 3e-3, "warmup_steps": 2},
+        "save_every_steps": 5,
+        "optimizer": {"learning_rate": 1e-3, "warmup_steps": 2},
     }
     return values | changes
 
@@ -75,88 +89,110 @@ def inputs(world: Any, tiny_model: dict[str, Any], tmp_path_factory: pytest.Temp
     return {**world.inputs, "stage1": folder}
 
 
-def stage2(output: Path, inputs: dict[str, Path], batch_size: int, **run: Any) -> dict[str, Any]:
+def stage2(output: Path, inputs: dict[str, Path], name: str, *, steps: int = 20, **changes: Any) -> dict[str, Any]:
+    """A run of Stage II, four clips a step whatever the number of processes."""
+    run = {key: changes.pop(key) for key in ("kill_before",) if key in changes}
     config = {
-        "trainer": trainer(6, batch_size),
+        "trainer": trainer(steps, **{"batch_size": 2, "global_batch": 4, **changes}),
         "clips": {"lengths": [9, 17], "view_weights": {"joint": 1.0, "head": 1.0}},
         "action_multiplier": 3.0,
         "relational": None,
     }
-    return {"step": "train_stage2", "config": config, "inputs": inputs, "output": output, **run}
+    return {"step": "train_stage2", "config": config, "inputs": inputs, "output": output / name, **run}
 
 
-@pytest.mark.slow
-def test_two_processes_train_one_model(
-    world: Any, inputs: dict[str, Path], tiny_model: dict[str, Any], project_root: Path, tmp_path: Path
-) -> None:
-    text_run = {
-        "step": "train_stage1",
-        "config": {
-            "model": tiny_model,
-            # Each process draws for itself whether it reads the text, so often only one of them uses the text tower.
-            "text_dropout": 0.5,
-            "clips": {"lengths": [9], "view_weights": {"primary": 1}},
-            "trainer": trainer(6, 2),
-        },
-        "inputs": world.inputs,
-        "output": tmp_path / "text",
+def stage1(output: Path, world: Any, tiny_model: dict[str, Any], name: str) -> dict[str, Any]:
+    """A run of Stage I in which some micro-batches read their text and others do not."""
+    config = {
+        "model": tiny_model,
+        "text_dropout": 0.5,
+        "clips": {"lengths": [9], "view_weights": {"primary": 1}},
+        "trainer": trainer(20, 2, global_batch=4),
     }
-    shared, twice = tmp_path / "shared", tmp_path / "twice"
-    runs = [stage2(shared, inputs, 2, by_clip=True), stage2(tmp_path / "drawn", inputs, 2), text_run]
-    assert run_processes(project_root, tmp_path, runs) == [0, 0], (tmp_path / "log").read_text()[-3000:]
-    assert run_processes(project_root, tmp_path, [stage2(twice, inputs, 4, by_clip=True)], count=1) == [0]
+    return {"step": "train_stage1", "config": config, "inputs": world.inputs, "output": output / name}
 
-    # Two processes with two clips each take the step of one process with four (but for the order of sums).
-    together, alone = weights(shared, 0), weights(twice, 0)
-    assert max(float((together[name] - alone[name]).abs().max()) for name in alone) < 2e-4
-    start = dict(load_file(inputs["stage1"] / "model.safetensors"))
-    moved = max(float((alone[name] - start[name].float()).abs().max()) for name in alone if name in start)
-    assert moved > 5e-3
-    losses = [
-        [row["loss"] for row in read_json_lines(run / "metrics.jsonl") if "loss" in row] for run in (shared, twice)
+
+@dataclass(frozen=True)
+class Runs:
+    """What was trained: the folder of each run, and what the processes wrote to the terminal."""
+
+    folder: Path
+    log: str
+    codes: list[int]
+    seconds: float
+
+    def __truediv__(self, name: str) -> Path:
+        return self.folder / name
+
+
+@pytest.fixture(scope="module")
+def runs(
+    world: Any, inputs: dict[str, Path], tiny_model: dict[str, Any], project_root: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Runs:  # fmt: skip
+    """Every run that the tests below compare: starting processes costs more than the runs."""
+    folder = tmp_path_factory.mktemp("runs")
+    one, two, four = folder / "one", folder / "two", folder / "four"
+    for path in (one, two, four):
+        path.mkdir()
+    # One process: whole runs, and one that is stopped half-way.
+    alone = [stage1(one, world, tiny_model, "text"), stage2(one, inputs, "plain")]
+    assert run_processes(project_root, one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
+    assert run_processes(project_root, one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
+    # Two processes: the same, with blocks computed again; the last run loses its second process.
+    shared = [
+        stage1(two, world, tiny_model, "text"),
+        stage2(two, inputs, "plain"),
+        stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
+        stage2(two, inputs, "killed", kill_before=11),
     ]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
-
-    for run in (shared, tmp_path / "drawn", tmp_path / "text"):
-        first, second = weights(run, 0), weights(run, 1)
-        assert all(torch.equal(first[name], second[name]) for name in first)
-        # One writer: every line of the log once.
-        steps = [row["step"] for row in read_json_lines(run / "metrics.jsonl") if "loss" in row]
-        assert steps == [2, 4, 6]
+    begun = time.monotonic()
+    codes = run_processes(project_root, two, shared)
+    seconds = time.monotonic() - begun
+    # Two go on from one, one goes on from two, two from two.
+    shutil.copytree(one / "half", two / "half")
+    shutil.copytree(two / "killed", one / "killed")
+    resumed = [stage2(two, inputs, "killed"), stage2(two, inputs, "half")]
+    log = (two / "log").read_text()
+    assert run_processes(project_root, two, resumed) == [0, 0], (two / "log").read_text()[-3000:]
+    assert run_processes(project_root, one, [stage2(one, inputs, "killed")], count=1) == [0]
+    # Four processes, two copies of two parts.
+    copies = stage2(four, inputs, "plain", batch_size=1, sharding={"shards": 2})
+    assert run_processes(project_root, four, [copies], count=4) == [0] * 4, (four / "log").read_text()[-3000:]
+    single = stage2(four, inputs, "single", batch_size=1)
+    assert run_processes(project_root, four, [single], count=1) == [0]
+    return Runs(folder, log, codes, seconds)
 
 
 @pytest.mark.slow
-def test_processes_that_were_killed_end_with_the_same_bytes(
-    inputs: dict[str, Path], project_root: Path, tmp_path: Path
-) -> None:
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_processes(project_root, tmp_path, [stage2(whole, inputs, 2)]) == [0, 0]
-    killed = run_processes(project_root, tmp_path, [stage2(parts, inputs, 2, kill_before=5)])
-    assert killed == [-9, -9]
-    assert not (parts / "checkpoint.json").exists()
-    assert run_processes(project_root, tmp_path, [stage2(parts, inputs, 2)]) == [0, 0]
-    assert digest_folder(parts) == digest_folder(whole)
-    # A state of two processes is not one of a single process: the batches differ.
-    assert run_processes(project_root, tmp_path, [stage2(parts, inputs, 2)], count=1) != [0]
-    assert "The training state belongs to another run" in (tmp_path / "log").read_text()
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("one/plain", "two/plain"),
+        ("one/text", "two/text"),
+        ("one/plain", "two/again"),
+        ("one/plain", "one/killed"),
+        ("one/plain", "two/half"),
+        ("four/single", "four/plain"),
+    ],
+    ids=["two", "two, text", "two, blocks again", "two, then one", "one, then two", "two copies of two parts"],
+)
+def test_another_number_of_processes_learns_the_same(runs: Runs, first: str, second: str) -> None:
+    assert losses(runs / second) == pytest.approx(losses(runs / first), rel=1e-6)
+    assert difference(runs / first, runs / second) <= 1e-6
+    # One writer: every line of the log once.
+    assert [row["step"] for row in read_json_lines(runs / second / "metrics.jsonl") if "loss" in row] == [
+        *range(2, 21, 2)
+    ]
 
 
-def test_gradients_and_values_of_a_single_process_are_left_alone(make_model: Callable[..., WorldModel]) -> None:
-    from worldline_core.training.trainer import (
-        average_gradients,
-        average_values,
-        join_processes,
-        processes,
-        wait_for_all,
-    )
+@pytest.mark.slow
+def test_processes_that_were_killed_end_with_the_same_bytes(runs: Runs) -> None:
+    assert digest_folder(runs / "two/killed") == digest_folder(runs / "two/plain")
 
-    join_processes("cpu")
-    assert processes() == (0, 1)
-    wait_for_all()
-    model = make_model()
-    parameters = list(model.parameters())
-    parameters[0].grad = torch.ones_like(parameters[0])
-    average_gradients(parameters)
-    assert parameters[1].grad is None
-    assert float(parameters[0].grad.mean()) == 1.0
-    assert average_values({"loss": 2.5}) == {"loss": 2.5}
+
+@pytest.mark.slow
+def test_a_process_that_is_left_alone_says_so_and_ends(runs: Runs) -> None:
+    assert runs.codes == [1, -9]
+    assert "Another process of this training has ended or cannot be reached" in runs.log
+    assert "the same command continues from the last saved state" in runs.log

@@ -33,7 +33,14 @@ from worldline_core.distillation.trajectory_store import (
     write_trajectories,
 )
 from worldline_core.errors import CheckpointError
-from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.checkpoint import (
+    CHECKPOINT_DTYPE,
+    CheckpointInfo,
+    CheckpointKind,
+    load_checkpoint,
+    read_checkpoint_info,
+    save_checkpoint,
+)
 from worldline_core.model.contracts import TrainedClips
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
@@ -42,15 +49,10 @@ from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
 from worldline_core.training.clip_source import ClipRow, named_rows, training_rows
 from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.processes import ALONE, BatchPlan, join_processes, processes, wait_for_all
+from worldline_core.training.sharding import gathered, place_model
 from worldline_core.training.stage import validation_function
-from worldline_core.training.trainer import (
-    ParameterGroup,
-    TrainerConfig,
-    join_processes,
-    processes,
-    train,
-    wait_for_all,
-)
+from worldline_core.training.trainer import ParameterGroup, TrainerConfig, batch_plan, train
 
 __all__ = ["DistillConfig", "distill"]
 
@@ -151,11 +153,12 @@ class DistillationRun:
     def teacher_forcing(self) -> dict[str, float]:
         """Step 1, from the Stage II model."""
         settings = self.config.teacher_forcing
-        model, info = load_checkpoint(self.stage2, expect_kind="stage2", towers="generation")
+        model, info = self._model(self.stage2, settings.trainer, expect_kind="stage2")
         views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
         clips = ClipSampling.model_validate(self.config.clips.model_dump() | views)
-        sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, distributed=True)
-        objective = TeacherForcingObjective(model.to(settings.trainer.device).train(), self.config)
+        plan = batch_plan(settings.trainer, self._work(STEPS[0]))
+        sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
+        objective = TeacherForcingObjective(model.train(), self.config)
         return self._train(
             STEPS[0], settings.trainer, objective, lambda index: self.loader.load(sampler.clips(index)), info
         )
@@ -163,37 +166,40 @@ class DistillationRun:
     def trajectory_regression(self) -> dict[str, float]:
         """Step 2, from step 1's model, on trajectories that this model makes."""
         settings = self.config.trajectory_regression
-        student, info = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
-        self._make_trajectories(info)
-        objective = TrajectoryObjective(student.to(settings.trainer.device).train(), self.config, self.perceptual)
-        return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(settings.trainer), info)
+        self._make_trajectories(read_checkpoint_info(self.folder(STEPS[0])))
+        student, info = self._model(self.folder(STEPS[0]), settings.trainer, expect_kind="causal")
+        objective = TrajectoryObjective(student.train(), self.config, self.perceptual)
+        return self._train(STEPS[1], settings.trainer, objective, self._load_trajectories(STEPS[1]), info)
 
     def distribution_matching(self) -> dict[str, float]:
         """Step 3, from step 2's model; the real and the fake score start from the same weights."""
         settings = self.config.distribution_matching
-        student, info = load_checkpoint(self.folder(STEPS[1]), expect_kind="causal")
+        student, info = self._model(self.folder(STEPS[1]), settings.trainer, expect_kind="causal")
         scores = self.stage2 if settings.real_score == "stage2" else self.folder(STEPS[0])
-        real, fake = (load_checkpoint(scores, towers="generation")[0].to(settings.trainer.device) for _ in range(2))
-        objective = DistributionMatchingObjective(
-            student.to(settings.trainer.device).train(), real, fake.train(), self.config, self.perceptual
-        )
+        real, fake = (self._model(scores, settings.trainer)[0] for _ in range(2))
+        objective = DistributionMatchingObjective(student.train(), real, fake.train(), self.config, self.perceptual)
         other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate)
-        load = self._load_trajectories(settings.trainer)
-        return self._train(STEPS[2], settings.trainer, objective, load, info, other)
-
-    def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, *, distributed: bool) -> ClipSampler:
-        """Clips of the training splits; the same on every process unless `distributed`."""
-        rank, world_size = processes() if distributed else (0, 1)
-        return ClipSampler(
-            self.store,
-            clips,
-            splits=self.config.splits,
-            batch_size=batch_size,
-            seed=seed,
-            rank=rank,
-            world_size=world_size,
-            rows=self.rows,
+        return self._train(
+            STEPS[2], settings.trainer, objective, self._load_trajectories(STEPS[2]), info, (other, fake)
         )
+
+    def _model(
+        self, folder: Path, trainer: TrainerConfig, *, expect_kind: CheckpointKind | None = None
+    ) -> tuple[WorldModel, CheckpointInfo]:
+        """A checkpoint's video tower, shared out among the processes; the first one alone reads its weights."""
+        first = processes()[0] == 0
+        model, info = load_checkpoint(folder, expect_kind=expect_kind, towers="generation", weights=first)
+        return place_model(model, trainer.sharding, precision=trainer.precision, device=trainer.device), info
+
+    def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
+        """Clips of the training splits."""
+        return ClipSampler(
+            self.store, clips, splits=self.config.splits, batch_size=batch_size, seed=seed, plan=plan, rows=self.rows
+        )
+
+    def _work(self, step: str) -> Path:
+        """Where a step keeps its training state and its log until it is finished."""
+        return self.output / "run" / step
 
     @property
     def _trajectory_folder(self) -> Path:
@@ -204,12 +210,11 @@ class DistillationRun:
         settings = self.config.trajectory_regression.trajectories
         trainer = self.config.trajectory_regression.trainer
         folder = self._trajectory_folder
-        first = processes()[0] == 0
-        if first and not (folder / INDEX).is_file():
+        if not (folder / INDEX).is_file():
             teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
             teacher.to(trainer.device).eval().requires_grad_(False)
             per_shard = min(settings.clips, settings.clips_per_shard)
-            sampler = self._sampler(per_shard, settings.seed, self.config.clips, distributed=False)
+            sampler = self._sampler(per_shard, settings.seed, self.config.clips, ALONE)
             make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, sampler=sampler)
             facts = {
                 "teacher": teacher_info.weights_sha256,
@@ -219,16 +224,18 @@ class DistillationRun:
                 **settings.model_dump(mode="json"),
             }
             write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
-        if first:
+        if processes()[0] == 0:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
         wait_for_all()
 
-    def _load_trajectories(self, trainer: TrainerConfig) -> Callable[[int], TrajectoryBatch]:
+    def _load_trajectories(self, step: str) -> Callable[[int], TrajectoryBatch]:
+        trainer: TrainerConfig = getattr(self.config, step).trainer
         loader = TrajectoryLoader(
             TrajectoryStore.open(self._trajectory_folder),
             self.loader,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
+            plan=batch_plan(trainer, self._work(step)),
             generated_history=self.config.trajectory_regression.trajectories.history == "generated",
         )
         return loader.load
@@ -246,16 +253,16 @@ class DistillationRun:
         objective: CausalObjective[BatchT],
         load: Callable[[int], BatchT],
         parent: CheckpointInfo,
-        *other_groups: ParameterGroup,
+        *others: tuple[ParameterGroup, WorldModel],
     ) -> dict[str, float]:
         """Train one step with the shared loop, then write its checkpoint and metrics; a finished step is only read."""
         folder, log = self.folder(step), self.output / step / "metrics.jsonl"
         if (folder / "checkpoint.json").is_file() and log.is_file():
             return {f"{step}/{name}": value for name, value in read_checkpoint_info(folder).metadata["metrics"].items()}
-        work, model = self.output / "run" / step, objective.model
+        work, model = self._work(step), objective.model
         result = train(
             trainer,
-            groups=(ParameterGroup("student", _named_parameters(model)), *other_groups),
+            groups=(ParameterGroup("student", _named_parameters(model)), *(group for group, _ in others)),
             objective=objective,
             load=load,
             validate=validation_function(
@@ -270,9 +277,11 @@ class DistillationRun:
                 "episodes": named_rows(self.rows),
             },
             title=step.replace("_", " "),
+            models=(model, *(other for _, other in others)),
         )
+        trained = {name: result.average[name] for name, _ in model.named_parameters()}
+        weights = gathered(model.state_dict() | trained, CHECKPOINT_DTYPE)
         if processes()[0] == 0:
-            trained = {name: result.average[name] for name, _ in model.named_parameters()}
             write_bytes_atomic(log, (work / "metrics.jsonl").read_bytes())
             save_checkpoint(
                 folder,
@@ -290,7 +299,7 @@ class DistillationRun:
                     "lpips": self.lpips,
                     "metrics": result.metrics,
                 },
-                state_dict=model.state_dict() | trained,
+                state_dict=weights,
             )
         wait_for_all()
         return {f"{step}/{name}": value for name, value in result.metrics.items()}

@@ -25,12 +25,12 @@ from torch import Tensor
 
 from worldline_core.distillation.causal_objective import with_observed_frame
 from worldline_core.errors import ArtifactError
-from worldline_core.progress import with_progress
+from worldline_core.progress import Progress
 from worldline_core.store.artifact_files import digest_file, read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_source import Clip, ClipBatch
-from worldline_core.training.trainer import processes
+from worldline_core.training.processes import BatchPlan, processes, wait_for_all
 
 INDEX = "trajectories.json"
 
@@ -44,7 +44,7 @@ def shard_path(folder: Path, number: int) -> Path:
 
 
 def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dict[str, Any]) -> None:
-    """Make every shard that is not there yet, then the index.
+    """Make every shard that is not there yet, then the index. Processes of a run share the shards.
 
     Args:
         settings: everything that decides the content (teacher, seed, schedule), JSON values.
@@ -61,15 +61,22 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
             got=found,
             next_step="remove the folder, or use another one",
         )
+    rank, world_size = processes()
     write_json_atomic(folder / "settings.json", settings)
-    for number in with_progress(range(shards), "teacher trajectories", "shard"):
-        path = shard_path(folder, number)
-        if path.is_file():
-            continue
-        clips, nodes, mask = make(number)
-        header = {"clips": json.dumps([asdict(clip) for clip in clips])}
-        tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
-        write_bytes_atomic(path, save({name: value.contiguous() for name, value in tensors.items()}, metadata=header))
+    mine = range(rank, shards, world_size)
+    with Progress("teacher trajectories", len(mine), "shard", shown=rank == 0) as progress:
+        for number in mine:
+            path = shard_path(folder, number)
+            if not path.is_file():
+                clips, nodes, mask = make(number)
+                header = {"clips": json.dumps([asdict(clip) for clip in clips])}
+                tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
+                content = {name: value.contiguous() for name, value in tensors.items()}
+                write_bytes_atomic(path, save(content, metadata=header))
+            progress.advance()
+    wait_for_all()
+    if rank > 0:
+        return
     digests = [digest_file(shard_path(folder, number)) for number in range(shards)]
     write_json_atomic(folder / INDEX, {"settings": settings, "shards": digests})
 
@@ -156,12 +163,14 @@ class TrajectoryLoader:
         *,
         batch_size: int,
         seed: int,
+        plan: BatchPlan,
         generated_history: bool,
     ) -> None:
         self.store = store
         self.loader = loader
         self.batch_size = batch_size
         self.seed = seed
+        self.plan = plan
         self.generated_history = generated_history
         # A batch has one shape, so its clips have one length: a group is drawn by its size, then clips within it.
         lengths = [clip.num_frames for clip in store.clips(range(len(store)))]
@@ -171,12 +180,12 @@ class TrajectoryLoader:
         self._shares = np.array([len(group) for group in self._groups]) / len(store)
 
     def load(self, index: int) -> TrajectoryBatch:
-        """The batch of micro-step `index` (of this rank)."""
+        """The batch of this process's micro-step `index`."""
+        index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         group = self._groups[int(random.choice(len(self._groups), p=self._shares))]
-        rank, world_size = processes()
-        draws = random.integers(len(group), size=self.batch_size * world_size)
-        rows = [group[int(draw)] for draw in draws[rank * self.batch_size : (rank + 1) * self.batch_size]]
+        draws = random.integers(len(group), size=self.batch_size * self.plan.together)
+        rows = [group[int(draw)] for draw in draws[part * self.batch_size : (part + 1) * self.batch_size]]
         batch = self.loader.load(ClipBatch(self.store.clips(rows), None))
         nodes = self.store.nodes(rows).to(self.loader.device)
         history = batch.latents

@@ -25,6 +25,7 @@ FORMAT = "worldline.checkpoint"
 VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "checkpoint.json"
 MAPS_IN = "action_encoder.proj.weight"
+CHECKPOINT_DTYPE = torch.float16
 
 
 class CheckpointInfo(StrictModel):
@@ -99,7 +100,7 @@ def save_checkpoint(
     causal: CausalSpec | None = None,
     trained: TrainedClips | None = None,
     metadata: Mapping[str, Any] | None = None,
-    dtype: torch.dtype = torch.float16,
+    dtype: torch.dtype = CHECKPOINT_DTYPE,
     state_dict: Mapping[str, Tensor] | None = None,
     max_shard_bytes: int = MAX_SHARD_BYTES,
 ) -> None:
@@ -178,6 +179,7 @@ def load_checkpoint[Model: WorldModel](
     towers: Literal["both", "generation"] | None = None,
     action_frames: Literal[1, 4] | None = None,
     dtype: torch.dtype = torch.float32,
+    weights: bool = True,
     model_class: Callable[[WorldModelConfig], Model] = WorldModel,
 ) -> tuple[Model, CheckpointInfo]:
     """Build the model and fill it; nothing may be missing, left over, or of another shape.
@@ -188,6 +190,7 @@ def load_checkpoint[Model: WorldModel](
         towers: ``generation`` drops the understanding tower of a checkpoint that has it; None keeps what is stored.
         action_frames: control frames per latent frame that the model shall take. Those that the checkpoint does not
             know start with weights of zero, so that the model computes what it computed; None keeps what is stored.
+        weights: False gives an empty model (on the meta device), for a process that gets its weights from another one.
 
     Raises:
         CheckpointError: anything that does not fit, saying what was expected and what was found.
@@ -213,6 +216,12 @@ def load_checkpoint[Model: WorldModel](
             got=action_frames,
             next_step=f"set action_frames to {config.action_frames}, or start from another checkpoint",
         )
+    if not weights:
+        with torch.device("meta"):
+            model = model_class(config)
+            if action_frames not in (None, config.action_frames) and MAPS_IN in model.state_dict():
+                model = model_class(config.model_copy(update={"action_frames": action_frames}))
+        return model, info
     path = folder / WEIGHTS
     tensors = read_weights(path, info.weights_sha256)
     if action_frames not in (None, config.action_frames) and MAPS_IN in tensors:

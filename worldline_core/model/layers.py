@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +18,11 @@ import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import (
+    CheckpointPolicy,
+    SelectiveCheckpointContext,
+    create_selective_checkpoint_contexts,  # pyright: ignore[reportUnknownVariableType]
+)
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.rope import Rotation, rotate
@@ -65,11 +71,34 @@ def grouped_attention(queries: Tensor, keys: Tensor, values: Tensor, mask: Tenso
 
 @dataclass(frozen=True)
 class TextContext:
-    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once."""
+    """Keys and values of a text in every layer. They depend on neither the video nor sigma: compute them once.
+
+    ``ignored``: the video does not see the text. Only the way back passes through the text tower, with zero gradients,
+    because processes that share its weights must gather them together.
+    """
 
     layers: tuple[tuple[Tensor, Tensor], ...]
     mask: Bool[Tensor, "b m"] | None
     size: int
+    ignored: bool = False
+
+
+_ATTENTION = (
+    torch.ops.aten._scaled_dot_product_flash_attention.default,
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu.default,
+    torch.ops.aten._scaled_dot_product_efficient_attention.default,
+    torch.ops.aten._scaled_dot_product_cudnn_attention.default,
+)
+
+
+def keep_attention() -> tuple[AbstractContextManager[object], AbstractContextManager[object]]:
+    """Contexts for `torch.utils.checkpoint` that keep what the fused attention kernels return, and nothing else."""
+
+    def policy(_context: SelectiveCheckpointContext, operation: object, *_: object, **__: object) -> CheckpointPolicy:
+        return CheckpointPolicy.MUST_SAVE if operation in _ATTENTION else CheckpointPolicy.PREFER_RECOMPUTE
+
+    first, again = create_selective_checkpoint_contexts(policy)
+    return first, again
 
 
 class RMSNorm(nn.Module):
@@ -131,14 +160,12 @@ class MixtureAttention(nn.Module):
         mixed = grouped_attention(queries, keys, value, causal[None, None])
         return self.to_out(mixed), (keys, value)
 
-    def generate(
-        self, values: Tensor, attend: GenerationAttention, layer: int, text: tuple[Tensor, Tensor] | None
-    ) -> Tensor:
-        """Attention of the video tokens, as ``attend`` lays down."""
+    def project(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of the video tokens, ``(b heads n d)``, normalised and not yet rotated."""
         queries = rearrange(self.norm_added_q(self._heads(self.add_q_proj(values))), "b n k d -> b k n d")
         keys = rearrange(self.norm_added_k(self._heads(self.add_k_proj(values))), "b n k d -> b k n d")
         value = rearrange(self._heads(self.add_v_proj(values)), "b n k d -> b k n d")
-        return self.to_add_out(attend(layer, queries, keys, value, text))
+        return queries, keys, value
 
 
 class MixtureLayer(nn.Module):
@@ -169,7 +196,19 @@ class MixtureLayer(nn.Module):
             attend: how they look at each other.
             text: keys and values of the text in this layer, from `understand`.
         """
-        tokens = tokens + self.self_attn.generate(self.input_layernorm_moe_gen(tokens), attend, layer, text)
+        queries, keys, values = self._before_attention(tokens)
+        return self._after_attention(tokens, attend(layer, queries, keys, values, text))
+
+    def compile_halves(self) -> None:
+        """Compile what comes before attention and what comes after it; attention itself differs from pass to pass."""
+        self._before_attention = torch.compile(self._before_attention)  # pyright: ignore[reportUnknownMemberType]
+        self._after_attention = torch.compile(self._after_attention)  # pyright: ignore[reportUnknownMemberType]
+
+    def _before_attention(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.self_attn.project(self.input_layernorm_moe_gen(tokens))
+
+    def _after_attention(self, tokens: Tensor, mixed: Tensor) -> Tensor:
+        tokens = tokens + self.self_attn.to_add_out(mixed)
         return tokens + self.mlp_moe_gen(self.post_attention_layernorm_moe_gen(tokens))
 
     def understand(

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
+from torch.utils.checkpoint import checkpoint, noop_context_fn  # pyright: ignore[reportUnknownVariableType]
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import (
@@ -40,6 +40,7 @@ from worldline_core.model.layers import (
     TimeEmbedder,
     check_shapes,
     is_text_parameter,
+    keep_attention,
     velocity_of,
 )
 from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
@@ -72,7 +73,13 @@ class WorldModel(nn.Module):
         self.view_embedding = (
             nn.Parameter(torch.zeros(len(config.views), config.hidden_size)) if config.view_embedding else None
         )
-        self.gradient_checkpointing = False
+        self.checkpointing: Literal["none", "block", "selective"] = "none"
+        """What is computed again on the way back instead of being kept: see ``ShardingConfig``."""
+
+    def compile_blocks(self) -> None:
+        """Compile what every block computes around its attention; weights and their names stay as they are."""
+        for layer in self._mixture():
+            layer.compile_halves()
 
     def initialise(self, generator: torch.Generator | None = None) -> None:
         """Starting values for training from scratch.
@@ -156,12 +163,12 @@ class WorldModel(nn.Module):
         """
         check_shapes(self.config, latents, views, action_maps)
         frames, (rows, columns) = latents.shape[3], self._patch_grid(latents)
-        offset = 0.0 if text is None else text.size + self.config.temporal_margin
+        offset = 0.0 if text is None or text.ignored else text.size + self.config.temporal_margin
         by = self._rotation(torch.arange(frames, device=latents.device), latents, views, fps, offset)
         clean = torch.zeros(len(latents), frames, dtype=torch.bool, device=latents.device)
         clean[:, 0] = True
         tokens = self._embed(latents, sigma, clean, action_maps, views)
-        attend = FullAttention(by, None if text is None else text.mask)
+        attend = FullAttention(by) if text is None else FullAttention(by, text.mask, text.ignored)
         tokens, features = self._run(tokens, attend, action_maps, text, features_at)
         velocity = self._velocity(tokens, latents, sigma, clean, latents[:, :, :, :1])
         if features is not None:
@@ -330,8 +337,12 @@ class WorldModel(nn.Module):
             context = None if text is None else text.layers[index]
             if action_maps is not None and isinstance(self.action_encoder, NativeActionFilm):
                 tokens = self.action_encoder(tokens, action_maps, index)
-            if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens = cast("Tensor", checkpoint(layer, tokens, attend, index, context, use_reentrant=False))
+            if self.checkpointing != "none" and torch.is_grad_enabled():
+                kept = keep_attention if self.checkpointing == "selective" else noop_context_fn
+                tokens = cast(
+                    "Tensor",
+                    checkpoint(layer, tokens, attend, index, context, use_reentrant=False, context_fn=kept),
+                )
             else:
                 tokens = layer(tokens, attend, index, context)
             if features_at == index + 1:

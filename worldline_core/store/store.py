@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldline_core.config import StrictModel
+from worldline_core.config import StrictModel, what_is_made
 from worldline_core.errors import ArtifactError
 from worldline_core.store.artifact_files import (
     KEY_LENGTH,
@@ -127,7 +127,8 @@ class ArtifactStore:
 
     def key(self, step: str, version: int, config: StrictModel, inputs: Mapping[str, str]) -> str:
         """Content key of a step. ``inputs`` maps an input's name to the digest of its content."""
-        identity = {"step": step, "version": version, "config": config.model_dump(mode="json"), "inputs": dict(inputs)}
+        made = what_is_made(config.model_dump(mode="json"))
+        identity = {"step": step, "version": version, "config": made, "inputs": dict(inputs)}
         return digest_value(identity)[:KEY_LENGTH]
 
     def find(self, step: str, key: str) -> Artifact | None:

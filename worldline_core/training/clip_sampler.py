@@ -19,6 +19,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.contracts import TrainedClips
 from worldline_core.training.clip_source import Clip, ClipBatch, ClipRow, ClipSource, longest_clip
 from worldline_core.training.epoch_order import EpochOrder
+from worldline_core.training.processes import ALONE, BatchPlan
 
 JOINT = "joint"
 """In place of a view's name: all views of the model together."""
@@ -115,11 +116,12 @@ class _Kind:
 
 
 class ClipSampler:
-    """Draws batches of clips. Every rank draws the same global batch and takes its own part.
+    """Draws batches of clips. Every process draws the same large batch and takes its own part.
 
     Args:
         source: where the clips are read from.
-        batch_size: clips per micro-step on this rank.
+        batch_size: clips of a micro-batch.
+        plan: which micro-batches are this process's, and how many are drawn as one.
         rows: the episodes to draw from (default: all of the source).
 
     Raises:
@@ -135,8 +137,7 @@ class ClipSampler:
         splits: Sequence[str],
         batch_size: int,
         seed: int,
-        rank: int = 0,
-        world_size: int = 1,
+        plan: BatchPlan = ALONE,
         rows: Sequence[ClipRow] | None = None,
     ) -> None:
         if config.hop is not None and config.hop % source.start_step:
@@ -149,8 +150,7 @@ class ClipSampler:
         self.batch_size = batch_size
         self.single_view_factor = config.single_view_factor
         self.seed = seed
-        self.rank = rank
-        self.world_size = world_size
+        self.plan = plan
         self.step = source.start_step
         self._view_names = sorted(config.view_weights or {})
         self._view_weights = _normalised([(config.view_weights or {})[name] for name in self._view_names])
@@ -185,10 +185,11 @@ class ClipSampler:
             for kind in self._kinds:
                 kind.cumulative = np.cumsum([kind.starts(row, self.step) for row in kind.rows])
             counts = [int(kind.cumulative[-1]) for kind in self._kinds]
-            self._epochs = EpochOrder(counts, batch_size * world_size, seed)
+            self._epochs = EpochOrder(counts, batch_size * plan.together, seed)
 
     def clips(self, index: int) -> ClipBatch:
-        """The clips of micro-step ``index`` (of this rank)."""
+        """The clips of this process's micro-step ``index``."""
+        index, part = self.plan.drawn(index)
         random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
         number = int(random.choice(len(self._kinds), p=self._kind_weights))
         places: list[int] = []
@@ -200,10 +201,10 @@ class ClipSampler:
             name = self._view_names[int(random.choice(len(self._view_names), p=weights))]
             view = None if name == JOINT else name
         if self._epochs is not None:
-            mine = places[self.rank * self.batch_size : (self.rank + 1) * self.batch_size]
+            mine = places[part * self.batch_size : (part + 1) * self.batch_size]
             return ClipBatch(tuple(self._numbered(kind, place) for place in mine), view, kind.absent)
         size = self.batch_size * (1 if view is None else self.single_view_factor)
-        return ClipBatch(self._drawn(random, kind, size), view, kind.absent)
+        return ClipBatch(self._drawn(random, kind, size, part), view, kind.absent)
 
     def _weights_of_views(self, kind: _Kind) -> np.ndarray:
         """Weights of what a step of this kind trains on: of views that its episodes lack, none."""
@@ -221,12 +222,13 @@ class ClipSampler:
         first = batch.clips[place]
         kinds = [(kind.length, kind.stride, kind.absent) for kind in self._kinds]
         number = kinds.index((first.num_frames, first.stride, batch.absent))
+        index, part = self.plan.drawn(index)
         counter = [0, 0, 1 + attempt, 1 + place]
         random = np.random.Generator(np.random.Philox(key=[self.seed, index], counter=counter))
         if self._epochs is not None:
-            places = random.integers(self._epochs.counts[number], size=self.world_size)
-            return self._numbered(self._kinds[number], int(places[self.rank]))
-        return self._drawn(random, self._kinds[number], 1)[0]
+            places = random.integers(self._epochs.counts[number], size=self.plan.together)
+            return self._numbered(self._kinds[number], int(places[part]))
+        return self._drawn(random, self._kinds[number], 1, part)[0]
 
     @property
     def clips_per_epoch(self) -> int | None:
@@ -234,9 +236,9 @@ class ClipSampler:
         return None if self._epochs is None else sum(self._epochs.counts)
 
     def epochs(self, index: int) -> float | None:
-        """Epochs that the micro-steps before ``index`` make up, or None where clips are drawn by weights."""
+        """Epochs that the micro-steps before ``index`` make up on all processes, or None where clips are drawn by weights."""
         total = self.clips_per_epoch
-        return None if total is None else index * self.batch_size * self.world_size / total
+        return None if total is None else index * self.batch_size * self.plan.world_size / total
 
     @property
     def longest(self) -> int:
@@ -262,9 +264,9 @@ class ClipSampler:
         factor = self.single_view_factor
         return [(None, self.batch_size) if name == JOINT else (name, self.batch_size * factor) for name in drawn]
 
-    def _drawn(self, random: np.random.Generator, kind: _Kind, size: int) -> tuple[Clip, ...]:
-        draws = random.random((size * self.world_size, 2))  # per clip: which episode, which start
-        return tuple(self._clip(kind, *draw) for draw in draws[self.rank * size : (self.rank + 1) * size])
+    def _drawn(self, random: np.random.Generator, kind: _Kind, size: int, part: int) -> tuple[Clip, ...]:
+        draws = random.random((size * self.plan.together, 2))  # per clip: which episode, which start
+        return tuple(self._clip(kind, *draw) for draw in draws[part * size : (part + 1) * size])
 
     def _clip(self, kind: _Kind, which: float, where: float) -> Clip:
         row = kind.rows[min(int(np.searchsorted(kind.cumulative, which, side="right")), len(kind.rows) - 1)]

@@ -9,6 +9,7 @@ The flow-matching objective of Stage I and Stage II, with the relational terms w
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -21,6 +22,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
+from worldline_core.training.processes import any_process
 from worldline_core.training.relational import RelationalTerm
 
 
@@ -167,11 +169,13 @@ class FlowMatchingObjective:
             taught = self.relational.taught(
                 batch, (latents.shape[3], latents.shape[-2] // patch, latents.shape[-1] // patch)
             )
+        # Where another process reads its text, this one takes part in gathering that tower's weights.
+        text = self._text(batch) if batch.text_ids is not None and any_process(with_text) else None
         output = self.model(
             add_noise(latents, noise, sigma),
             sigma,
             action_maps=maps,
-            text=self._text(batch) if with_text else None,
+            text=text if text is None or with_text else replace(text, ignored=True),
             views=batch.views,
             fps=batch.fps,
             features_at=None if self.relational is None else self.relational.layer,

@@ -24,7 +24,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.trainer import average_values
+from worldline_core.training.processes import average_values
 from worldline_core.training.video_teacher import VideoTeacher
 
 

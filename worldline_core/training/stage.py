@@ -18,7 +18,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
-from worldline_core.model.checkpoint import CheckpointInfo, save_checkpoint
+from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch, ClipLoader, ClipReader, SkipLog
@@ -38,13 +38,14 @@ from worldline_core.training.clip_source import (
 from worldline_core.training.flow_matching import FlowMatchingObjective, LossWeighting, SigmaSampling
 from worldline_core.training.frame_source import FrameSource
 from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.processes import BatchPlan, join_processes, processes
+from worldline_core.training.sharding import gathered, place_model
 from worldline_core.training.trainer import (
     ParameterGroup,
     TrainerConfig,
     TrainingResult,
+    batch_plan,
     held_out_losses,
-    join_processes,
-    processes,
     train,
 )
 
@@ -114,7 +115,7 @@ class Stage:
         join_processes(device)
         torch.manual_seed(config.trainer.seed)
         model, parent = load_model()
-        model.to(device).train()
+        place_model(model, config.trainer.sharding, precision=config.trainer.precision, device=device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
         source = _open_source(config, inputs, episodes, model.config.views)
         needed = config.clips.needed_views(model.config.views)
@@ -132,17 +133,20 @@ class Stage:
     def sampler(self) -> ClipSampler:
         """Which clips every micro-step trains on."""
         trainer = self.config.trainer
-        rank, world_size = processes()
         return ClipSampler(
             self.source,
             self.config.clips,
             splits=self.config.splits,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
-            rank=rank,
-            world_size=world_size,
+            plan=self.plan,
             rows=self.rows,
         )
+
+    @cached_property
+    def plan(self) -> BatchPlan:
+        """How each step's micro-batches are shared out among the processes."""
+        return batch_plan(self.config.trainer, self.output)
 
     def loader(self, **conditions: Any) -> ClipLoader:
         """A loader of this run's clips; ``conditions`` as `ClipLoader` takes them (action tracks, text)."""
@@ -174,7 +178,7 @@ class Stage:
                 here,
                 workers=config.input.workers,
                 prefetch=config.input.prefetch,
-                stop=trainer.steps * trainer.accumulation,
+                stop=trainer.steps * self.plan.accumulation,
                 pinned=torch.device(trainer.device).type == "cuda",
             )
         with reading as reader:
@@ -200,6 +204,7 @@ class Stage:
                     "episodes": named_rows(self.rows),
                 },
                 title=self.title,
+                models=(self.model,),
             )
 
     def save(
@@ -210,10 +215,10 @@ class Stage:
         action_contract: ActionContract | None,
         facts: Mapping[str, Any],
     ) -> dict[str, Any]:
-        """Write the averaged weights (the first process alone does) and return the counts of the run."""
+        """Gather and write the averaged weights (the first process alone writes) and return the counts of the run."""
         trainer = self.config.trainer
-        rank, world_size = processes()
-        if rank == 0:
+        weights = gathered({**self.model.state_dict(), **result.average}, CHECKPOINT_DTYPE)
+        if processes()[0] == 0:
             save_checkpoint(
                 self.output,
                 self.model,
@@ -230,16 +235,16 @@ class Stage:
                     **self._input_facts(),
                     **facts,
                 },
-                state_dict={**self.model.state_dict(), **result.average},
+                state_dict=weights,
             )
-        clips = trainer.steps * trainer.batch_size * trainer.accumulation * world_size
+        clips = trainer.steps * trainer.batch_size * self.plan.per_step
         return {"steps": trainer.steps, "clips": clips}
 
     def _input_facts(self) -> dict[str, Any]:
         """How clips were read, for the checkpoint; nothing where they were cached latents in the default order."""
         facts: dict[str, Any] = {}
         source, trainer = self.config.input, self.config.trainer
-        micro_steps = trainer.steps * trainer.accumulation
+        micro_steps = trainer.steps * self.plan.accumulation
         if isinstance(source, FrameInput):
             facts["input"] = {"kind": source.kind, "decoder": self.source.description["decoder"]}
         if self.config.clips.order == "epochs":

@@ -15,6 +15,7 @@ from worldline_core.model.text import TextConfig, load_text_encoder
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.training.clip_sampler import ClipSampling
 from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.processes import processes
 from worldline_core.training.stage import Stage, StageConfig
 from worldline_core.training.trainer import ParameterGroup
 
@@ -48,7 +49,8 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo | None]:
         if "base" in inputs:
-            return load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both")
+            first = processes()[0] == 0
+            return load_checkpoint(Path(inputs["base"]), expect_kind=("base", "stage1"), towers="both", weights=first)
         model = WorldModel(config.model)
         model.initialise(torch.Generator().manual_seed(config.trainer.seed))
         return model, None

@@ -19,6 +19,7 @@ from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContr
 from worldline_core.model.film import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
+from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherRelations
 from worldline_core.training.stage import Stage, StageConfig
 from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
@@ -78,7 +79,11 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
         model, info = load_checkpoint(
-            parent, expect_kind=kinds, towers="generation", action_frames=config.action_frames
+            parent,
+            expect_kind=kinds,
+            towers="generation",
+            action_frames=config.action_frames,
+            weights=processes()[0] == 0,
         )
         if config.native_size is not None and model.config.native_size != config.native_size:
             film = {"action_conditioning": "native_film", "action_channels": config.native_size}

@@ -1,98 +1,40 @@
 """The training loop of every model that is trained here: optimiser, averages, metrics, and a state to continue from.
 
 A model states its parameters, its objective and its batches; see `train`. With torchrun, several processes share every
-global batch; weights stay equal on all of them.
+step and every weight (`sharding.py`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import ConfigError, TrainingError
+from worldline_core.errors import ConfigError, StoppedError, TrainingError
 from worldline_core.progress import Progress
+from worldline_core.training.early_end import keep_batch, require_finite, stop_requests
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.processes import BatchPlan, average_values, processes, reporting_lost_processes
+from worldline_core.training.sharding import ShardingConfig, reduce_gradients, whole
 from worldline_core.training.training_state import (
-    STATE_FILE,
-    ExponentialAverage,
     MetricsLog,
+    SavingConfig,
+    TrainingStates,
     identity_digests,
-    load_training_state,
-    save_training_state,
+    json_numbers,
+    newest_state,
+    numbers_of,
 )
-
-# The first process makes the offline trajectories alone: at full size that takes hours while the others wait.
-_PROCESS_TIMEOUT = timedelta(hours=24)
-
-
-def join_processes(device: str) -> None:
-    """Join the processes that torchrun has started to share a run; nothing happens where this one is alone.
-
-    Call it before anything is moved to ``device``: on GPUs it makes "cuda" this process's own card.
-    """
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not torch.distributed.is_initialized():
-        on_gpu = torch.device(device).type == "cuda"
-        if on_gpu:
-            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-        torch.distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PROCESS_TIMEOUT)
-
-
-def processes() -> tuple[int, int]:
-    """(rank, number) of the processes that share this run; (0, 1) where this one is alone."""
-    if not torch.distributed.is_initialized():
-        return 0, 1
-    return torch.distributed.get_rank(), torch.distributed.get_world_size()
-
-
-def wait_for_all() -> None:
-    """Return once every process has called this; at once when there is only one."""
-    if torch.distributed.is_initialized():
-        torch.distributed.barrier()
-
-
-def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Mean of every gradient over the processes, in place.
-
-    Where only some processes used a parameter (text dropout is drawn by each), it counts as zero on the others; where
-    none did, there is still no gradient.
-    """
-    if not torch.distributed.is_initialized():
-        return
-    parameters = list(parameters)
-    device = parameters[0].device
-    used = torch.tensor([parameter.grad is not None for parameter in parameters], dtype=torch.int32, device=device)
-    torch.distributed.all_reduce(used)
-    for parameter, count in zip(parameters, used.tolist(), strict=True):
-        if not count:
-            continue
-        if parameter.grad is None:
-            parameter.grad = torch.zeros_like(parameter)
-        torch.distributed.all_reduce(parameter.grad)
-        parameter.grad /= torch.distributed.get_world_size()
-
-
-def average_values(values: Mapping[str, float]) -> dict[str, float]:
-    """Mean of every number over the processes, the same on all of them; they must name the same numbers."""
-    if not torch.distributed.is_initialized():
-        return dict(values)
-    names = sorted(values)
-    on_gpu = torch.distributed.get_backend() == "nccl"
-    numbers = torch.tensor([values[name] for name in names], dtype=torch.float64, device="cuda" if on_gpu else "cpu")
-    torch.distributed.all_reduce(numbers)
-    numbers /= torch.distributed.get_world_size()
-    return dict(zip(names, numbers.tolist(), strict=True))
 
 
 class OptimizerConfig(StrictModel):
@@ -107,7 +49,12 @@ class OptimizerConfig(StrictModel):
 
 
 class TrainerConfig(StrictModel):
-    """Length, batch and bookkeeping of a run. ``batch_size`` counts examples per device and micro-step."""
+    """Length, batch and bookkeeping of a run.
+
+    ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
+    ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
+    it, and the run learns the same on 8 or 64 devices.
+    """
 
     steps: int = Field(ge=1)
     batch_size: int = Field(default=8, ge=1)
@@ -122,6 +69,18 @@ class TrainerConfig(StrictModel):
     validation_batches: int = Field(default=4, ge=0)
     save_every_seconds: float = Field(default=20.0, ge=0)
     save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
+    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
+    global_batch: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+    sharding: ShardingConfig = Field(default=ShardingConfig(), exclude_if=lambda value: value == ShardingConfig())
+    saving: SavingConfig = Field(default=SavingConfig(), exclude_if=lambda value: value == SavingConfig())
+
+    @model_validator(mode="after")
+    def _whole_micro_batches(self) -> Self:
+        if self.global_batch is not None and self.global_batch % self.batch_size:
+            raise ValueError(f"global_batch ({self.global_batch}) must be a multiple of batch_size ({self.batch_size})")
+        if self.global_batch is not None and self.accumulation != 1:
+            raise ValueError("accumulation follows from global_batch and the number of processes: give one of the two")
+        return self
 
 
 @dataclass(frozen=True)
@@ -201,6 +160,35 @@ def held_out_losses[BatchT](
     return totals
 
 
+def batch_plan(config: TrainerConfig, output: Path) -> BatchPlan:
+    """How the micro-batches of a run are shared out: as its saved state says, or as the configuration asks for.
+
+    Raises: ConfigError: they cannot be shared out evenly. ArtifactError: the saved state is damaged.
+    """
+    state = newest_state(output)
+    if state is not None:
+        return BatchPlan.of(state["micro_batches"], state["drawn_together"])
+    if config.global_batch is None:
+        return BatchPlan.of(config.accumulation * processes()[1])
+    # Drawn as one, whatever the number of processes: all have clips of one length at a time, and the same clips.
+    per_step = config.global_batch // config.batch_size
+    return BatchPlan.of(per_step, per_step)
+
+
+@dataclass(frozen=True)
+class _Run[BatchT: NamedBatch]:  # what every step needs
+    config: TrainerConfig
+    objective: Objective[BatchT]
+    load: Callable[[int], BatchT]
+    optimizer: torch.optim.Optimizer
+    parameters: Mapping[str, nn.Parameter]
+    models: Sequence[nn.Module]
+    plan: BatchPlan
+    states: TrainingStates
+    title: str
+    output: Path
+
+
 def train[BatchT: NamedBatch](
     config: TrainerConfig,
     *,
@@ -212,22 +200,24 @@ def train[BatchT: NamedBatch](
     identity: Mapping[str, Any],
     title: str,
     schedule: Callable[[int], float] | None = None,
+    models: Sequence[nn.Module] = (),
 ) -> TrainingResult:
     """Train until ``config.steps``; called again with the same ``output``, it continues from the last saved state.
 
-    On a CPU the result does not depend on where a run was interrupted.
+    On a CPU the result does not depend on where it was interrupted; with other processes sums have another order.
 
     Args:
-        load: micro-step index to batch (a pure function).
+        load: number of this process's micro-step to batch (a pure function; `BatchPlan` says which clips it has).
         validate: measures held-out losses; called with the averaged weights in the model.
         output: ``metrics.jsonl`` is written here, the state to continue from and timings under ``run/``.
-        identity: JSON values that name this run (config, weights it starts from, clips); a state of another run is
-            refused.
+        identity: JSON values that name this run (config, start, clips); a state of another run is refused.
         schedule: factor on the base learning rate per step (0-based); by default `learning_rate_factor`.
+        models: the trained models, where processes share them (`place_model`).
 
     Raises:
-        TrainingError: if the loss or the gradient is not finite.
+        TrainingError: if a loss or the gradient is not finite, a state cannot be written, or another process has ended.
         ArtifactError: if a saved state is damaged or belongs to another run.
+        StoppedError: the run was asked to stop (SIGTERM); its state is saved.
     """
     parameters = {f"{group.name}/{name}": value for group in groups for name, value in group.parameters.items()}
     if not parameters:
@@ -241,28 +231,29 @@ def train[BatchT: NamedBatch](
         fused=True,
     )
     average = ExponentialAverage(parameters, config.ema_decay)
-    rank, world_size = processes()
-    # Another number of processes takes other batches: that is another run.
-    digests = identity_digests({**identity, "processes": world_size})
-    state_path = output / STATE_FILE
-    first, sums, count, last = 0, {}, 0, {}
-    if state_path.is_file():
-        facts = load_training_state(state_path, parameters, average, optimizer, digests)
-        first, sums, count, last = facts["step"], facts["sums"], facts["count"], facts["last"]
+    states = TrainingStates(output, config.saving, parameters, average, optimizer)
+    plan = batch_plan(config, output)
+    run = _Run(config, objective, load, optimizer, parameters, models, plan, states, title, output)
+    digests = identity_digests(identity)
+    first, sums, count, last, best = 0, dict[str, float](), 0, dict[str, float](), math.inf
+    if (facts := states.load(digests)) is not None:
+        first, sums, count, last = facts["step"], numbers_of(facts["sums"]), facts["count"], numbers_of(facts["last"])
+        best = math.inf if facts["best"] is None else facts["best"]
         objective.load_state(facts["objective"])
+    rank, world_size = processes()
     log = MetricsLog(output / "metrics.jsonl", first) if rank == 0 else None
     timings = MetricsLog(output / "run" / "timings.jsonl", first) if rank == 0 else None
     started = saved_at = time.monotonic()
     seen = 0
-    with Progress(title, config.steps, "step", done=first, shown=rank == 0) as progress:
+    progress = Progress(title, config.steps, "step", done=first, shown=rank == 0)
+    with progress, stop_requests() as stop_requested, reporting_lost_processes(title), states:
         for step in range(first, config.steps):
             factor = schedule(step) if schedule else learning_rate_factor(settings, step, config.steps)
             for slot, group in zip(optimizer.param_groups, groups, strict=True):
                 slot["lr"] = settings.learning_rate * group.multiplier * factor
-            values, norm, size = _step(config, objective, load, optimizer, parameters, step, title)
+            values, size = _step(run, step)
             average.update(step)
             seen += size * world_size
-            values["gradient_norm"] = norm
             sums = {key: sums.get(key, 0.0) + value for key, value in values.items()}
             count += 1
             done = step + 1
@@ -275,67 +266,87 @@ def train[BatchT: NamedBatch](
                     log.add(row)
                     timings.add({"step": done, "seconds": seconds, "clips_per_second": seen / seconds})
             due = config.validate_every and done % config.validate_every == 0
+            score = math.inf
             if validate is not None and (due or done == config.steps):
                 with average.swapped(), torch.no_grad():
-                    scores = {f"validation/{key}": value for key, value in validate().items()}
-                last = {**last, **scores}
+                    scores = average_values({f"validation/{key}": value for key, value in validate().items()})
                 if log is not None:
                     log.add({"step": done, **scores})
+                require_finite(scores, states, f"{title}, step {done}")
+                last = {**last, **scores}
+                score = scores.get(f"validation/{config.saving.best}", math.inf)
             progress.advance(clips=size * world_size, loss=last.get("loss", values["loss"]))
+            better, best = score < best, min(best, score)
+            # Clocks and signals differ from process to process: what one decides, all do.
+            failure = states.collect()
+            pause = max(config.save_every_seconds, states.seconds / config.saving.share)
+            late = rank == 0 and not states.busy and time.monotonic() - saved_at >= pause
+            asked = average_values({"save": late, "stop": stop_requested(), "failed": failure is not None})
+            if asked["failed"]:
+                raise states.failed(failure)
             by_steps = config.save_every_steps and done % config.save_every_steps == 0
-            if rank == 0 and (
-                by_steps or time.monotonic() - saved_at >= config.save_every_seconds or done == config.steps
-            ):
-                facts = {"step": done, "identity": digests, "sums": sums, "count": count, "last": last}
-                facts["objective"] = objective.state()
-                save_training_state(state_path, parameters, average, optimizer, facts)
+            if by_steps or better or asked["save"] or asked["stop"] or done == config.steps:
                 saved_at = time.monotonic()
+                states.save(
+                    {
+                        "step": done,
+                        "identity": digests,
+                        "micro_batches": plan.per_step,
+                        "drawn_together": plan.together,
+                        "count": count,
+                        "objective": objective.state(),
+                        **json_numbers({"score": score, "best": best}),
+                        "sums": json_numbers(sums),
+                        "last": json_numbers(last),
+                    }
+                )
+            if asked["stop"] and done < config.steps:
+                raise StoppedError(
+                    "The training was asked to stop.",
+                    where=f"{title}, after step {done} of {config.steps}",
+                    next_step=f"the same command continues from the state in {states.folder}",
+                )
     names = [name for group in groups for name in group.parameters]
     return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
 
 
-def _step[BatchT: NamedBatch](
-    config: TrainerConfig,
-    objective: Objective[BatchT],
-    load: Callable[[int], BatchT],
-    optimizer: torch.optim.Optimizer,
-    parameters: Mapping[str, nn.Parameter],
-    step: int,
-    title: str,
-) -> tuple[dict[str, float], float, int]:
-    """One optimiser step: mean metrics of its micro-steps, the gradient norm before clipping, examples of this rank."""
-    rank, world_size = processes()
-    optimizer.zero_grad(set_to_none=True)
+def _step[BatchT: NamedBatch](run: _Run[BatchT], step: int) -> tuple[dict[str, float], int]:
+    """One optimiser step: mean metrics of its micro-steps over all processes, examples of this process."""
+    config, plan = run.config, run.plan
+    run.optimizer.zero_grad(set_to_none=True)
     totals: dict[str, float] = {}
-    size = 0
-    for part in range(config.accumulation):
-        index = step * config.accumulation + part
-        batch = load(index)
+    size, saved = 0, ""
+    for part in range(plan.accumulation):
+        index = step * plan.accumulation + part
+        batch = run.load(index)
         size += len(batch.names)
-        generator = step_generator(config.seed, index * world_size + rank, config.device)
+        generator = step_generator(config.seed, plan.number(index), config.device)
+        reduce_gradients(run.models, now=config.sharding.reduce_every_micro_step or part + 1 == plan.accumulation)
         with autocast(config):
-            loss, values = objective.loss(batch, generator, step)
-        if not math.isfinite(loss.item()):
-            raise TrainingError(
-                "The loss is not finite.",
-                where=f"{title}, step {step}, clips {', '.join(batch.names)}",
-                expected="a finite loss",
-                got=loss.item(),
-                next_step="lower the learning rate, or look at these clips; the last saved state is from before",
-            )
-        (loss / config.accumulation).backward()
+            loss, values = run.objective.loss(batch, generator, step)
+        if not saved and not math.isfinite(loss.item()):
+            kept = keep_batch(run.output, batch, step=step, micro_batch=plan.number(index), seed=config.seed)
+            saved = f"clips {', '.join(batch.names)} (the batch is kept in {kept})"
+        (loss / plan.accumulation).backward()
         for key, value in {"loss": loss.item(), **values}.items():
-            totals[key] = totals.get(key, 0.0) + value / config.accumulation
-    if world_size > 1:
-        average_gradients(parameters.values())
-        totals = average_values(totals)
-    norm = float(nn.utils.clip_grad_norm_(parameters.values(), config.optimizer.clip_norm))
-    if not math.isfinite(norm):
+            totals[key] = totals.get(key, 0.0) + value / plan.accumulation
+    totals = average_values(totals)
+    if not math.isfinite(totals["loss"]):
+        raise TrainingError(
+            "The loss is not finite.",
+            where=f"{run.title}, step {step}, {saved or 'clips of another process, which names them'}",
+            expected="a finite loss",
+            got=totals["loss"],
+            next_step=f"lower the learning rate, or look at these clips; {run.states.last_good()}",
+        )
+    norm = nn.utils.clip_grad_norm_(run.parameters.values(), config.optimizer.clip_norm)
+    totals["gradient_norm"] = float(whole(norm))
+    if not math.isfinite(totals["gradient_norm"]):
         raise TrainingError(
             "The gradient is not finite.",
-            where=f"{title}, step {step}",
-            got=norm,
-            next_step="lower the learning rate or the clipping norm",
+            where=f"{run.title}, step {step}",
+            got=totals["gradient_norm"],
+            next_step=f"lower the learning rate or the clipping norm; {run.states.last_good()}",
         )
-    optimizer.step()
-    return totals, norm, size
+    run.optimizer.step()
+    return totals, size

@@ -1,25 +1,69 @@
-"""What a killed training run needs to continue bit by bit: weights, their average, optimizer moments, random state, log.
+"""What a killed training run needs to continue: weights, their average, optimiser moments, random state, log.
 
-One safetensors file, replaced atomically, holds all but the log of metrics.
+States are written by `torch.distributed.checkpoint` while training goes on, each process its own parts, as safetensors
+and JSON: its usual storage keeps an index that is a pickle, which runs code when it is read, so the storage that knows
+safetensors alone is used. ``run/training_state/step-<N>/`` holds a state; its ``state.json`` is written last.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import logging
+import math
+import shutil
+import time
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self, cast
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from pydantic import Field
+from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from worldline_core.errors import ArtifactError
+from worldline_core.config import StrictModel, what_is_made
+from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.store.atomic import atomic_path, write_bytes_atomic
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.processes import processes, wait_for_all
+from worldline_core.training.sharding import own_part
+
+logger = logging.getLogger(__name__)
+
+STATES = Path("run") / "training_state"
+INDEX = "state.json"
+_FILE_BYTES = 2**31
+"""Tensors are put together into files of about this size: a file is held in memory a second time while it is written."""
+
+
+class SavingConfig(StrictModel):
+    """When states are saved besides ``save_every_steps``, and which stay.
+
+    Attributes:
+        share: of the run's time that saving may take at most: after a save of 30 s the next begins 10 minutes later at
+            0.05 (and never sooner than ``save_every_seconds``).
+        keep: so many of the latest states stay.
+        best: also keep the state at which this held-out loss was lowest ("loss", "rollout_error").
+    """
+
+    share: float = Field(default=0.05, gt=0, le=1)
+    keep: int = Field(default=1, ge=1)
+    best: str | None = None
+
+
+def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Numbers as JSON knows them: null for those that are not finite."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def numbers_of(values: Mapping[str, float | None]) -> dict[str, float]:
+    """The numbers that `json_numbers` has written: what is null was not finite."""
+    return {name: math.nan if value is None else value for name, value in values.items()}
 
 
 class MetricsLog:
@@ -30,136 +74,256 @@ class MetricsLog:
         kept = [row for row in read_json_lines(path) if row["step"] <= resume_step]
         write_bytes_atomic(path, "".join(f"{json.dumps(row)}\n" for row in kept).encode())
 
-    def add(self, row: Mapping[str, Any]) -> None:
+    def add(self, row: Mapping[str, float]) -> None:
         """Append one row."""
         with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row, allow_nan=False) + "\n")
-
-
-class ExponentialAverage:
-    """Exponential moving average of named parameters; shipped checkpoints hold it.
-
-    The decay rises with the number of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
-    forgotten also in short runs.
-    """
-
-    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
-        self.parameters = dict(parameters)
-        self.decay = decay
-        self.average = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
-
-    @torch.no_grad()
-    def update(self, updates: int) -> None:
-        """Take in the current weights; ``updates`` counts earlier updates."""
-        decay = min(self.decay, (1 + updates) / (10 + updates))
-        for name, parameter in self.parameters.items():
-            self.average[name].lerp_(parameter, 1 - decay)
-
-    @contextmanager
-    def swapped(self) -> Iterator[None]:
-        """Within the context the model holds the average."""
-        self._exchange()
-        try:
-            yield
-        finally:
-            self._exchange()
-
-    @torch.no_grad()
-    def _exchange(self) -> None:
-        for name, parameter in self.parameters.items():
-            current = parameter.detach().clone()
-            parameter.copy_(self.average[name])
-            self.average[name] = current
-
-    def load(self, average: Mapping[str, Tensor]) -> None:
-        """Continue from stored averages."""
-        for name, value in self.average.items():
-            value.copy_(average[name])
-
-
-STATE_FILE = Path("run") / "training_state" / "state.safetensors"
-
-
-def save_training_state(
-    path: Path,
-    parameters: Mapping[str, nn.Parameter],
-    average: ExponentialAverage,
-    optimizer: torch.optim.Optimizer,
-    facts: Mapping[str, Any],
-) -> None:
-    """Write weights, averages, optimizer moments and the random state; ``facts`` (JSON) go into the file's header."""
-    tensors: dict[str, Tensor] = {"random_state": torch.get_rng_state()}
-    for name, parameter in parameters.items():
-        tensors[f"weight/{name}"] = parameter.detach()
-        tensors[f"average/{name}"] = average.average[name]
-        for key, value in optimizer.state.get(parameter, {}).items():
-            tensors[f"{key}/{name}"] = value
-    with atomic_path(path) as temporary:
-        save_file(
-            {name: tensor.cpu().contiguous() for name, tensor in tensors.items()},
-            temporary,
-            metadata={"facts": json.dumps(facts)},
-        )
+            stream.write(json.dumps(json_numbers(row), allow_nan=False) + "\n")
 
 
 def identity_digests(identity: Mapping[str, Any]) -> dict[str, str]:
-    """Short digests of the JSON values that name a run, by name."""
+    """Short digests of the JSON values that name a run, by name. How it is shared out and saved is no part of it."""
     return {
-        name: hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        name: hashlib.sha256(json.dumps(what_is_made(value), sort_keys=True, default=str).encode()).hexdigest()[:16]
         for name, value in identity.items()
     }
 
 
-@torch.no_grad()
-def load_training_state(
-    path: Path,
-    parameters: Mapping[str, nn.Parameter],
-    average: ExponentialAverage,
-    optimizer: torch.optim.Optimizer,
-    identity: Mapping[str, str],
-) -> dict[str, Any]:
-    """Fill everything from a state file and return its facts.
-
-    Args:
-        identity: digest of each thing that makes a run what it is (see `identity_digests`); the file's are compared.
+def newest_state(output: Path) -> dict[str, Any] | None:
+    """Facts of the newest whole state below ``output``, with its ``folder``; None where there is none.
 
     Raises:
-        ArtifactError: if it is damaged, or belongs to a run with another configuration, model or other clips.
+        ArtifactError: its description is damaged, or it was written by an earlier version.
     """
-    try:
-        with safe_open(path, framework="pt") as stored:
-            facts = json.loads((stored.metadata() or {})["facts"])
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+    old = output / STATES / "state.safetensors"
+    if old.is_file():
         raise ArtifactError(
-            "The training state is damaged.",
-            where=path,
-            got=repr(error),
-            next_step="delete it to start this run again",
-        ) from error
-    found = facts.get("identity", {})
-    different = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
-    if different:
-        raise ArtifactError(
-            "The training state belongs to another run.",
-            where=path,
-            expected={name: identity.get(name) for name in different},
-            got={name: found.get(name) for name in different},
-            next_step=f"give it the {', '.join(different)} that it began with, use another output folder, or delete "
-            "this training state",
+            "The training state is of an earlier version.",
+            where=old,
+            expected=f"folders step-<N> with {INDEX}",
+            next_step="delete it to start this run again, or finish the run with the version that began it",
         )
-    with safe_open(path, framework="pt") as stored:
-        names = set(stored.keys())
-        missing = [name for name in parameters if f"weight/{name}" not in names]
-        if missing:
-            raise ArtifactError("The training state lacks weights.", where=path, got=missing[:5])
-        for name, parameter in parameters.items():
-            parameter.copy_(stored.get_tensor(f"weight/{name}"))
-            for key in ("step", "exp_avg", "exp_avg_sq"):
-                if f"{key}/{name}" in names:
-                    value = stored.get_tensor(f"{key}/{name}")
-                    # Moments have the memory layout of their parameter.
-                    target = torch.empty((), device=parameter.device) if key == "step" else torch.empty_like(parameter)
-                    optimizer.state[parameter][key] = target.copy_(value)
-        average.load({name: stored.get_tensor(f"average/{name}") for name in parameters})
-        torch.set_rng_state(stored.get_tensor("random_state"))
-    return facts
+    whole = sorted((output / STATES).glob(f"step-*/{INDEX}"))
+    if not whole:
+        return None
+    try:
+        facts = json.loads(whole[-1].read_text(encoding="utf-8"))
+        return {**facts, "folder": whole[-1].parent, "sizes": dict(facts["sizes"]), "step": int(facts["step"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(whole[-1], repr(error)) from error
+
+
+def _damaged(where: Path, got: object) -> ArtifactError:
+    return ArtifactError(
+        "The training state is damaged.",
+        where=where,
+        got=got,
+        next_step="delete its folder: the run goes on from an earlier state, or starts again where there is none",
+    )
+
+
+class TrainingStates:
+    """The states of one run: written while training goes on, read when it continues.
+
+    Args:
+        output: folder of the run.
+    """
+
+    def __init__(
+        self,
+        output: Path,
+        config: SavingConfig,
+        parameters: Mapping[str, nn.Parameter],
+        average: ExponentialAverage,
+        optimizer: torch.optim.Optimizer,
+    ) -> None:
+        self.output = output
+        self.folder = output / STATES
+        self.config = config
+        self.parameters = parameters
+        self.average = average
+        self.optimizer = optimizer
+        self.seconds = 0.0
+        """How long the last save took."""
+        self._writing: Future[float] | None = None
+        self._rank, world_size = processes()
+        self._alone = world_size == 1
+        # Said at every save and load by a process that is alone on purpose.
+        warnings.filterwarnings("ignore", "torch.distributed is disabled, unavailable or uninitialized")
+        # States are written beside training, so their messages need a channel of their own.
+        group = None if self._alone else torch.distributed.new_group(backend="gloo")
+        self._group = cast("torch.distributed.ProcessGroup | None", group)
+
+    def load(self, identity: Mapping[str, str]) -> dict[str, Any] | None:
+        """Fill everything from the newest state and return its facts; None where there is no state.
+
+        Args:
+            identity: digest of each thing that makes a run what it is (see `identity_digests`); the state's are compared.
+
+        Raises:
+            ArtifactError: it is damaged, or belongs to a run with another configuration, model or other clips.
+        """
+        facts = newest_state(self.output)
+        wait_for_all()
+        if self._rank == 0:
+            for folder in self.folder.glob("step-*"):
+                if not (folder / INDEX).is_file():
+                    shutil.rmtree(folder)
+        if facts is None:
+            return None
+        folder, found = facts["folder"], facts.get("identity", {})
+        different = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
+        if different:
+            raise ArtifactError(
+                "The training state belongs to another run.",
+                where=folder,
+                expected={name: identity.get(name) for name in different},
+                got={name: found.get(name) for name in different},
+                next_step=f"give it the {', '.join(different)} that it began with, use another output folder, or "
+                "delete this training state",
+            )
+        sizes = {path.name: path.stat().st_size for path in folder.glob("*.safetensors")}
+        for name, size in facts["sizes"].items():
+            if sizes.get(name) != size:
+                raise _damaged(folder / name, f"{sizes[name]} bytes, not {size}" if name in sizes else "no such file")
+        self._read(folder)
+        return facts
+
+    @torch.no_grad()
+    def _read(self, folder: Path) -> None:
+        from torch.distributed.checkpoint.api import CheckpointException
+        from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader
+        from torch.distributed.checkpoint.state_dict_loader import load
+
+        try:
+            reader = HuggingFaceStorageReader(str(folder))
+            stored = reader.read_metadata().state_dict_metadata
+            for name, parameter in self.parameters.items():
+                for key in ("exp_avg", "exp_avg_sq"):
+                    if f"{key}/{name}" in stored:  # moments have the memory layout of their parameter
+                        self.optimizer.state[parameter][key] = torch.zeros_like(parameter)
+                if f"step/{name}" in stored:
+                    self.optimizer.state[parameter]["step"] = torch.zeros((), device=parameter.device)
+            tensors = self._tensors()
+            load(tensors, storage_reader=reader, process_group=self._group, no_dist=self._alone)
+        except (CheckpointException, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+            raise _damaged(folder, repr(error)) from error
+        torch.set_rng_state(tensors["random_state"])
+
+    def save(self, facts: Mapping[str, Any]) -> None:
+        """Begin to write a state; training may go on at once. ``facts`` are JSON values with the ``step``.
+
+        Raises:
+            TrainingError: the state before it could not be written.
+        """
+        from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
+        from torch.distributed.checkpoint.state_dict_saver import async_save
+
+        if (failure := self.collect(wait=True)) is not None:
+            raise self.failed(failure)
+        begun = time.monotonic()
+        folder = self.folder / f"step-{facts['step']:09d}"
+        tensors = self._tensors()
+        writer = HuggingFaceStorageWriter(
+            str(folder), fqn_to_index_mapping=_files(tensors), save_distributed=True, thread_count=1
+        )
+        done = async_save(tensors, storage_writer=writer, process_group=self._group, no_dist=self._alone)
+        self._writing = writing = Future[float]()
+
+        def describe(done: Future[Any]) -> None:
+            """In the thread that has written this process's part: the first process's ends when all parts are there."""
+            try:
+                done.result()
+                if self._rank == 0:
+                    sizes = {path.name: path.stat().st_size for path in folder.glob("*.safetensors")}
+                    write_json_atomic(folder / INDEX, {**facts, "sizes": sizes})
+                    self._prune()
+                writing.set_result(time.monotonic() - begun)
+            except BaseException as error:  # noqa: BLE001 - handed to whoever collects it
+                if self._rank == 0:
+                    shutil.rmtree(folder, ignore_errors=True)
+                writing.set_exception(error)
+
+        cast("Future[Any]", done).add_done_callback(describe)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Wait for what is being written.
+
+        Raises:
+            TrainingError: it could not be written, and nothing else has ended the run.
+        """
+        failure = self.collect(wait=True)
+        if failure is not None and error is None:
+            raise self.failed(failure)
+        if failure is not None:
+            logger.warning("%s", self.failed(failure))
+
+    def failed(self, error: BaseException | None) -> TrainingError:
+        """What to say of a state that could not be written."""
+        from torch.distributed.checkpoint.api import CheckpointException
+
+        if isinstance(error, CheckpointException):
+            error = next(iter(error.failures.values()))[0]
+        return TrainingError(
+            "The training state could not be written.",
+            where=self.folder,
+            expected="room for a state beside the one before it",
+            got=repr(error) if error else "another process could not write its part",
+            next_step=f"free some space, then give the same command again; {self.last_good()}",
+        )
+
+    def last_good(self) -> str:
+        """Where a run that cannot go on has its last good state, in words; what is being written is waited for."""
+        self.collect(wait=True)
+        state = newest_state(self.output)
+        return f"the last good state is {state['folder']}" if state else "no state had been saved before"
+
+    @property
+    def busy(self) -> bool:
+        """Whether a state is being written."""
+        return self._writing is not None and not self._writing.done()
+
+    def collect(self, *, wait: bool = False) -> BaseException | None:
+        """What kept a state that has been written (``wait``: until it is) from being whole, or None."""
+        if self._writing is None or not (wait or self._writing.done()):
+            return None
+        writing, self._writing = self._writing, None
+        error = writing.exception()
+        if error is None:
+            self.seconds = writing.result()
+        return error
+
+    def _prune(self) -> None:
+        whole = [path.parent for path in sorted(self.folder.glob(f"step-*/{INDEX}"))]
+        kept = set(whole[-self.config.keep :])
+        if self.config.best is not None:
+            scores = {folder: json.loads((folder / INDEX).read_text(encoding="utf-8"))["score"] for folder in whole}
+            measured = [folder for folder in whole if scores[folder] is not None]
+            kept |= {min(measured, key=lambda folder: scores[folder])} if measured else set()
+        for folder in set(whole) - kept:
+            (folder / INDEX).unlink()  # first: without it, what a kill leaves of the folder counts as no state
+            shutil.rmtree(folder)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        tensors: dict[str, Tensor] = {"random_state": torch.get_rng_state()}
+        for name, parameter in self.parameters.items():
+            tensors[f"weight/{name}"] = parameter.detach()
+            tensors[f"average/{name}"] = self.average.average[name]
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"{key}/{name}"] = value
+        return tensors
+
+
+def _files(tensors: Mapping[str, Tensor]) -> dict[str, int]:
+    """Number of the file, from 1, that each tensor goes to."""
+    numbers: dict[str, int] = {}
+    total = 0
+    for name, tensor in tensors.items():
+        part = own_part(tensor)
+        total += part.numel() * part.element_size()
+        numbers[name] = 1 + total // _FILE_BYTES
+    return numbers
