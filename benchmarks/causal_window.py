@@ -152,27 +152,38 @@ def trained(output: Path, history: History, minutes: float, batch: int) -> None:
     )
 
 
+Rolled = dict[str, list[list[float]]]
+
+
 @torch.no_grad()
-def rolled(output: Path, history: History, batch: int) -> dict[str, list[list[float]] | list[int]]:
-    """Squared error of every block of every episode, that of copying, and the bytes of the cache after every block."""
+def rolled(output: Path, history: History, batch: int) -> Rolled:
+    """Squared error of every block of every episode, that of copying, and the bytes of the cache after every block.
+
+    A batch that was rolled out before is read from ``output``.
+    """
     data = load_file(output / "test.safetensors")
     model, _ = load_checkpoint(output / history, expect_kind="causal")
     spec = config_of(history, steps=1, batch=1).spec
-    size, errors, copies, memory = spec.block_size, [], [], []
+    found: Rolled = {"error": [], "copy": [], "cache_bytes": []}
     for first in range(0, len(data["latents"]), batch):
-        latents, maps = (data[name][first : first + batch].float() for name in ("latents", "maps"))
-        noise = Noise(range(42 + first, 42 + first + len(latents)))
-        simulator = BlockCausalSimulator(model.eval(), spec, noise=noise, bfloat16=True)
-        simulator.start(latents[:, :, :, 0], maps[:, :, :, :1])
-        found, copied, memory = [], [], []
-        for start in range(1, latents.shape[3] - size + 1, size):
-            truth = latents[:, :, :, start : start + size]
-            found.append(((simulator.step(maps[:, :, :, start : start + size]) - truth) ** 2).mean(dim=(1, 2, 3, 4, 5)))
-            copied.append(((latents[:, :, :, :1] - truth) ** 2).mean(dim=(1, 2, 3, 4, 5)))
-            memory.append(simulator.cache.nbytes)
-        errors += torch.stack(found, dim=1).tolist()
-        copies += torch.stack(copied, dim=1).tolist()
-    return {"error": errors, "copy": copies, "cache_bytes": memory}
+        path = output / history / f"rolled-{first:03d}-{batch}.json"
+        if not path.is_file():
+            latents, maps = (data[name][first : first + batch].float() for name in ("latents", "maps"))
+            noise = Noise(range(42 + first, 42 + first + len(latents)))
+            simulator = BlockCausalSimulator(model.eval(), spec, noise=noise, bfloat16=True)
+            simulator.start(latents[:, :, :, 0], maps[:, :, :, :1])
+            columns: dict[str, list[Tensor]] = {name: [] for name in found}
+            for start in range(1, latents.shape[3] - spec.block_size + 1, spec.block_size):
+                truth = latents[:, :, :, start : start + spec.block_size]
+                block = simulator.step(maps[:, :, :, start : start + spec.block_size])
+                columns["error"].append(((block - truth) ** 2).mean(dim=(1, 2, 3, 4, 5)))
+                columns["copy"].append(((latents[:, :, :, :1] - truth) ** 2).mean(dim=(1, 2, 3, 4, 5)))
+                columns["cache_bytes"].append(torch.full((len(truth),), simulator.cache.nbytes / len(truth)))
+            part = {name: torch.stack(values, dim=1).tolist() for name, values in columns.items()}
+            write_json_atomic(path, part)
+        for name, values in json.loads(path.read_text(encoding="utf-8")).items():
+            found[name] += values
+    return found
 
 
 def curve(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
@@ -192,13 +203,10 @@ def measure(output: Path, batch: int, figure: Path | None) -> None:
     """Roll out both models, print their curves, and draw them."""
     series: list[Series] = []
     figures: dict[str, object] = {}
-    found: dict[str, list[list[float]] | list[int]] = {}
+    found: Rolled = {}
     drawn: tuple[tuple[History, str, str], ...] = (("window", "c0", "window"), ("full_history", "c3", "full history"))
     for history, colour, label in drawn:
-        path = output / f"{history}.json"
-        if not path.is_file():
-            write_json_atomic(path, rolled(output, history, batch))
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = rolled(output, history, batch)
         value, low, high = curve(np.array(found["error"]), np.array(found["copy"]))
         blocks = [GROUP * group + (GROUP + 1) / 2 for group in range(len(value))]
         series.append(Series(label, blocks, value.tolist(), low.tolist(), high.tolist(), colour))
@@ -206,7 +214,7 @@ def measure(output: Path, batch: int, figure: Path | None) -> None:
             "error_over_copying": value.round(3).tolist(),
             "low": low.round(3).tolist(),
             "high": high.round(3).tolist(),
-            "cache_bytes": sorted(set(found["cache_bytes"])),
+            "cache_bytes": sorted({size for sizes in found["cache_bytes"] for size in sizes}),
             **json.loads((output / history / "steps.json").read_text(encoding="utf-8")),
         }
     figures["episodes"] = len(found["error"])
@@ -231,8 +239,8 @@ def main() -> None:
     measuring = verbs.add_parser("measure")
     measuring.add_argument("output", type=Path)
     measuring.add_argument("--figure", type=Path)
-    for verb in (training, measuring):
-        verb.add_argument("--batch", type=int, default=6)
+    for verb, size in ((training, 6), (measuring, 3)):
+        verb.add_argument("--batch", type=int, default=size)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     if options.verb == "prepare":
