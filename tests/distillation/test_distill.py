@@ -23,7 +23,7 @@ from worldline_core.distillation.trajectory_store import TrajectoryStore, write_
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import TEMPORAL
+from worldline_core.model.contracts import TEMPORAL, TrainedClips
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
@@ -140,6 +140,21 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     times = long_rollout(partial(world.simulator, [42]), first, maps, blocks=4)
     assert len(times["block_seconds"]) == 4
     assert set(passes) == {(2, 1, 1.0), (2, 1, 0.6)}
+
+
+def test_the_head_alone_is_distilled_and_said(inputs: dict[str, Path], tmp_path: Path) -> None:
+    model, info = load_checkpoint(inputs["stage2"])
+    head = TrainedClips(views=("head",), strides=(1,))
+    save_checkpoint(tmp_path / "head", model, kind="stage2", action_contract=info.contract, trained=head)
+    given = inputs | {"stage2": tmp_path / "head"}
+    with pytest.raises(
+        CheckpointError, match=r"(?s)distilled in views that its Stage II model was trained on.*right_wrist"
+    ):
+        distill(config(), given, tmp_path / "refused")
+    alone = config().model_copy(update={"views": ["head"]})
+    distill(alone, given, tmp_path / "out")
+    assert read_checkpoint_info(tmp_path / "out").trained == head
+    assert read_checkpoint_info(tmp_path / "out").views == ("head",)
 
 
 def test_a_finished_run_is_read_not_repeated(

@@ -117,7 +117,10 @@ def recording_content(
     predicted: dict[str, dict[str, np.ndarray]] = {}
     for method, rollout in rollouts.items():
         seed = rollout.seeds(episode_id)[0]
-        predicted[method] = {view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views}
+        there = rollout.views(episode_id)
+        predicted[method] = {
+            view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views if view in there
+        }
     true_frames = {view: np.asarray(episode_set.frames(index, view)) for view in views}
     return RecordingContent(episode, true_frames, predicted, tracks, episode.state_names or (), sigma_px_ref)
 

@@ -147,8 +147,8 @@ def predicted_frames(context: ReportContext, name: str, episode_id: str, view: s
 
 def video(context: ReportContext, item: ChosenEpisode, view: str, group: str, number: int) -> dict[str, Any] | None:
     """Truth and one group's predictions of one view, with a caption; None when the group has none."""
-    episodes = context.episodes
-    methods = methods_of_group(context, item.episode_id, group)
+    episodes, name = context.episodes, item.episode_id
+    methods = [m for m in methods_of_group(context, name, group) if view in context.rollouts[m.name].views(name)]
     if episodes is None or not methods:
         return None
     index = episodes.position(item.episode_id)
@@ -195,7 +195,8 @@ def overview_video(context: ReportContext) -> dict[str, Any] | None:
     index = episodes.position(item.episode_id)
     row = episodes.rows[index]
     rows: list[np.ndarray] = []
-    for view in [v for v in VIEWS if v in row.views]:
+    predicted_views = context.rollouts[method.name].views(item.episode_id)
+    for view in [v for v in VIEWS if v in row.views and v in predicted_views]:
         true = np.asarray(episodes.frames(index, view))
         predicted = predicted_frames(context, method.name, item.episode_id, view)
         columns = {"recorded": true, f"predicted, {method.label}": predicted}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -114,7 +113,8 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
                     for view in item.views:
                         writer.register(item.episode_id, item.seed, view, item.frames, world.image_size)
             else:
-                seconds = _predict(config, world, episodes, tracks, batch, writer)
+                pieces = _predicted(config, world, episodes, tracks, batch)
+                seconds = _write(batch, pieces, writer, world.image_size, config.device)
                 frames = sum(item.frames for item in batch)
                 speed.add(BatchTime(len(batch), frames, seconds, tuple(world.block_seconds), first))
                 first = False
@@ -186,46 +186,44 @@ def _observed(
     return torch.stack(firsts)
 
 
-def _predict(
+def _predicted(
     config: RolloutConfig,
     world: WorldLine | FirstFrameCopy,
     episodes: EpisodeSet,
     tracks: ActionTracks,
     batch: Sequence[Prediction],
+) -> Iterator[Frames]:
+    """Frames of a batch, piece by piece."""
+    yield from world.stream(
+        _observed(world, episodes, batch),
+        [tracks.tracks(item.controls_of) for item in batch],
+        max(item.frames for item in batch),
+        [item.seed for item in batch],
+        views=batch[0].views,
+        stride=config.stride,
+        without_actions=config.actions == "zero",
+    )
+
+
+def _write(
+    batch: Sequence[Prediction],
+    pieces: Iterator[Frames],
     writer: RolloutSetWriter,
+    size: tuple[int, int],
+    device: str,
 ) -> float:
-    """Predict a batch into its files; wall seconds of predicting (writing is left out)."""
-    pieces: Iterator[Frames] | None = None
-
-    def next_piece() -> Frames | None:
-        nonlocal pieces
-        if pieces is None:
-            pieces = world.stream(
-                _observed(world, episodes, batch),
-                [tracks.tracks(item.controls_of) for item in batch],
-                max(item.frames for item in batch),
-                [item.seed for item in batch],
-                views=batch[0].views,
-                stride=config.stride,
-                without_actions=config.actions == "zero",
-            )
-        return next(pieces, None)
-
+    """Write a batch as it is predicted; wall seconds of predicting (writing is left out)."""
+    seconds, done = 0.0, 0
     with ExitStack() as stack:
-        videos = [
-            stack.enter_context(writer.video(item.episode_id, item.seed, item.views, world.image_size))
-            for item in batch
-        ]
-        seconds, done = 0.0, 0
-        for _ in itertools.count():
-            piece, elapsed = timed(next_piece, config.device)
+        videos = [stack.enter_context(writer.video(item.episode_id, item.seed, item.views, size)) for item in batch]
+        while True:
+            piece, elapsed = timed(partial(next, pieces, None), device)
             seconds += elapsed.wall
             if piece is None:
                 return seconds
             for add, item, clip in zip(videos, batch, piece, strict=True):
                 add({view: frames[: max(0, item.frames - done)] for view, frames in clip.items()})
             done += len(next(iter(piece[0].values())))
-    return seconds
 
 
 def _timed_blocks(
