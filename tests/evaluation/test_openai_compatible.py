@@ -10,7 +10,8 @@ import pytest
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import Image, OpenAICompatibleModel, Text, VLMConfig, open_vlm
+from worldline_core.evaluation.vlm import Image, NoAnswerError, Text
+from worldline_core.evaluation.vlm_models import OpenAICompatibleModel, VLMConfig, open_vlm
 
 
 class Server:
@@ -84,12 +85,26 @@ def test_does_not_retry_a_refusal_or_a_malformed_reply(server):
     with pytest.raises(UnavailableError, match="HTTP 401"):
         _model(server).answer([Text("?")])
     server.replies = [(200, {"choices": []})]
-    with pytest.raises(UnavailableError, match="another form"):
+    with pytest.raises(NoAnswerError, match="another form"):
         _model(server).answer([Text("?")])
     server.replies = [(200, b"<html>")]
-    with pytest.raises(UnavailableError, match="JSON"):
+    with pytest.raises(NoAnswerError, match="JSON"):
         _model(server).answer([Text("?")])
     assert len(server.requests) == 3
+
+
+def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(server):
+    judge = VLMJudge(_model(server, attempts=1))
+    good = _reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')
+    server.replies = [(400, {"error": "content"}), (500, {}), good]
+    found = [judge.extract(_trajectory(), "grasp", (0, 19), 360) for _ in range(3)]
+    assert [answer.well_formed for answer in found] == [False, False, True]
+    assert found[0].evidence.target_held_for_two_late_steps is None
+    server.replies = [(500, {})] * 3
+    judge.reconcile(_trajectory(), "", "", "")
+    judge.inspect_motion(_trajectory(), (0, 19), "")
+    with pytest.raises(UnavailableError, match="no answer to the 2 messages before"):
+        judge.reconcile(_trajectory(), "", "", "")
 
 
 def test_nobody_there():

@@ -8,12 +8,15 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from urllib.parse import quote
 
 import pytest
 
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.policy.evidence import GraspEvidence
-from worldline_core.evaluation.vlm import OpenAICompatibleModel, Text, VLMConfig, parse_answer
+from worldline_core.evaluation.vlm import Text, parse_answer
+from worldline_core.evaluation.vlm import ask as ask_model
+from worldline_core.evaluation.vlm_models import OpenAICompatibleModel, VLMConfig
 
 KEY = "key-of-the-judge"
 OK = b"HTTP/1.1 200 OK\r\n"
@@ -59,7 +62,7 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable[[socke
 
 def ask(endpoint: Endpoint, attempts: int = 1) -> tuple[str, float]:
     """What the user is told, and after how many seconds."""
-    config = VLMConfig(url=endpoint.url, timeout_s=1, attempts=attempts, api_key_variable="JUDGE")
+    config = VLMConfig(url=endpoint.url, timeout_s=0.5, attempts=attempts, api_key_variable="JUDGE")
     began = time.monotonic()
     with pytest.raises(UnavailableError) as caught:
         OpenAICompatibleModel(config, backoff_s=0.01).answer([Text("?")])
@@ -88,7 +91,7 @@ def hang(connection: socket.socket) -> None:
 )
 def test_an_answer_that_does_not_end_is_given_up_in_time(serve: Callable, behave: Callable) -> None:
     told, seconds = ask(serve(behave))
-    assert "cannot be used" in told
+    assert "no whole answer within 0.5 s" in told
     assert seconds < 4
 
 
@@ -103,12 +106,37 @@ def test_a_flood_is_cut(serve: Callable) -> None:
     [
         b"", b"\r\n\r\n", b"\xff\xfe nonsense\r\n\r\n", OK + b"Content-Length: 100\r\n\r\n{}",
         OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n",
+        OK + b"Transfer-Encoding: chunked\r\n\r\n-1\r\n" + b"x" * 3_000_000,
+        b"HTTP/1.1 302 Found\r\nLocation: http://[half\r\n\r\n", OK + b"Content-Encoding: gzip\r\n\r\nno gzip",
+        OK + b"Content-Length: -1\r\n\r\n{}", OK + b"\r\n\xff\xfe\x00\xd8", OK + b"\r\n" + b"[1," * 50_000,
         OK + b"\r\n" + b"[" * 100_000, OK + b"\r\n\xff\xfe", OK + b"\r\n" + b"9" * 5000, OK + b"\r\n[]", OK + b"\r\nnull",
     ],
 )  # fmt: skip
 def test_answers_that_are_none_are_named(serve: Callable, answer: bytes) -> None:
-    told, _ = ask(serve(lambda connection: connection.sendall(answer)))
+    told, seconds = ask(serve(lambda connection: connection.sendall(answer)))
     assert "The judge's server" in told
+    assert seconds < 4
+
+
+def promise(connection: socket.socket) -> None:
+    """Answers to come, for as long as somebody listens."""
+    while True:
+        connection.sendall(b"HTTP/1.1 100 Continue\r\n\r\n" * 1000)
+
+
+def test_the_connection_ends_with_the_patience(serve: Callable) -> None:
+    """Given up and not closed, it would go on in a thread of its own."""
+    ended = threading.Event()
+
+    def behave(connection: socket.socket) -> None:
+        try:
+            promise(connection)
+        finally:
+            ended.set()
+
+    _, seconds = ask(serve(behave))
+    assert seconds < 4
+    assert ended.wait(2)
 
 
 @pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
@@ -126,8 +154,49 @@ def test_a_key_that_a_server_repeats_is_not_shown(serve: Callable) -> None:
     assert KEY not in told
 
 
+@pytest.mark.parametrize("form", [KEY, "key\\/of\\/the judge's".replace(" ", "")])
+@pytest.mark.parametrize("written", [str, repr, json.dumps, quote, lambda key: " " * 485 + key])
+def test_a_key_is_hidden_in_whatever_form_it_is_repeated(
+    serve: Callable, monkeypatch: pytest.MonkeyPatch, form: str, written: Callable[[str], str]
+) -> None:
+    monkeypatch.setenv("JUDGE", form)
+    told, _ = ask(serve(lambda c: c.sendall(b"HTTP/1.1 401 No\r\n\r\nwrong: " + written(form).encode() + b" here")))
+    assert "HTTP 401" in told
+    assert written(form).strip()[:8] not in told
+
+
+@pytest.mark.parametrize("around", ["{}\r", " {}\r\n", "{}\n", "\t{}"])
+def test_white_space_around_a_key_is_not_sent(serve: Callable, monkeypatch: pytest.MonkeyPatch, around: str) -> None:
+    monkeypatch.setenv("JUDGE", around.format(KEY))
+    endpoint = serve(lambda c: c.sendall(OK + b"\r\n[]"))
+    ask(endpoint)
+    assert f"bearer {KEY}\r\n".encode() in endpoint.requests[0].lower()
+
+
+@pytest.mark.parametrize("key", ["two\rlines-of-a-key", "key\x7f-of-the-judge", "schl\u00fcssel", "two words"])
+def test_a_key_that_no_request_carries_is_refused_unseen(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    monkeypatch.setenv("JUDGE", key)
+    with pytest.raises(ConfigError, match="the environment variable JUDGE") as caught:
+        OpenAICompatibleModel(VLMConfig(url="http://127.0.0.1:9", api_key_variable="JUDGE"))
+    assert key[:3] not in str(caught.value).replace("The judge's key cannot be sent", "")
+
+
+def test_every_hostile_reply_is_null_and_counted(serve: Callable) -> None:
+    endpoint = serve(lambda c: c.sendall(OK + b"\r\n" + b"[1," * 50_000))
+    config = VLMConfig(url=endpoint.url, timeout_s=0.5, attempts=1, api_key_variable="JUDGE")
+    assert ask_model(OpenAICompatibleModel(config), [Text("?")], GraspEvidence) == (GraspEvidence(), False)
+
+
 def test_a_hostile_answer_is_no_evidence() -> None:
-    for text in ('{"a": ' * 3000, "{" * 100_000, '{"a": ' + "9" * 5000 + "}"):
+    for text in (
+        "[1," * 50_000,
+        '{"a":[1,' * 50_000,
+        '{"a":' * 900 + "x",
+        '{"a": "' * 5000,
+        '{"a": ' * 3000,
+        "{" * 100_000,
+        '{"a": ' + "9" * 5000 + "}",
+    ):
         began = time.monotonic()
         assert parse_answer(GraspEvidence, text) == (GraspEvidence(), False)
         assert time.monotonic() - began < 5

@@ -36,7 +36,7 @@ from worldline_core.evaluation.planning.selectors import (
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import SUMMARY_FILE, Score, bootstrap_mean, kept_part, write_scores, write_table
 from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
-from worldline_core.evaluation.vlm import VLMConfig, open_vlm
+from worldline_core.evaluation.vlm_models import VLMConfig, open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic

@@ -26,7 +26,7 @@ from worldline_core.evaluation.vlm import (
     Text,
     Video,
     VisionLanguageModel,
-    parse_answer,
+    ask,
 )
 
 _WHOLE, _LATE = 10, 6
@@ -155,14 +155,14 @@ class VLMSelector:
         for letter, candidate in candidates.items():
             parts += [Text(f"Candidate {letter}:"), _video(candidate)]
         parts.append(Text(PROMPTS["compare"].format(select_count=select_count)))
-        answer, well_formed = parse_answer(_ComparisonAnswer, self.model.answer(parts))
+        answer, well_formed = ask(self.model, parts, _ComparisonAnswer)
         return Comparison(tuple(label.strip().upper() for label in answer.selected_labels), well_formed)
 
     def score(self, instruction: str, candidate: CandidateVideo) -> CandidateScore:
         """P2. A malformed answer, or a score outside of 0..100, scores 0."""
         question = Text(f"Task instruction: {instruction}\nCandidate video:")
-        text = self.model.answer([question, _video(candidate), Text(PROMPTS["score"].format())])
-        answer, well_formed = parse_answer(_ScoreAnswer, text)
+        parts = [question, _video(candidate), Text(PROMPTS["score"].format())]
+        answer, well_formed = ask(self.model, parts, _ScoreAnswer)
         if not 0 <= answer.score <= 100:
             return CandidateScore(0.0, well_formed=False)
         return CandidateScore(float(answer.score), well_formed)

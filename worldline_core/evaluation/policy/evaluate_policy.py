@@ -44,7 +44,7 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
-from worldline_core.evaluation.vlm import VLMConfig, open_vlm
+from worldline_core.evaluation.vlm_models import VLMConfig, open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.store.atomic import write_json_atomic
 

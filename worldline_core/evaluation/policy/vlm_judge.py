@@ -8,7 +8,7 @@ import numpy as np
 from worldline_core.evaluation.policy.evidence import SCHEMAS, Evidence, EvidenceFamily, MotionEvidence, Reconciliation
 from worldline_core.evaluation.policy.judge import Extracted
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import PROMPTS, Image, Part, Text, Video, VisionLanguageModel, parse_answer
+from worldline_core.evaluation.vlm import PROMPTS, Image, Part, Text, Video, VisionLanguageModel, ask
 
 _LABELS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}  # the prompts' words
 
@@ -36,7 +36,7 @@ class VLMJudge:
                 for label, picture in pictures.items():
                     parts += [Text(f"{instant}, {label}"), Image(picture)]
         schema = PROMPTS["evidence_schema"].format(schema=PROMPTS[family], instruction=trajectory.instruction)
-        return Extracted(*parse_answer(SCHEMAS[family], self.model.answer([*parts, Text(schema)])))
+        return Extracted(*ask(self.model, [*parts, Text(schema)], SCHEMAS[family]))
 
     def reconcile(
         self, trajectory: Trajectory, selected: str, first: str, verification: str
@@ -45,7 +45,7 @@ class VLMJudge:
         prompt = PROMPTS["reconciliation"].format(
             instruction=trajectory.instruction, selected=selected, first=first, verification=verification
         )
-        return Extracted(*parse_answer(Reconciliation, self.model.answer([Text(prompt)])))
+        return Extracted(*ask(self.model, [Text(prompt)], Reconciliation))
 
     def inspect_motion(
         self, trajectory: Trajectory, indices: tuple[int, ...], earlier: str
@@ -56,7 +56,7 @@ class VLMJudge:
             video = Video(frames[list(indices)], indices, trajectory.fps, len(frames))
             parts += [Text(f"View {_LABELS[view]}"), video]
         prompt = PROMPTS["motion"].format(instruction=trajectory.instruction, earlier=earlier)
-        return Extracted(*parse_answer(MotionEvidence, self.model.answer([*parts, Text(prompt)])))
+        return Extracted(*ask(self.model, [*parts, Text(prompt)], MotionEvidence))
 
 
 def _resized(frame: np.ndarray, height_px: int) -> np.ndarray:
