@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import resource
 import struct
+import time
 import zlib
 from pathlib import Path
 
@@ -103,3 +105,69 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_image(tmp_path / "pipe.png")
     cv2.imwrite(str(tmp_path / "sound.png"), PICTURE[..., ::-1])
     assert np.array_equal(read_image(tmp_path / "sound.png"), PICTURE)
+
+
+def test_a_jpeg_of_thousands_of_scans_is_refused_undecoded() -> None:
+    """20,000 bytes that take the decoder minutes: every scan goes over all of the picture."""
+    stream = io.BytesIO()
+    Image.new("L", (6000, 6000)).save(stream, "JPEG", progressive=True)
+    sound = stream.getvalue()
+    last = sound.rindex(b"\xff\xda")
+    bomb = sound[:last] + sound[last:-2] * 5000 + sound[-2:]
+    began = time.monotonic()
+    with pytest.raises(RejectedInputError, match="too many scans") as caught:
+        decode_image(bomb, "x")
+    assert time.monotonic() - began < 2
+    assert caught.value.reason == "too_large"
+    assert decode_image(sound, "x").shape == (6000, 6000, 3)
+
+
+def png_with(*chunks: tuple[bytes, bytes], data: bytes | None = None) -> bytes:
+    """A PNG of 50 x 30 with further chunks behind its header."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    rows = b"".join(b"\0" + row.tobytes() for row in PICTURE)
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 50, 30, 8, 2, 0, 0, 0))
+    parts = [chunk(*each) for each in chunks]
+    body = chunk(b"IDAT", zlib.compress(rows) if data is None else data)
+    return b"\x89PNG\r\n\x1a\n" + header + b"".join(parts) + body + chunk(b"IEND", b"")
+
+
+ZEROS = zlib.compress(b"\0" * (200 << 20))
+ODD_PNGS = {
+    "a text of 200 MB": png_with((b"zTXt", b"a\0\0" + ZEROS)),
+    "a profile of 200 MB": png_with((b"iCCP", b"a\0\0" + ZEROS)),
+    "another header": png_with((b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0))),
+    "a billion pictures": png_with((b"acTL", struct.pack(">II", 10**9, 0))),
+    "data of 200 MB": png_with(data=ZEROS),
+    "ten thousand chunks": png_with(*[(b"tEXt", b"a\0b")] * 10_000),
+    "a palette of nothing": png_with((b"PLTE", b"")),
+}
+
+
+@pytest.mark.parametrize("content", ODD_PNGS.values(), ids=ODD_PNGS)
+def test_what_else_a_png_may_carry_costs_nothing(content: bytes) -> None:
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    try:
+        found = np.array_equal(decode_image(content, "x"), PICTURE)
+    except RejectedInputError as error:
+        found = error.reason
+    assert found in (True, "unreadable")
+    assert time.monotonic() - began < 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KB
+
+
+def test_a_jpeg_with_a_second_larger_frame_is_no_image() -> None:
+    sound = jpeg()
+    frame = sound.index(b"\xff\xc0")
+    length = struct.unpack(">H", sound[frame + 2 : frame + 4])[0]
+    second = bytearray(sound[frame : frame + 2 + length])
+    second[5:9] = struct.pack(">HH", 60_000, 60_000)
+    for content in (
+        sound[:frame] + bytes(second) + sound[frame:],
+        sound[: frame + 2 + length] + bytes(second) + sound[frame:],
+    ):
+        with pytest.raises(RejectedInputError, match="Image"):
+            decode_image(content, "x")

@@ -96,3 +96,73 @@ def test_lengths_of_records_that_no_number_can_hold(tmp_path: Path) -> None:
             except RejectedInputError:
                 failed += 1
     assert failed > len(places)
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def chunk(packed: bytes, unpacked: int, compression: bytes = b"zstd") -> bytes:
+    head = struct.pack("<QQQI", 0, 0, unpacked, 0) + struct.pack("<I", len(compression)) + compression
+    return record(0x06, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def indexed_file(path: Path, data: bytes, chunks: list[tuple[int, int]]) -> Path:
+    """A file whose summary says that chunks (offset, length) are there; its one channel makes readers trust it."""
+    summary = record(0x04, struct.pack("<HH", 0, 0) + struct.pack("<I", 2) + b"/a" + struct.pack("<I", 0) * 2)
+    for offset, length in chunks:
+        index = struct.pack("<QQQQ", 0, 1, offset, length) + struct.pack("<IQ", 0, 0)
+        summary += record(0x08, index + struct.pack("<I", 4) + b"zstd" + struct.pack("<QQ", length - 49, 1 << 20))
+    header = record(0x01, struct.pack("<II", 0, 0))
+    start = len(MAGIC) + len(header) + len(data) + 13
+    footer = record(0x02, struct.pack("<QQI", start, 0, 0))
+    path.write_bytes(MAGIC + header + data + record(0x0F, bytes(4)) + summary + footer + MAGIC)
+    return path
+
+
+def test_an_index_that_leads_into_an_attachment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The size of a chunk in there was never looked at."""
+    monkeypatch.setattr(mcap_file, "MAX_CHUNK_BYTES", 1 << 20)
+    bomb = chunk(zstandard.compress(b"\0" * (8 << 20)), 8 << 20)
+    attachment = record(0x09, struct.pack("<QQII", 0, 0, 0, 0) + struct.pack("<Q", len(bomb)) + bomb + bytes(4))
+    inside = len(MAGIC) + 9 + 8 + 9 + 24 + 8
+    path = indexed_file(tmp_path / "a.mcap", attachment, [(inside, len(bomb))])
+    assert path.read_bytes()[inside] == 0x06
+    with pytest.raises(RejectedInputError, match=r"damaged or was not finished[\s\S]*something else than the chunks"):
+        McapFile(path)
+
+
+def test_one_chunk_that_is_listed_a_thousand_times(tmp_path: Path) -> None:
+    small = chunk(zstandard.compress(b"\0" * 1000), 1000)
+    place = (len(MAGIC) + 17, len(small))
+    assert McapFile(indexed_file(tmp_path / "a.mcap", small, [place])).topics == {"/a": ""}
+    with pytest.raises(RejectedInputError, match="or to one twice"):
+        McapFile(indexed_file(tmp_path / "b.mcap", small, [place] * 1000))
+
+
+def test_a_chunk_behind_the_end_of_the_data(tmp_path: Path) -> None:
+    path = indexed_file(tmp_path / "a.mcap", b"", [])
+    content = path.read_bytes()
+    end = content.index(record(0x0F, bytes(4))) + 13
+    path.write_bytes(content[:end] + chunk(zstandard.compress(b"\0" * 1000), 1000) + content[end:])
+    with pytest.raises(RejectedInputError, match="behind the end of the data"):
+        McapFile(path)
+
+
+def test_every_flipped_byte_of_our_own_file_is_noticed(tmp_path: Path) -> None:
+    """Text in the metadata lies in no chunk: the chunks' own sums say nothing of it."""
+    mcap.write(tmp_path, 1, 0, np.random.default_rng(0))
+    path = next(tmp_path.glob("*.mcap"))
+    sound = path.read_bytes()
+    read_exported_episode(McapFile(path))
+    places = np.random.default_rng(1).integers(8, len(sound) - 8, 120).tolist()
+    places += [sound.index(word) + 1 for word in (b"instruction", b"outcome", b"scene")]
+    unnoticed = []
+    for place in places:
+        path.write_bytes(sound[:place] + bytes([sound[place] ^ 0x01]) + sound[place + 1 :])
+        try:
+            read_exported_episode(McapFile(path))
+            unnoticed.append(place)
+        except RejectedInputError:
+            continue
+    assert not unnoticed

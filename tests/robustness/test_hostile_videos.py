@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import struct
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -124,3 +127,57 @@ def test_boxes_without_end_are_counted(tmp_path: Path) -> None:
     path.write_bytes(struct.pack(">I4s8s", 16, b"ftyp", b"isom\0\0\0\0") + struct.pack(">I4s", 8, b"free") * 100_001)
     with pytest.raises(RejectedInputError, match="too many boxes"):
         check_video_header(path)
+
+
+def tracks(content: bytes, count: int) -> bytes:
+    """A file whose one track is listed so often."""
+    start = content.index(b"trak") - 4
+    length = struct.unpack(">I", content[start : start + 4])[0]
+    moov = content.index(b"moov") - 4
+    size = struct.unpack(">I", content[moov : moov + 4])[0]
+    grown = struct.pack(">I", size + length * (count - 1))
+    return (
+        content[:moov]
+        + grown
+        + content[moov + 4 : start]
+        + content[start : start + length] * count
+        + content[start + length :]
+    )
+
+
+def changed(content: bytes, box: bytes, offset: int, value: bytes) -> bytes:
+    start = content.index(box) + 4 + offset
+    return content[:start] + value + content[start + len(value) :]
+
+
+ODD_VIDEOS = {
+    "3,000 tracks": lambda c: tracks(c, 3000),
+    "no time scale": lambda c: changed(c, b"mdhd", 12, bytes(4)),
+    "a time scale of 2^32": lambda c: changed(c, b"mdhd", 12, b"\xff" * 4),
+    "frames without duration": lambda c: changed(c, b"stts", 12, bytes(4)),
+    "frames that last for ever": lambda c: changed(c, b"stts", 12, b"\xff" * 4),
+    "4 billion times": lambda c: changed(c, b"stts", 4, b"\xff" * 4),
+    "an edit that begins nowhere": lambda c: changed(c, b"elst", 12, b"\x7f" + b"\xff" * 3),
+    "4 billion edits": lambda c: changed(c, b"elst", 4, b"\xff" * 4),
+    "frames of 4 GB": lambda c: changed(c, b"stsz", 4, b"\xff" * 4),
+    "chunks beyond the end": lambda c: changed(c, b"stco", 8, b"\xff" * 4),
+    "4 billion chunks": lambda c: changed(c, b"stco", 4, b"\xff" * 4),
+    "a description of nothing": lambda c: changed(c, b"avcC", 5, bytes(8)),
+    "31 parameter sets": lambda c: changed(c, b"avcC", 5, b"\xff"),
+}
+
+
+@pytest.mark.parametrize("change", ODD_VIDEOS.values(), ids=ODD_VIDEOS)
+def test_tables_of_a_video_that_say_other_things_end(video: Path, change: Callable[[bytes], bytes]) -> None:
+    """In the frames that were recorded, or in a named rejection; never in a wait, nor in memory of the machine."""
+    expected = [picture.rgb().copy() for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
+    video.write_bytes(change(video.read_bytes()))
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    try:
+        pictures = [picture.rgb() for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
+        found = all(np.array_equal(one, other) for one, other in zip(pictures, expected, strict=True))
+    except RejectedInputError as error:
+        found = error.reason
+    assert found in (True, "unreadable", "truncated_video", "too_large", "wrong_fps")
+    assert time.monotonic() - began < 5
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # KB

@@ -237,7 +237,8 @@ class Hdf5File:
                 )
             # A chunk is unpacked as a whole, whatever little of it is wanted.
             chunk = int(np.prod(node.chunks or (), dtype=np.float64)) * node.dtype.itemsize if node.chunks else 0
-            largest = max(int(node.nbytes) if whole else 0, chunk)
+            # Whole datasets become float64, whatever they are stored as.
+            largest = max(int(node.size) * max(node.dtype.itemsize, 8) if whole else 0, chunk)
             where = f"{self._path}, {key}"
             if largest > MAX_ARRAY_BYTES:
                 raise too_large("Dataset is too large", where=where, limit=MAX_ARRAY_BYTES, got=largest, unit="bytes")

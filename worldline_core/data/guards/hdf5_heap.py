@@ -8,6 +8,8 @@ object must lead on to the next. (HDF5 file format specification, "Global Heap" 
 from __future__ import annotations
 
 import struct
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +18,7 @@ import numpy as np
 from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, RejectedInputError, too_large
 
 _LARGEST_OFFSET = 2**62
+_GZIP, _SHUFFLE = 1, 2
 _ENTRY = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")])
 
 
@@ -23,7 +26,8 @@ def check_entries(dataset: Any, start: int, stop: int, path: Path, where: str) -
     """Entries start..stop (exclusive) of a dataset of variable length: none longer than the file, nor all of them together
     than an array may be, and sound heaps.
 
-    Raises: RejectedInputError (too_large); (unreadable) for a damaged heap, and for compressed entries, which cannot be seen.
+    Raises: RejectedInputError (too_large); (unreadable) for a damaged heap, and for entries behind filters other than gzip
+        and shuffle, which cannot be seen.
     """
     entries = _entries(dataset, start, stop, path, where)
     lengths = entries["length"].astype(np.int64)
@@ -51,16 +55,38 @@ def _entries(dataset: Any, start: int, stop: int, path: Path, where: str) -> np.
             return np.zeros(0, dtype=_ENTRY)
         _check_stored(dataset.id.get_storage_size(), dataset.size, where)
         return _read(path, offset + start * _ENTRY.itemsize, stop - start, where)
-    if dataset.id.get_create_plist().get_nfilters():
-        raise _unseen(where, "compressed entries")
-    rows = dataset.chunks[0]
+    settings, rows = dataset.id.get_create_plist(), dataset.chunks[0]
+    filters = [settings.get_filter(number)[0] for number in range(settings.get_nfilters())]
+    if not set(filters) <= {_GZIP, _SHUFFLE}:
+        raise _unseen(where, f"filters {filters}")
     found = []
     for chunk in range(start // rows, -(-stop // rows)):
         info = dataset.id.get_chunk_info_by_coord((chunk * rows,))
         if info.byte_offset is not None:
-            _check_stored(info.size, rows, where)
-            found.append(_read(path, info.byte_offset, rows, where))
+            with path.open("rb") as stream:
+                stream.seek(info.byte_offset)
+                content = stream.read(info.size)
+            content = _unfiltered(content, filters, info.filter_mask, rows * _ENTRY.itemsize, where)
+            _check_stored(len(content), rows, where)
+            found.append(np.frombuffer(content, _ENTRY))
     return np.concatenate(found) if found else np.zeros(0, dtype=_ENTRY)
+
+
+def _unfiltered(content: bytes, filters: Sequence[int], skipped: int, size: int, where: str) -> bytes:
+    """A chunk before its filters, which were applied in their order; bit n of `skipped`: not filter n."""
+    for number, applied in reversed(list(enumerate(filters))):
+        if skipped >> number & 1:
+            continue
+        if applied == _SHUFFLE:
+            whole = len(content) // _ENTRY.itemsize * _ENTRY.itemsize
+            shuffled = np.frombuffer(content[:whole], np.uint8).reshape(_ENTRY.itemsize, -1)
+            content = shuffled.T.tobytes() + content[whole:]
+        else:
+            try:
+                content = zlib.decompressobj().decompress(content, size + 1)
+            except zlib.error as error:
+                raise RejectedInputError("unreadable", "Entries are damaged", where=where, got=str(error)) from error
+    return content
 
 
 def _check_stored(stored: int, entries: int, where: str) -> None:
@@ -106,6 +132,6 @@ def _unseen(where: str, got: str) -> RejectedInputError:
         "unreadable",
         "Lengths of the entries cannot be checked",
         where=where,
-        expected="entries of variable length without compression",
+        expected="entries of variable length, plain or behind gzip and shuffle",
         got=got,
     )

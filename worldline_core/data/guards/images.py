@@ -7,13 +7,21 @@ import struct
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, unreadable
+from worldline_core.data.guards.rejection import (
+    MAX_PIXELS,
+    RejectedInputError,
+    check_image_size,
+    too_large,
+    unreadable,
+)
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_END = b"\xff\xd9"
+_SCAN = b"\xff\xda"
+_MAX_SCANS = 100
 _LAST_BYTES = 256
 # Start-of-frame markers; C4, C8 and CC in their midst are tables and reserved.
 _START_OF_FRAME = {0xC0 + n for n in range(16)} - {0xC4, 0xC8, 0xCC}
@@ -79,6 +87,9 @@ def decode_image(content: bytes, where: object, *, channels: str = "rgb") -> np.
             expected="the end mark of its format",
             got=f"{len(content)} bytes that end with {content[-8:].hex()}",
         )
+    # Every scan of a progressive JPEG goes over the whole picture, however little it says; usual files have ten.
+    if not content.startswith(_PNG) and (scans := content.count(_SCAN)) > _MAX_SCANS:
+        raise too_large("Image has too many scans", where=where, limit=_MAX_SCANS, got=scans, unit="scans")
     with unreadable("Image cannot be decoded", where, (cv2.error,)):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     if image is None or image.shape[:2] not in ((height, width), (width, height)):  # EXIF may turn a JPEG

@@ -43,7 +43,7 @@ def message_file(stream: BinaryIO, encoding: Encoding) -> MessageFile:
 
 class _FoxgloveFile:
     def __init__(self, stream: BinaryIO, encoding: Literal["json", "protobuf"]) -> None:
-        self._writer = Writer(stream, compression=CompressionType.ZSTD)
+        self._writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="", library="worldline")
         self._encoding = encoding
         self._schemas: dict[str, int] = {}

@@ -42,6 +42,7 @@ def read_exported_episode(file: McapFile) -> LoadedEpisode:
 
     Raises: RejectedInputError: unreadable, length_mismatch or missing_calibration where messages are missing.
     """
+    file.check_sums()
     about = _metadata(file)
     with well_formed(file.path, "an episode as this project writes it"):
         return _assembled(file, about)

@@ -7,6 +7,7 @@ bytes per byte. So the size of every chunk is checked first. Records (https://mc
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -33,6 +34,7 @@ _DAMAGE = (
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK = 0x06
 _DATA_END = 0x0F
+_FOOTER_BYTES = 9 + 20
 _LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
 _SMALLEST_BYTES = 2 * 8 + 29
@@ -64,9 +66,30 @@ class McapFile:
     @cached_property
     def _summary(self) -> Summary | None:
         """None where the file is complete but has no summary; then it is read from the beginning."""
-        check_chunks(regular_file(self.path, "MCAP file"), self.path)
+        chunks = check_chunks(regular_file(self.path, "MCAP file"), self.path)
         with self._opened(indexed=True) as reader:
-            return reader.get_summary()
+            summary = reader.get_summary()
+            indexed = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]
+            if len(set(indexed)) < len(indexed) or not set(indexed) <= set(chunks):
+                raise ValueError("an index that leads to something else than the chunks, or to one twice")
+            return summary
+
+    def check_sums(self) -> None:
+        """Compare the whole file with the sums of its data and summary that it states (0: it states none).
+
+        Raises: RejectedInputError (unreadable) where a byte differs.
+        """
+        path = regular_file(self.path, "MCAP file")
+        size, end = path.stat().st_size, _data_end(path)
+        with _undamaged(self.path), path.open("rb") as stream:
+            data = _sum(stream, 0, end)
+            stated = struct.unpack("<BQI", stream.read(13))[2]
+            if stated not in (0, data):
+                raise ValueError("data that do not give their sum")
+            stream.seek(size - len(_MAGIC) - _FOOTER_BYTES)
+            start, _, stated = struct.unpack("<9xQQI", stream.read(_FOOTER_BYTES))
+            if stated not in (0, _sum(stream, start or size - len(_MAGIC) - _FOOTER_BYTES, size - len(_MAGIC) - 4)):
+                raise ValueError("a summary that does not give its sum")
 
     @property
     def _indexed(self) -> bool:
@@ -233,30 +256,54 @@ def read_streams(
     return streams
 
 
-def check_chunks(path: Path, where: object) -> None:
-    """Every chunk up to the end of the data section.
+def check_chunks(path: Path, where: object) -> list[int]:
+    """Where the chunks of the data section begin; none of them unpacks to too much.
 
-    Raises: RejectedInputError: too_large, or unreadable for what is no MCAP file or breaks off.
+    Raises: RejectedInputError: too_large, or unreadable for what is no MCAP file or breaks off, or has chunks elsewhere.
     """
-    size = path.stat().st_size
+    size, chunks, ended = path.stat().st_size, list[int](), False
     with _undamaged(where), path.open("rb") as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
             raise ValueError("another beginning than that of an MCAP file")
         position = len(_MAGIC)
-        while position < size:
+        while position < size - len(_MAGIC):
             stream.seek(position)
             opcode, length = struct.unpack("<BQ", stream.read(9))
-            position += 9 + length
-            if opcode == _DATA_END:
-                return
-            if position > size:
-                raise EOFError(f"a record of {length} bytes where {size - position + length} are left")
+            if position + 9 + length > size:
+                raise EOFError(f"a record of {length} bytes where {size - position - 9} are left")
             if opcode == _CHUNK:
+                if ended:
+                    raise ValueError("a chunk behind the end of the data")
                 unpacked = _unpacked_bytes(stream, length)
                 if unpacked > MAX_CHUNK_BYTES:
                     raise too_large(
                         "MCAP chunk is too large", where=where, limit=MAX_CHUNK_BYTES, got=unpacked, unit="bytes"
                     )
+                chunks.append(position)
+            ended = ended or opcode == _DATA_END
+            position += 9 + length
+    return chunks
+
+
+def _data_end(path: Path) -> int:
+    """Where the record stands that ends the data of a file whose records `check_chunks` has gone through."""
+    with path.open("rb") as stream:
+        position = len(_MAGIC)
+        while True:
+            stream.seek(position)
+            opcode, length = struct.unpack("<BQ", stream.read(9))
+            if opcode == _DATA_END:
+                return position
+            position += 9 + length
+
+
+def _sum(stream: BinaryIO, start: int, stop: int) -> int:
+    """CRC-32 of the bytes start..stop (exclusive), behind which the stream then stands."""
+    stream.seek(start)
+    found, left = 0, stop - start
+    while left > 0 and (block := stream.read(min(left, 1 << 20))):
+        found, left = zlib.crc32(block, found), left - len(block)
+    return found
 
 
 def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
