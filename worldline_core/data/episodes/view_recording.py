@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
-import av
 import cv2
 import numpy as np
 from av.container import InputContainer
@@ -35,7 +35,7 @@ from worldline_core.data.video.clip import (
     read_clip,
     wrong_count,
 )
-from worldline_core.data.video.encoder import BITEXACT, Encoding, VideoEncoder, frame_rate, length_prefixed
+from worldline_core.data.video.encoder import Encoding, VideoEncoder, frame_rate, length_prefixed, new_mp4
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, write_thumbnails
 from worldline_core.geometry.cameras import Fit, ImageTransform
 
@@ -157,22 +157,19 @@ def _encoded(
     encoder: VideoEncoder | None = None
     transform = None
     count = 0
-    try:
+    with ExitStack() as writing:
         for luma, full_range, rgb in _pictures(recorded):
             if count % recorded.step == 0 and count < recorded.num_frames:
                 small.add(luma, full_range=full_range)
                 image = rgb()
                 if encoder is None or transform is None:
                     transform = ImageTransform.of(image.shape[:2]).fitted(recorded.image_size, recorded.fit)
-                    encoder = VideoEncoder(path, transform.image_size, fps, video)
+                    encoder = writing.enter_context(VideoEncoder(path, transform.image_size, fps, video))
                 image = transform.frames(image[None])[0]
                 if sampler.wants(encoder.count):
                     sampler.add(image)
                 encoder.add(image)
             count += 1
-    finally:
-        if encoder is not None:
-            encoder.close()
     check_length("Video", path.stem, states=recorded.num_frames, unit="frames", found=count)
     if transform is None:
         raise RejectedInputError("truncated_video", "View has no pictures", where=path.stem)
@@ -250,7 +247,7 @@ def _write_copy(
         packets = islice(every, selection.first, selection.first + clip.num_frames)
     size = stream.height, stream.width  # as the container says it: a damaged packet may change the stream's
     found = 0
-    with av.open(str(target), "w", format="mp4", options=BITEXACT) as out:
+    with new_mp4(target) as out:
         written = out.add_stream_from_template(stream, opaque=True)
         written.time_base = 1 / rate
         for number, packet in enumerate(chain(packets, (None,))):  # None: what the decoder still holds

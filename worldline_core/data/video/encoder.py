@@ -9,6 +9,7 @@ frame, and presentation order equals file order: clips can be joined without enc
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 from av import Packet
 from av.bitstream import BitStreamFilterContext
 from av.codec.context import Flags
+from av.container import OutputContainer
 from av.video.stream import VideoStream
 
 from worldline_core.errors import DataError
@@ -73,6 +75,23 @@ BITEXACT = {"fflags": "+bitexact", "movflags": "+faststart"}
 X264_PARAMETERS = "cpu-independent=1"
 """Without this x264 chooses other algorithms on other processors, and with AVX-512 about one clip in a hundred came out
 differently from run to run."""
+
+
+@contextmanager
+def new_mp4(path: Path) -> Iterator[OutputContainer]:
+    """An mp4 to write packets into, which is ended with the context.
+
+    Of one that could not be written (a full disk) nothing more is asked: FFmpeg crashes where a packet follows a header that
+    did not fit.
+    """
+    out = av.open(str(path), "w", format="mp4", options=BITEXACT)
+    try:
+        yield out
+    except BaseException:
+        with suppress(OSError):
+            out.close()
+        raise
+    out.close()
 
 
 def frame_rate(fps: float) -> Fraction:
@@ -166,12 +185,21 @@ class VideoEncoder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if isinstance(error, OSError):  # see `new_mp4`
+            with suppress(OSError):
+                self._out.close()
+        else:
+            self.close()
 
     def close(self) -> None:
         """Write what the encoder still holds. Of a picture that was refused nothing is in the file."""
-        if self.count:
-            self._out.mux(self._stream.encode(None))
+        try:
+            if self.count:
+                self._out.mux(self._stream.encode(None))
+        except OSError:
+            with suppress(OSError):
+                self._out.close()
+            raise
         self._out.close()
 
     def add(self, image: np.ndarray) -> None:
@@ -232,7 +260,7 @@ def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float
     Raises: DataError when a part holds another number of frames than stated.
     """
     rate = frame_rate(fps)
-    with av.open(str(path), "w", format="mp4", options=BITEXACT) as out:
+    with new_mp4(path) as out:
         stream = None
         first_frame = 0
         for part, expected in parts:
