@@ -172,9 +172,10 @@ def _pipeline(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.pipeline import pipeline
+    from tasks.prefect_artifacts import run_flow
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
-    report = pipeline(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
+    report = run_flow(pipeline, preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
     print(f"report: {report.path / 'index.html'}")
 
 
@@ -188,11 +189,10 @@ def _nightly(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments)
     prepare_prefect(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
+    from tasks.prefect_artifacts import run_flow
 
-    history = nightly_evaluation(
-        preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
-    )
-    print(f"nightly: {history / 'index.html'}")
+    values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
+    print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
 
 
 def _task(arguments: argparse.Namespace) -> None:

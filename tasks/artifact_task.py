@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
+import json
 import multiprocessing
-import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,16 @@ from prefect.client.schemas.objects import RunInput, State, TaskRunResult
 from prefect.context import TaskRunContext
 from prefect.futures import PrefectConcurrentFuture
 from prefect.runtime import task_run
+from prefect.serializers import JSONSerializer
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
 from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.command_line import log_to_stderr
 from tasks.shard_mapper import shard_mapper
-from tasks.supervisor import end_with_parent
+from tasks.supervisor import end_with_pool
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
+from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.steps import Step, get_step, run_step
 from worldline_core.progress import running_node
 from worldline_core.scale.mapping import RunnerConfig
@@ -41,7 +44,9 @@ class ArtifactTask:
     """Calls one step through Prefect.
 
     Prefect's cache key is the store's own key (step, version, config, digests of the inputs), so Prefect shows a
-    task as cached exactly when the store has the artifact. A record whose artifact was deleted is refreshed.
+    task as cached exactly when the store has the artifact. Where an artifact lies and what its digest is the store says
+    alone: a record of Prefect's that says anything else (its artifact was deleted, the store was moved, somebody wrote
+    it) is not read but written anew.
     """
 
     def __init__(self, step: Step) -> None:
@@ -66,8 +71,9 @@ class ArtifactTask:
     ) -> ArtifactReference:
         """Run the step (or find it done). ``name`` is what Prefect shows; the step's name by default. ``runner`` says
         where a step that maps its episodes works on them."""
-        task, parameters, _ = self._prepared(config, inputs, store_root, name, runner)
-        return ArtifactReference.model_validate(task(**parameters))
+        task, parameters, _, find = self._prepared(config, inputs, store_root, name, runner)
+        task(**parameters)
+        return find()
 
     def start(
         self,
@@ -79,22 +85,22 @@ class ArtifactTask:
         runner: RunnerConfig,
         pool: Callable[[], ProcessPoolTaskRunner] | None,
         after: Sequence[State[Any]] = (),
-    ) -> tuple[PrefectConcurrentFuture[Any] | State[Any], bool]:
+    ) -> tuple[PrefectConcurrentFuture[Any] | State[Any], bool, FindArtifact]:
         """Start the step in a pool's process, or, where it is finished or there is no pool, do it here and now.
 
         Args:
             after: how the tasks ended whose artifacts it uses, so that Prefect shows what depends on what.
 
         Returns:
-            The running task, or how it ended; and whether the artifact was there already.
+            The running task, or how it ended; whether the artifact was there already; and what finds it afterwards.
         """
-        task, parameters, finished = self._prepared(config, inputs, store_root, name, runner)
+        task, parameters, finished, find = self._prepared(config, inputs, store_root, name, runner)
         if pool is None or finished:
             ended: State[Any] = task(**parameters, wait_for=list(after), return_state=True)  # pyright: ignore[reportAssignmentType]
-            return ended, finished
+            return ended, finished, find
         ids = [state.state_details.task_run_id for state in after]
         runs: set[RunInput] = {TaskRunResult(id=run) for run in ids if run}  # pyright: ignore[reportUnhashable] - frozen
-        return pool().submit(task, parameters, dependencies={"inputs": runs}), False
+        return pool().submit(task, parameters, dependencies={"inputs": runs}), False, find
 
     def _prepared(
         self,
@@ -103,12 +109,15 @@ class ArtifactTask:
         store_root: Path,
         name: str | None,
         runner: RunnerConfig | None,
-    ) -> tuple[Task[..., dict[str, Any]], dict[str, Any], bool]:
-        """Prefect's task, its parameters, and whether the store has the artifact."""
+    ) -> tuple[Task[..., dict[str, Any]], dict[str, Any], bool, FindArtifact]:
+        """Prefect's task, its parameters, whether the store has the artifact, and what finds it there."""
         store = ArtifactStore(store_root)
         references = {key: _reference(value, store) for key, value in inputs.items()}
-        finished = store.find(self.step.name, _key(store, self.step, config, references)) is not None
-        task = self._task.with_options(refresh_cache=not finished, task_run_name=name or self.step.name)
+        key = _key(store, self.step, config, references)
+        find = partial(_stored, store, self.step, key)
+        finished = store.find(self.step.name, key) is not None
+        recorded = finished and _is_recorded(f"{self.step.name}-{key}", find())
+        task = self._task.with_options(refresh_cache=not recorded, task_run_name=name or self.step.name)
         parameters = {
             "step_name": self.step.name,
             "config": config.model_dump(mode="json"),
@@ -116,7 +125,31 @@ class ArtifactTask:
             "store_root": str(store.root),
             "runner": (runner or RunnerConfig()).model_dump(mode="json"),
         }
-        return task, parameters, finished
+        return task, parameters, finished, find
+
+
+FindArtifact = Callable[[], ArtifactReference]
+"""Finds the artifact of a task that has ended. Raises ArtifactError where there is none."""
+
+
+def _stored(store: ArtifactStore, step: Step, key: str) -> ArtifactReference:
+    artifact = store.find(step.name, key)
+    if artifact is None:
+        raise ArtifactError(
+            "A task ended without its artifact", where=store.root / step.name / key, next_step="run the command again"
+        )
+    return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest)
+
+
+def _is_recorded(key: str, reference: ArtifactReference) -> bool:
+    """Whether Prefect's record of a task is, to the word, what this module lets it write: a record names the code that
+    reads it."""
+    try:
+        record = json.loads((PREFECT_LOCAL_STORAGE_PATH.value() / key).read_bytes())
+        same = json.loads(record["result"]) == reference.model_dump(mode="json")
+        return same and record["metadata"]["serializer"] == JSONSerializer().model_dump(mode="json")
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return False
 
 
 def _run_step(
@@ -128,7 +161,7 @@ def _run_step(
 ) -> dict[str, Any]:
     """The body of every task: plain JSON in and out, so that any task runner can carry it."""
     if multiprocessing.parent_process() is not None:
-        _end_with_parent()
+        end_with_pool()
         log_to_stderr()
     folders = {name: parse_location(value["path"]) for name, value in inputs.items()}
     model = get_step(step_name).load_config().model_validate(config)
@@ -140,12 +173,6 @@ def _run_step(
     finally:
         running_node.reset(before)
     return ArtifactReference(step=artifact.step, path=artifact.path, digest=artifact.digest).model_dump(mode="json")
-
-
-@functools.cache
-def _end_with_parent() -> None:
-    """Let this process of a pool end with the one that started it."""
-    end_with_parent(lambda: os._exit(1))
 
 
 def _cache_key(_context: TaskRunContext, parameters: dict[str, Any]) -> str:

@@ -1,14 +1,50 @@
-"""What Prefect's pages show of a finished run: a link to its report and a table of what was measured."""
+"""What Prefect is told of a finished run: that it is, a link to its report, and a table of what was measured.
+
+None of it is the work itself: a server that ended before fails no run whose work is done.
+"""
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import httpx
+from prefect import Flow
 from prefect.artifacts import create_link_artifact, create_table_artifact
 
 from tasks.artifact_task import ArtifactReference
+from worldline_core.errors import UnavailableError
 from worldline_core.report.nightly import collect_metrics
+
+logger = logging.getLogger(__name__)
+
+
+def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
+    """What a flow returns, although Prefect's server may have ended before it could be told.
+
+    Raises: UnavailableError when the server ended before the flow did; what the flow raises.
+    """
+    done: list[R] = []
+
+    @functools.wraps(flow.fn)
+    def body(*values: Any, **named: Any) -> R:
+        done.append(flow.fn(*values, **named))
+        return done[0]
+
+    observed = flow.with_options()
+    observed.fn = body
+    try:
+        return observed(*arguments)
+    except httpx.TransportError as error:
+        if not done:
+            raise UnavailableError(
+                "Prefect's server ended before the run", got=str(error), next_step="the same command continues"
+            ) from error
+        logger.warning("The run is finished; Prefect's server ended before it could be told: %s", error)
+        return done[0]
 
 
 def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference]) -> None:
@@ -18,11 +54,16 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference]) -> None:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
     """
-    create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     rows = [
         {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}
         for name, value in sorted(collect_metrics(scores).items())
     ]
-    if rows:
-        create_table_artifact(rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric")
+    try:
+        create_link_artifact((page / "index.html").as_uri(), "Open the report", key="report", description=str(page))
+        if rows:
+            create_table_artifact(
+                rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric"
+            )
+    except httpx.TransportError as error:
+        logger.warning("Prefect's pages show nothing of this run: its server does not answer (%s)", error)

@@ -17,7 +17,7 @@ from prefect.futures import PrefectConcurrentFuture
 from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.task_runners import ProcessPoolTaskRunner
 
-from tasks.artifact_task import ArtifactReference, artifact_task
+from tasks.artifact_task import ArtifactReference, FindArtifact, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
 from worldline_core.report.progress import share
@@ -82,6 +82,7 @@ class _Run:
         self.pool = pool
         self.done: dict[str, ArtifactReference] = {}
         self.running: dict[str, PrefectConcurrentFuture[Any]] = {}
+        self._find: dict[str, FindArtifact] = {}
         self._ended: dict[str, State[Any]] = {}
 
     def has_inputs(self, node: Node) -> bool:
@@ -91,7 +92,7 @@ class _Run:
         if self.watcher is not None:
             self.watcher.started(node.name)
         sources = [source for source in node.inputs.values() if isinstance(source, str)]
-        begun, cached = artifact_task(node.step).start(
+        begun, cached, self._find[node.name] = artifact_task(node.step).start(
             node.config,
             {name: self.done[source] if isinstance(source, str) else source for name, source in node.inputs.items()},
             store_root=self.store_root,
@@ -125,7 +126,9 @@ class _Run:
             self._take(name, future.state, cached=False)
 
     def _take(self, name: str, ended: State[Any], cached: bool) -> None:
-        artifact = ArtifactReference.model_validate(ended.result())
+        if not ended.is_completed():
+            ended.result()  # raises what ended it
+        artifact = self._find[name]()
         self.done[name], self._ended[name] = artifact, ended
         if self.watcher is not None:
             self.watcher.finished(name, artifact, cached)

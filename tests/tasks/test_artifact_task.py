@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import pickle
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,3 +86,63 @@ def test_prefect_shows_what_the_store_has(
         assert _run(tmp_path, "a", "b") == (one, two)
         assert (one.path / "text").read_text() == "a"
         assert _shown(expected := {"one": "Completed", "two": "Cached"}) == expected
+
+
+class Trap:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
+    """What somebody may have written in the place of a record."""
+    pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
+    lie = json.dumps({"step": "write_one", "path": str(elsewhere), "digest": "0" * 64})
+    made = json.dumps({"__class__": "trap_door.Anything", "data": {}})
+
+    def change(result: str | None = None, **serializer: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+        return lambda record: {
+            "metadata": record["metadata"] | {"serializer": record["metadata"]["serializer"] | serializer},
+            "result": record["result"] if result is None else result,
+        }
+
+    return {
+        "pickle": lambda r: {"metadata": r["metadata"] | {"serializer": {"type": "pickle"}}, "result": pickled},
+        "a decoder": change(object_decoder="trap_door.anything"), "another place": change(lie), "a class": change(made), "no record": lambda r: {},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["pickle", "a decoder", "another place", "a class", "no record"])
+def test_prefects_records_are_not_believed(
+    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
+        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
+    (tmp_path / "trap_door.py").write_text(f"open({str(tmp_path / 'trap')!r}, 'w')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        one, two = _run(tmp_path, "a", "b")
+        change = _records(tmp_path / "trap", tmp_path / "elsewhere")[kind]
+        for path in (tmp_path / "prefect").iterdir():
+            path.write_text(json.dumps(change(json.loads(path.read_text()))))
+        assert _run(tmp_path, "a", "b") == (one, two)
+    assert not (tmp_path / "trap").exists()
+
+
+def test_a_store_that_was_moved_is_found_where_it_is(
+    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
+        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
+    before, after = tmp_path / "before", tmp_path / "after"
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: before / "prefect"}):
+        _run(before, "a", "b")
+    before.rename(after)
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: after / "prefect"}):
+        one, two = _run(after, "a", "b")
+    assert (one.path.parents[1], two.path.parents[1]) == (after, after)
+    assert not before.exists()
