@@ -14,7 +14,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from worldline_core.distillation.trajectory_store import TrajectoryStore
 from worldline_core.errors import ArtifactError, CheckpointError
+from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
@@ -124,3 +126,110 @@ def test_descriptions_that_are_no_json_are_named(text: str, folder: Path) -> Non
     path.write_bytes(text.encode("latin-1") + b"\n{}\n")
     with pytest.raises(ArtifactError, match="not JSON"):
         read_json_lines(path)
+
+
+@pytest.fixture
+def segmenter(tmp_path: Path) -> Path:
+    save_segmenter(tmp_path / "s", (8, 16), UNet((8, 16)).state_dict(), {"threshold": 0.5})
+    return tmp_path / "s"
+
+
+@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
+def test_a_segmenters_weights_that_lie_are_refused(content: bytes, segmenter: Path) -> None:
+    (segmenter / "model.safetensors").write_bytes(content)
+    with pytest.raises(ArtifactError, match="segmenter cannot be read"):
+        LearnedSegmenter.load(segmenter)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"widths": [8, 10**9]}, {"widths": [8] * 10**5}, {"widths": []}, {"widths": [8, 0]}, {"widths": [7, 16]},
+        {"widths": 8}, {"widths": ["x"]}, {"widths": [8, 16, 24]}, {"threshold": None}, {"threshold": 1e400},
+        {"threshold": float("nan")}, {"threshold": -1},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_segmenters_description_that_fits_no_weights_is_refused(
+    change: dict[str, Any], segmenter: Path, little_memory: None
+) -> None:
+    path = segmenter / "segmenter.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(ArtifactError, match="segmenter cannot be read"):
+        LearnedSegmenter.load(segmenter)
+
+
+@pytest.mark.parametrize("value", [torch.tensor(float("nan")), torch.tensor(1), torch.tensor(1j)], ids=str)
+def test_a_segmenters_weights_that_are_no_numbers_are_refused(value: torch.Tensor, segmenter: Path) -> None:
+    tensors = load_file(segmenter / "model.safetensors")
+    save_file(tensors | {"head.bias": value.reshape(1)}, segmenter / "model.safetensors")
+    with pytest.raises(ArtifactError, match=r"not finite"):
+        LearnedSegmenter.load(segmenter)
+
+
+CLIP = {"episode_id": "a", "start": 0, "num_frames": 5, "stride": 1}
+
+
+def write_shard(path: Path, clips: object = (CLIP,), **tensors: torch.Tensor) -> None:
+    whole = {"nodes": torch.zeros(1, 2, 1, 1, 1, 2, 2).half(), "mask": torch.zeros(1, 1, 2, 2, 2).byte()} | tensors
+    save_file(whole, path, metadata={"clips": clips if isinstance(clips, str) else json.dumps(clips)})
+
+
+@pytest.fixture
+def trajectories(tmp_path: Path) -> Path:
+    (tmp_path / "trajectories.json").write_text(json.dumps({"settings": {}, "shards": [""]}))
+    write_shard(tmp_path / "shard-00000.safetensors")
+    assert len(TrajectoryStore.open(tmp_path)) == 1
+    return tmp_path
+
+
+@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
+def test_shards_of_trajectories_that_lie_are_refused(content: bytes, trajectories: Path) -> None:
+    (trajectories / "shard-00000.safetensors").write_bytes(content)
+    with pytest.raises(ArtifactError, match="shard of trajectories cannot be read"):
+        TrajectoryStore.open(trajectories)
+
+
+@pytest.mark.parametrize(
+    "clips",
+    [
+        "[" * 100_000, "{}", "[[]]", "[1]", [CLIP | {"start": "0"}], [CLIP | {"num_frames": 1e99}], [{"start": 1}], [],
+        [CLIP, CLIP], [CLIP | {"episode_id": 3}],
+    ],
+    ids=lambda clips: str(clips)[:30],
+)  # fmt: skip
+def test_clips_of_a_shard_that_are_none_are_refused(clips: object, trajectories: Path) -> None:
+    write_shard(trajectories / "shard-00000.safetensors", clips)
+    with pytest.raises(ArtifactError, match="shard of trajectories"):
+        TrajectoryStore.open(trajectories)
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {"nodes": torch.zeros(1)}, {"nodes": torch.zeros(1, 2, 1, 1, 1, 2, 2)}, {"mask": torch.zeros(1, 3, 2, 2, 2).byte()},
+        {"mask": torch.zeros(1, 1, 2, 2, 2)}, {"nodes": torch.zeros(1, 2, 1, 1, 1, 2, 2).to(torch.int16)},
+    ],
+    ids=lambda tensors: str({name: (t.dtype, tuple(t.shape)) for name, t in tensors.items()}),
+)  # fmt: skip
+def test_tensors_of_a_shard_that_do_not_fit_its_clips_are_refused(
+    tensors: dict[str, torch.Tensor], trajectories: Path
+) -> None:
+    write_shard(trajectories / "shard-00000.safetensors", **tensors)
+    with pytest.raises(ArtifactError, match="do not fit its clips"):
+        TrajectoryStore.open(trajectories)
+
+
+def test_trajectories_that_are_no_numbers_are_refused(trajectories: Path) -> None:
+    write_shard(trajectories / "shard-00000.safetensors", nodes=torch.full((1, 2, 1, 1, 1, 2, 2), float("nan")).half())
+    with pytest.raises(ArtifactError, match="not finite"):
+        TrajectoryStore.open(trajectories).nodes([0])
+
+
+@pytest.mark.parametrize(
+    "index", ["[" * 100_000, "[]", "{}", '{"shards": 3}', '{"shards": {"a": 1}}', '{"shards": []}']
+)
+def test_an_index_of_trajectories_that_is_none_is_refused(index: str, trajectories: Path) -> None:
+    (trajectories / "trajectories.json").write_text(index)
+    with pytest.raises(ArtifactError, match=r"damaged|wrong form|lists no shards"):
+        TrajectoryStore.open(trajectories)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import ConfigDict, TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -97,19 +98,11 @@ class TrajectoryStore:
         """
         if not (folder / INDEX).is_file():
             raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
-        shards = json.loads((folder / INDEX).read_text(encoding="utf-8"))["shards"]
-        clips: list[tuple[int, int, Clip]] = []
-        for number in range(len(shards)):
-            path = shard_path(folder, number)
-            try:
-                with safe_open(path, framework="pt") as shard:
-                    header = shard.metadata() or {}
-            except (OSError, SafetensorError) as error:
-                raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
-            if "clips" not in header:
-                raise ArtifactError("Not a shard of trajectories", where=path, expected="clips in its header")
-            clips += [(number, row, Clip(**clip)) for row, clip in enumerate(json.loads(header["clips"]))]
-        return cls(folder, clips)
+        shards = read_json(folder / INDEX).get("shards")
+        if not isinstance(shards, list) or not shards:
+            raise ArtifactError("The index lists no shards", where=folder / INDEX, got=type(shards).__name__)
+        found = [(number, _clips(shard_path(folder, number))) for number in range(len(shards))]
+        return cls(folder, [(number, row, clip) for number, clips in found for row, clip in enumerate(clips)])
 
     def __len__(self) -> int:
         return len(self._clips)
@@ -132,7 +125,36 @@ class TrajectoryStore:
             number, row, _ = self._clips[index]
             with safe_open(shard_path(self.folder, number), framework="pt") as shard:
                 rows.append(shard.get_slice(name)[row : row + 1])
-        return torch.cat(rows).float()
+        values = torch.cat(rows).float()
+        if not bool(torch.isfinite(values).all()):
+            raise ArtifactError(f"A trajectory's {name} are not finite", where=self.folder, next_step="make them again")
+        return values
+
+
+_CLIPS = TypeAdapter(list[Clip], config=ConfigDict(strict=True))
+
+
+def _clips(path: Path) -> list[Clip]:
+    """The clips of a shard whose tensors are one row of half-precision nodes and one of byte masks for each.
+
+    Raises:
+        ArtifactError: it is missing, damaged, or of another form.
+    """
+    try:
+        with safe_open(path, framework="pt") as shard:
+            clips = _CLIPS.validate_json((shard.metadata() or {}).get("clips", ""))
+            forms = {name: shard.get_slice(name) for name in ("nodes", "mask")}
+            found = {name: (form.get_dtype(), form.get_shape()) for name, form in forms.items()}
+    except (OSError, SafetensorError, ValueError) as error:  # pydantic's ValidationError is a ValueError
+        raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
+    (nodes_type, nodes), (mask_type, mask) = found["nodes"], found["mask"]
+    fits = len(nodes) == 7 and len(mask) == 5 and nodes[0] == mask[0] == len(clips) and nodes[2] == mask[1]
+    if not fits or (nodes_type, mask_type) != ("F16", "U8"):
+        expected = f"F16 ({len(clips)}, k, v, c, u, h, w) and U8 ({len(clips)}, v, t, h, w)"
+        raise ArtifactError(
+            "Tensors of a shard of trajectories do not fit its clips", where=path, expected=expected, got=found
+        )
+    return clips
 
 
 @dataclass(frozen=True, kw_only=True)

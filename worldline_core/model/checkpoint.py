@@ -231,7 +231,7 @@ def load_checkpoint[Model: WorldModel](
     if config.towers == "generation":
         tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-        _check_fit({name: tuple(t.shape) for name, t in WorldModel(config).state_dict().items()}, tensors, path)
+        check_fit({name: tuple(t.shape) for name, t in WorldModel(config).state_dict().items()}, tensors, path)
     model = model_class(config)
     fill(model, tensors, where=path, dtype=dtype)
     return model, info
@@ -266,7 +266,7 @@ def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object
     Raises:
         CheckpointError: keys are missing or left over, a shape differs, or values are not finite floating-point numbers.
     """
-    _check_fit({name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}, tensors, where)
+    check_fit({name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}, tensors, where)
     for name, tensor in tensors.items():
         if not tensor.is_floating_point() or not bool(torch.isfinite(tensor.float()).all()):
             raise CheckpointError(
@@ -277,7 +277,7 @@ def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object
     model.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()})
 
 
-def _check_fit(own: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor], where: object) -> None:
+def check_fit(own: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor], where: object) -> None:
     """Raises: CheckpointError when keys are missing or left over, or a shape differs."""
     missing, unexpected = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or unexpected:

@@ -7,21 +7,22 @@ video is what that video shows.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from pydantic import BaseModel, Field, ValidationError
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metrics import frames_to_unit
+from worldline_core.model.checkpoint import check_fit, fill, read_weights
+from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 WEIGHTS_FILE = "model.safetensors"
@@ -79,6 +80,15 @@ def _double_convolution(cin: int, cout: int) -> nn.Sequential:
     )
 
 
+class _Described(BaseModel):
+    """What of a description the network needs; trainings add what they did."""
+
+    widths: tuple[Annotated[int, Field(ge=_GROUPS, le=1 << 16, multiple_of=_GROUPS)], ...] = Field(
+        min_length=1, max_length=16
+    )
+    threshold: float = Field(gt=0, lt=1)
+
+
 class LearnedSegmenter:
     """A trained U-Net; a pixel whose probability exceeds ``threshold`` is robot."""
 
@@ -128,16 +138,17 @@ class LearnedSegmenter:
                 next_step="run train_segmenter, or use artifacts/shipped/models/segmenter",
             )
         try:
-            description = json.loads(description_path.read_text())
-            network = UNet(tuple(description["widths"]))
-            threshold = float(description["threshold"])
-            state = {name: value.float() for name, value in load_file(weights_path).items()}
-            network.load_state_dict(state)
-        except (json.JSONDecodeError, KeyError, TypeError, SafetensorError, RuntimeError) as error:
+            described = _Described.model_validate(read_json(description_path))
+            tensors = read_weights(weights_path, None)
+            with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
+                network = UNet(described.widths)
+            check_fit({name: tuple(t.shape) for name, t in network.state_dict().items()}, tensors, weights_path)
+            fill(network.to_empty(device="cpu"), tensors, where=weights_path, dtype=torch.float32)
+        except (ArtifactError, ValidationError) as error:
             raise ArtifactError(
                 "The segmenter cannot be read", where=folder, got=str(error), next_step="train it again"
             ) from error
-        return cls(network, threshold)
+        return cls(network, described.threshold)
 
 
 def save_segmenter(
