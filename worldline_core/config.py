@@ -206,12 +206,27 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
         raise ConfigError("The configuration is not valid", where=where, got="\n    " + "\n    ".join(lines)) from error
 
 
+def _take_away(values: dict[str, Any], given: Mapping[str, Any], keys: Sequence[str]) -> None:
+    """Remove a key that is null now, where it was given; anything else is a mistake that validation names."""
+    for key in keys[:-1]:
+        values, given = values[key], given.get(key) or {}
+        if not isinstance(given, Mapping):
+            return
+    if values[keys[-1]] is None and keys[-1] in given:
+        del values[keys[-1]]
+
+
 def _inside(location: Sequence[int | str], outer: Sequence[int | str]) -> bool:
     return len(location) > len(outer) and tuple(location[: len(outer)]) == tuple(outer)
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
-    """The keys that a place in the configuration takes, through lists, mappings and unions."""
+    """The keys that a place in the configuration takes."""
+    return sorted({key for current in _types_at(model, location) for key in getattr(current, "model_fields", {})})
+
+
+def _types_at(model: type[BaseModel], location: Sequence[int | str]) -> list[Any]:
+    """What may stand at a place of the configuration, through lists, mappings and unions."""
     types: list[Any] = [model]
     for part in location:
         found: list[Any] = []
@@ -223,7 +238,7 @@ def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[s
                 found += [member for item in get_args(current) if item is not ... for member in _alternatives(item)]
         # No field, no item: the tag that says which member of a union was meant.
         types = found or [current for current in types if part in _tags(current)] or types
-    return sorted({key for current in types for key in getattr(current, "model_fields", {})})
+    return types
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -258,7 +273,8 @@ def load_config[Model: BaseModel](
     A file may begin with ``extends: PRESET``: it then states only what differs from that preset.
 
     ``section`` picks one top-level mapping of the file (a single step's config out of a whole preset); overrides are
-    still written from the top (``train_stage2.steps=10``).
+    still written from the top (``train_stage2.steps=10``). An override with null takes away what the file has (one of its
+    rollouts), as in a file that extends it, where null is no value of its own.
 
     Raises:
         ConfigError: anything that is not right with it.
@@ -268,7 +284,13 @@ def load_config[Model: BaseModel](
     source = preset_path(preset) if preset is not None else path
     if source is None:
         raise ConfigError("No configuration given")
-    values = apply_overrides(_with_extended(source), overrides)
+    given = _with_extended(source)
+    values = apply_overrides(given, overrides)
+    for override in overrides:
+        keys = override.partition("=")[0].strip().split(".")
+        within = keys if section is None else keys[1:]
+        if section in (None, keys[0]) and within and type(None) not in _types_at(model, within):
+            _take_away(values, given, keys)
     if section is not None:
         values = values.get(section) or {}
         if not isinstance(values, Mapping):

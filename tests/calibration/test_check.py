@@ -14,7 +14,12 @@ import yaml
 from flows.command_line import main
 from tools.corrupted.conventions import corrupt
 from worldline_core.calibration import check as check_module
-from worldline_core.calibration.check import ListedEpisode, check_calibration, combined_conventions, repairing_lines
+from worldline_core.calibration.check import (
+    ListedEpisode,
+    check_calibration,
+    combined_conventions,
+    repairing_lines,
+)
 from worldline_core.calibration.check_report import as_json, cautions, page, plain, table_text
 from worldline_core.calibration.diagnosis import (
     CalibrationCheck,
@@ -195,6 +200,17 @@ def test_kinematics_of_other_arms_are_not_used(episode: Episode, images: dict[st
 def test_nothing_to_check_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no episodes to check"):
         check_calibration([], tmp_path)
+
+
+def test_an_empty_source_says_what_it_looked_for_and_what_is_there(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "notes.txt").write_text("no video")
+    config = tmp_path / "source.yaml"
+    config.write_text(
+        f"curate: {{sources: [{{kind: video_folder, path: {tmp_path / 'videos'}, name: mine, split: train}}]}}"
+    )
+    with pytest.raises(DataError, match=r"no episodes to check[\s\S]*mp4[\s\S]*notes\.txt"):
+        check_module.check_command(config, None, output=tmp_path / "out")
 
 
 def made_up() -> CalibrationCheck:

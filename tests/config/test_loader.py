@@ -159,3 +159,22 @@ def test_a_preset_cannot_extend_one_that_does_not_exist(tmp_path: Path) -> None:
     path.write_text("extends: smokey\n")
     with pytest.raises(ConfigError, match="Unknown preset"):
         load_config(PipelineConfig, path=path)
+
+
+def test_null_takes_away_what_the_file_has() -> None:
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
+
+    def load(*overrides: str) -> PipelineConfig:
+        return load_config(PipelineConfig, preset="smoke", overrides=overrides)
+
+    whole = load()
+    name = next(iter(whole.rollouts))
+    assert set(load(f"rollouts.{name}=null").rollouts) == set(whole.rollouts) - {name}
+    assert load("train_stage2.relational=null").train_stage2.relational is None
+    assert load("evaluate_policy=null").evaluate_policy is None
+    with pytest.raises(ConfigError, match=r"rollouts\.nobody"):
+        load("rollouts.nobody=null")
+    with pytest.raises(ConfigError, match=r"rolouts: unknown key; did you mean 'rollouts'"):
+        load("rolouts=null")
+    with pytest.raises(ConfigError, match="curate: Field required"):
+        load("curate=null")

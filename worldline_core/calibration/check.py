@@ -6,6 +6,7 @@ result is a line for the source's configuration (`repairing_lines`).
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,7 +28,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.sources.open import open_source
+from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.labels import jpeg_bytes
@@ -35,6 +36,8 @@ from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
 from worldline_core.scale.mapping import ends_the_run
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
+
+logger = logging.getLogger(__name__)
 
 ADDING = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
 """Conventions that add up when they are declared and found again."""
@@ -117,7 +120,7 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
 
     Raises:
         ConfigError: the file has no such section, or a mistake in it.
-        DataError: a source cannot be opened.
+        DataError: a source cannot be opened, or none holds an episode: what each looked for, and what is there.
     """
     values = apply_overrides(read_yaml(path), overrides)
     if not values.get("curate"):
@@ -125,13 +128,22 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
     config = validate(CurateConfig, values["curate"], where=f"{path}: curate")
     descriptions = (values.get("render_actions") or {}).get("description_paths") or {}
     listed: list[ListedEpisode] = []
+    empty: list[DataError] = []
     for number, source_config in enumerate(config.sources):
         source = open_source(source_config, source_config.path)
         prefix = f"curate.sources[{number}].conventions"
         declared, robot = source_config.conventions, "embodiment" in type(source_config).model_fields
-        for episode_id in filter(source_config.includes, source.episode_ids()):
-            load = partial(source.load, episode_id)
-            listed.append(ListedEpisode(episode_id, source_config.label, load, prefix, declared, robot))
+        found = [
+            ListedEpisode(episode_id, source_config.label, partial(source.load, episode_id), prefix, declared, robot)
+            for episode_id in filter(source_config.includes, source.episode_ids())
+        ]
+        if not found:
+            empty.append(nothing_found(source_config, source, source_config.path))
+        listed += found
+    if not listed:
+        raise DataError("There are no episodes to check", got="".join(f"\n{error}" for error in empty))
+    for error in empty:
+        logger.warning("%s", error)
     return listed, {str(name): str(file) for name, file in descriptions.items()}
 
 
@@ -186,7 +198,7 @@ def check_calibration(
         OSError: the disk is full or cannot be written, which no other episode would escape.
     """
     if not listed:
-        raise DataError("There are no episodes to check", next_step="see the source's path and its `include` patterns")
+        raise DataError("There are no episodes to check", got="an EpisodeSet without rows")
     kinematics = KinematicsByName(descriptions or {})
     findings: list[Finding] = []
     with Progress("calibrate check", len(listed), "episode") as progress:
