@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
+from tasks.supervisor import end_with_pool
 from tasks.temporary_server import set_up_temporary_server
 from worldline_core.errors import UnavailableError
 from worldline_core.scale.mapping import (
@@ -28,6 +29,7 @@ from worldline_core.scale.mapping import (
     do_shard,
 )
 from worldline_core.store.remote import is_transient, process_cache
+from worldline_core.store.store import writing_for_another
 
 _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
@@ -152,7 +154,9 @@ def _work(payload: bytes, remote_cache_bytes: int) -> None:
     shard: Shard[Any] = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
-    do_shard(shard)
+    with writing_for_another(shard.work.output):
+        end_with_pool()  # with the lock held: who takes this work over waits until this process has ended
+        do_shard(shard)
 
 
 def _may_pass(_task: Any, _run: Any, state: Any) -> bool:

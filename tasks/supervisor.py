@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import multiprocessing
 import os
 import signal
 import sys
@@ -81,6 +83,16 @@ def end_with_parent(end: Callable[[], object]) -> None:
         end()
 
     threading.Thread(target=watch, name="end with parent", daemon=True).start()
+
+
+@functools.cache
+def end_with_pool() -> None:
+    """Let this process of a pool end with the one that started it, at once where that has ended already."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        end_with_parent(lambda: os._exit(1))
+        if not parent.is_alive():
+            os._exit(1)
 
 
 def _end_group(child: int, seconds: float) -> None:

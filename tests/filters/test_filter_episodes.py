@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import tool_poses
@@ -267,3 +268,15 @@ def test_a_robot_whose_description_is_not_here_is_left_out_not_fatal(monkeypatch
     poses, arms = tool_poses(replace(episode, T_base_ee=None, gripper=None))
     assert poses is None
     assert arms == ()
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:3000])])
+@pytest.mark.parametrize("pattern", ["*.mp4", "cameras.parquet"])
+def test_damaged_data_is_no_verdict_on_an_episode(tmp_path: Path, pattern: str, damage: Any) -> None:
+    with EpisodeSetWriter(tmp_path / "set", fps=FPS, image_size=(HEIGHT, WIDTH)) as writer:
+        writer.add(*record(0))
+    shutil.rmtree(tmp_path / "set" / "thumbnails", ignore_errors=True)
+    damage(sorted((tmp_path / "set").rglob(pattern))[0])
+    with pytest.raises(ArtifactError, match="An input of this step is missing or damaged"):
+        filter_episodes(FilterConfig(), {"episodes": tmp_path / "set"}, tmp_path / "out")
+    assert not (tmp_path / "out" / "quarantine.parquet").exists()

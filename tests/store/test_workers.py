@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from worldline_core.config import StrictModel
-from worldline_core.store.store import ArtifactStore
+from worldline_core.store.store import ArtifactStore, writing_for_another
 
 CONTEXT = multiprocessing.get_context("fork")
 
@@ -65,7 +65,7 @@ def test_one_process_owns_the_artifact(tmp_path: Path, distributed: bool) -> Non
     assert first[1:3] == second[1:3]
     folder = Path(first[1])
     took_part = sorted(path.name for path in (folder / "run").iterdir())
-    assert took_part == (["rank-0", "rank-1"] if distributed else ["rank-0"])
+    assert took_part == ([".writers", "rank-0", "rank-1"] if distributed else ["rank-0"])
     assert (folder / "content").read_text() == "made"
     assert sorted(path.suffix for path in folder.parent.iterdir() if path.is_file()) == [
         ".lock"
@@ -95,4 +95,31 @@ def test_a_helper_does_not_join_work_of_another_launch(tmp_path: Path) -> None:
     for one in processes:
         one.join(timeout=30)
     assert found[0][1:3] == found[1][1:3]
-    assert sorted(path.name for path in (Path(found[0][1]) / "run").iterdir()) == ["rank-0", "rank-1"]
+    assert sorted(path.name for path in (Path(found[0][1]) / "run").iterdir()) == [".writers", "rank-0", "rank-1"]
+
+
+def straggle(folder: Path, begun: Any) -> None:
+    """A worker of a command that was killed: it does not know yet."""
+    with writing_for_another(folder):
+        begun.set()
+        time.sleep(1.0)
+        (folder / "late").write_text("by a worker whose command is gone")
+
+
+def test_work_is_taken_over_when_the_last_worker_of_a_killed_command_has_ended(tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    partial = tmp_path / "work" / f"{store.key('work', 1, WorkConfig(), {})}.partial"
+    begun = CONTEXT.Event()
+    worker = CONTEXT.Process(target=straggle, args=(partial, begun))
+    worker.start()
+    assert begun.wait(30)
+    there: list[bool] = []
+
+    def look(config: WorkConfig, inputs: Any, output: Path) -> dict[str, Any]:
+        there.append((output / "late").exists())
+        (output / "content").write_text("made")
+        return {}
+
+    store.run("work", 1, look, WorkConfig(), {})
+    worker.join(timeout=30)
+    assert there == [True]

@@ -26,6 +26,7 @@ from worldline_core.exports.rollout import MCAP_FORMATS, export_rollout, mcap_fi
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import write_json_atomic
+from worldline_core.store.store import alone_in
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +55,7 @@ def export(
     Returns: the files, or the folder of the new set.
 
     Raises: ConfigError for a format that the artifact does not have; DataError for an unknown episode; ArtifactError for
-        another kind of artifact.
+        another kind of artifact, or while another command exports into the folder.
     """
     kind = kind_of(artifact)
     offered = {"EpisodeSet": EPISODE_FORMATS, "RolloutSet": ROLLOUT_FORMATS}.get(kind)
@@ -63,9 +64,10 @@ def export(
     unknown = [wanted for wanted in formats if wanted not in offered]
     if unknown or not formats:
         raise ConfigError(f"Not a format of {kind}", expected=", ".join(offered), got=", ".join(unknown) or "none")
-    if kind == "EpisodeSet":
-        return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids)
-    return _export_rollouts(artifact, output, formats, episode_ids, episodes)
+    with alone_in(output, "exporting"):
+        if kind == "EpisodeSet":
+            return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids)
+        return _export_rollouts(artifact, output, formats, episode_ids, episodes)
 
 
 def _export_episodes(

@@ -35,7 +35,6 @@ from worldline_core.data.episodes.episode_index import (
 )
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import DataError
 from worldline_core.filters.alignment import find_lags, find_projection
 from worldline_core.filters.calibration import find_calibration_faults, find_mistake
 from worldline_core.filters.filter_config import FilterConfig
@@ -44,7 +43,7 @@ from worldline_core.filters.pictures import find_picture_faults
 from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding, Verdict, runs
 from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
@@ -133,13 +132,14 @@ class EpisodeVerdict(StrictModel):
 
 
 def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> EpisodeVerdict:
-    """The verdict on row i of a set."""
+    """The verdict on row i of a set.
+
+    Raises: ArtifactError when what the set holds of it cannot be read.
+    """
     row = episodes.rows[i]
-    try:
+    with reading_input(f"{episodes.root}, episode {row.episode_id}"):
         episode = episodes.episode(i)
         thumbnails = {view: episodes.thumbnails(i, view) for view in row.views}
-    except DataError as error:
-        return EpisodeVerdict(reason="unreadable", detail=str(error).replace(str(episodes.root), ""))
     thresholds = config.for_source(row.source)
     shortest = thresholds.min_segment_frames
     if row.video_frames < shortest:

@@ -12,19 +12,26 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+import logging
 import os
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
+from worldline_core.store.artifact_files import read_json
+from worldline_core.store.atomic import write_json_atomic
 from worldline_core.store.store import Artifact, ArtifactStore
 
 if TYPE_CHECKING:
     from worldline_core.scale.mapping import ShardMapper
 
+
+logger = logging.getLogger(__name__)
 
 _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # malloc.h
 _NEVER = 2**31 - 1
@@ -46,6 +53,27 @@ def keep_freed_memory() -> bool:
     settings = ((_MMAP_MAX, 0), (_TRIM_THRESHOLD, _NEVER), (_ARENA_MAX, 1))
     done = [bool(mallopt(parameter, value)) for parameter, value in settings]
     return all(done)
+
+
+@contextmanager
+def same_threads(output: Path) -> Iterator[None]:
+    """Work that is continued gets as many threads of linear algebra as it began with: sums in another order round
+    otherwise, and its bytes would depend on where it was stopped."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    path, now = output / "run" / "threads.json", torch.get_num_threads()
+    begun = read_json(path).get("threads")
+    if isinstance(begun, int) and 0 < begun != now:
+        logger.info("continuing on %d threads, as it began, instead of %d", begun, now)
+        torch.set_num_threads(begun)
+    elif begun is None:
+        write_json_atomic(path, {"threads": now})
+    try:
+        yield
+    finally:
+        torch.set_num_threads(now)
 
 
 @dataclass(frozen=True)
@@ -282,10 +310,16 @@ def run_step(
     step.check_inputs(inputs)
     keep_freed_memory()
     options = {"mapper": mapper} if step.mapped else {}
+
+    def work(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        function = step.load_function()
+        with same_threads(output):
+            return function(config, inputs, output, **options)
+
     return store.run(
         step.name,
         step.version,
-        lambda c, i, o: step.load_function()(c, i, o, **options),
+        work,
         config,
         inputs,
         distributed=step.distributed,

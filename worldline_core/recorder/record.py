@@ -30,7 +30,7 @@ from worldline_core.recorder.simulate import EpisodeRecorder
 from worldline_core.recorder.things import TASKS
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
-from worldline_core.store.store import describe_environment
+from worldline_core.store.store import alone_in, describe_environment
 
 Embodiment = Literal[
     "viperx_graphite",
@@ -280,12 +280,21 @@ def record_with_manifest[C: StrictModel](
         step: ``record_episodes`` or ``record_banks``.
         config: has a ``seed``.
 
-    Raises: DataError when the folder holds a finished recording; what ``run`` raises.
+    Raises:
+        DataError: the folder holds a finished recording.
+        ArtifactError: another command is recording into it.
+        WorldLineError: what ``run`` raises.
     """
     if (output / MANIFEST_NAME).exists():
         raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
-    if output.exists():
-        remove_unfinished(output)
+    with alone_in(output, "recording"):
+        return _recorded(step, run, config, output)
+
+
+def _recorded[C: StrictModel](
+    step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
+) -> dict[str, Any]:
+    remove_unfinished(output)
     counts = run(config, output)
     environment = describe_environment()
     environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")

@@ -13,7 +13,8 @@ import logging
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import Any, ClassVar, Literal, Protocol
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.progress import Progress
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
 from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, retry_pauses, with_retries
@@ -153,13 +154,30 @@ def _do_episode[E](work: EpisodeWork[E, Any], episode: E, crash: Mapping[str, An
         return work.quarantine_crashed(episode, detail, crash_evidence(error))
 
 
+@contextmanager
+def reading_input(where: object) -> Iterator[None]:
+    """Around the reading of what an earlier step has stored: a fault there is the run's, never a verdict on an episode.
+
+    Raises: ArtifactError; as it is, what is transient or ends the run.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_transient(error) or ends_the_run(error):
+            raise
+        raise ArtifactError(
+            "An input of this step is missing or damaged", where=where, got=f"{type(error).__name__}: {error}",
+            next_step="worldline verify says which files; --set-aside lets the step that wrote them build them again",
+        ) from error  # fmt: skip
+
+
 def ends_the_run(error: BaseException) -> bool:
     """Whether every other episode would fail as well, for a reason that the user must remove first."""
     if isinstance(error, UnreachableInputError):
         return False
     if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
         return True
-    return isinstance(error, ConfigError | UnavailableError)
+    return isinstance(error, ConfigError | UnavailableError | ArtifactError)
 
 
 type TakeOutcome = Callable[[Shard[Any], Exception | None], None]

@@ -159,8 +159,8 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def folder_files(folder: Path) -> list[Path]:
-    """The files that make up a folder's content, sorted: without the manifest and the volatile folder.
+def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
+    """The files that make up a folder's content, sorted: without the manifest and the volatile folder, or everything.
 
     Raises:
         ArtifactError: a symbolic link leads out of the folder.
@@ -169,7 +169,8 @@ def folder_files(folder: Path) -> list[Path]:
     files = []
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
-        if relative.parts[0] == VOLATILE_FOLDER or relative == Path(MANIFEST_NAME) or path.is_dir():
+        ours = relative.parts[0] == VOLATILE_FOLDER or relative == Path(MANIFEST_NAME)
+        if (ours and not everything) or path.is_dir():
             continue
         if path.is_symlink() and not path.resolve().is_relative_to(root):
             raise ArtifactError("A symbolic link leads out of the folder", where=path, got=path.resolve())
@@ -177,11 +178,11 @@ def folder_files(folder: Path) -> list[Path]:
     return files
 
 
-def content_files(folder: Path) -> dict[str, JsonObject]:
+def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
     """Relative name -> `size` [bytes] and `sha256` of every file of a folder's content, as a manifest states them."""
     return {
         path.relative_to(folder).as_posix(): {"size": path.stat().st_size, "sha256": digest_file(path)}
-        for path in folder_files(folder)
+        for path in folder_files(folder, everything=everything)
     }
 
 
@@ -190,9 +191,22 @@ def digest_listed(files: Mapping[str, JsonObject]) -> str:
     return digest_value([[name, files[name]["sha256"]] for name in sorted(files, key=lambda name: name.split("/"))])
 
 
-def digest_folder(folder: Path) -> str:
-    """SHA-256 over the relative names and bytes of a folder's content."""
-    return digest_listed(content_files(folder))
+def digest_folder(folder: Path, *, everything: bool = False) -> str:
+    """SHA-256 over the relative names and bytes of a folder's content.
+
+    Args:
+        everything: its manifest and volatile folder too, which of a folder that is no artifact are its owner's.
+    """
+    return digest_listed(content_files(folder, everything=everything))
+
+
+def is_artifact(folder: Path) -> bool:
+    """Whether a folder has the manifest of a finished artifact, damaged or not, and not another file of that name."""
+    path = folder / MANIFEST_NAME
+    if not path.is_file():
+        return False
+    text = path.read_bytes()
+    return is_stored(folder) or all(f'"{key}"'.encode() in text for key in ("digest", "step"))
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> str:

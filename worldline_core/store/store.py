@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,13 @@ from worldline_core.errors import ArtifactError
 from worldline_core.store.artifact_files import (
     KEY_LENGTH,
     MANIFEST_NAME,
+    VOLATILE_FOLDER,
     digest_folder,
     digest_value,
     how_to_rebuild,
+    is_artifact,
+    is_stored,
+    read_json,
     read_manifest,
     write_manifest,
 )
@@ -44,6 +48,7 @@ logger = logging.getLogger(__name__)
 
 _VERSIONED_PACKAGES = ("torch", "numpy", "av", "diffusers", "prefect", "lerobot", "worldline")
 _POLL_SECONDS = 0.1
+_WRITERS = ".writers"
 
 StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
@@ -60,6 +65,45 @@ def exclusive_lock(path: Path) -> Iterator[None]:
             logger.warning("waiting for another process that works on %s", path.stem)
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def writing_for_another(folder: Path) -> Iterator[None]:
+    """Held by a process that writes into a step's folder on behalf of the one that holds its lock: if that one is killed,
+    who takes the work over waits for this one to end."""
+    path = folder / VOLATILE_FOLDER / _WRITERS
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def alone_in(folder: Path, doing: str) -> Iterator[None]:
+    """Within the context no other command of this project writes into a folder of a user's own choice.
+
+    Raises: ArtifactError when another one does.
+    """
+    (folder / VOLATILE_FOLDER).mkdir(parents=True, exist_ok=True)
+    path = folder / VOLATILE_FOLDER / ".lock"
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+        path.unlink(missing_ok=True)
+        with suppress(OSError):  # others have something in there
+            path.parent.rmdir()
+    except BlockingIOError as error:
+        raise ArtifactError(
+            f"Another command is {doing} into this folder",
+            where=folder,
+            next_step="wait for it, or choose another folder",
+        ) from error
     finally:
         os.close(descriptor)
 
@@ -148,15 +192,18 @@ class ArtifactStore:
         change): its files are not read twice.
 
         Raises:
-            ArtifactError: the folder does not exist.
+            ArtifactError: the folder does not exist; what lies outside of a store is not what its manifest states.
             UnreachableInputError: the store does not answer.
         """
         if is_remote(path):
             return remote_digest(path)
         if not path.is_dir():
             raise ArtifactError("An input folder does not exist", where=path, next_step="run the step that makes it")
-        manifest = read_manifest(path)
-        return str(manifest["digest"]) if "digest" in manifest else digest_folder(path)
+        if not is_artifact(path):
+            return digest_folder(path, everything=True)
+        if not is_stored(path) and self.verify != "off":
+            verify_inputs({"of this step": path}, "fast")  # recordings and models, which their owner may change
+        return str(read_manifest(path)["digest"])
 
     def run(
         self,
@@ -191,7 +238,8 @@ class ArtifactStore:
         if is_helper():
             wait_until(lambda: self.find(step, key) or is_announced(announcement) or None)
             if distributed and self.find(step, key) is None:
-                function(config, sources, partial)
+                with writing_for_another(partial):
+                    function(config, sources, partial)
             return wait_until(lambda: self.find(step, key))
         with exclusive_lock(self.root / step / f".{key}.lock"):
             if (found := self.find(step, key)) is not None:
@@ -202,6 +250,9 @@ class ArtifactStore:
                 shutil.rmtree(folder)
             resumed = partial.exists()
             partial.mkdir(parents=True, exist_ok=True)
+            if (writers := partial / VOLATILE_FOLDER / _WRITERS).exists():
+                with exclusive_lock(writers):  # until workers of a killed command have ended
+                    pass
             remove_unfinished(partial)
             logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
             started = time.time()
@@ -217,7 +268,10 @@ class ArtifactStore:
                 },
                 "seeds": dict(seeds) if seeds is not None else _seeds(config.model_dump(mode="json")),
                 "metrics": metrics,
-                "environment": describe_environment(),
+                "environment": {
+                    **describe_environment(),
+                    "threads": read_json(partial / VOLATILE_FOLDER / "threads.json").get("threads"),
+                },
                 "resumed": resumed,
                 "wall_seconds": round(time.time() - started, 3),
                 "finished_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -236,7 +290,7 @@ def _account(folder: Path) -> str:
         lost, reasons = "quarantined", metrics.get("reasons", metrics.get("quarantine_reasons", {}))
         if "left_out" in metrics:
             lost, reasons = "left out", metrics["left_out"]
-        named = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        named = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
         account = f"found {metrics['found']}, kept {metrics['kept']}, {lost} {metrics['found'] - metrics['kept']}"
         parts.append(f"{account} ({named})" if named else account)
     if metrics.get("splits", {}).keys() == {"test"}:

@@ -22,6 +22,7 @@ from worldline_core.store.artifact_files import (
     digest_listed,
     folder_files,
     how_to_rebuild,
+    is_artifact,
     is_stored,
     read_manifest,
     read_table,
@@ -70,8 +71,8 @@ class CheckedArtifact:
 
 
 def find_damage(folder: Path, mode: VerifyMode = "full") -> list[Damage]:
-    """Compare the files of an artifact with its manifest. A folder without a manifest has nothing to be compared with."""
-    if mode == "off":
+    """Compare the files of an artifact with its manifest. One without a manifest of ours has nothing to be compared with."""
+    if mode == "off" or not is_artifact(folder):
         return []
     try:
         manifest = read_manifest(folder)
@@ -129,13 +130,18 @@ def _digest(path: Path) -> str:
         return f"{_UNREADABLE}: {error}"
 
 
-def linked_artifacts(folder: Path) -> list[Path]:
-    """The artifacts whose datasets an EpisodeSet shares: a filtered set has no videos of its own."""
+def shared_datasets(folder: Path) -> list[Path]:
+    """The datasets of other artifacts that an EpisodeSet shares: a filtered set has no videos of its own."""
     index = read_table(folder / "index.parquet")
     if index is None or "dataset" not in index.column_names:
         return []
     shared = [name for name in index.column("dataset").unique().to_pylist() if ".." in PurePosixPath(name).parts]
-    places = [Path(os.path.normpath(folder / name)) for name in shared]
+    return [Path(os.path.normpath(folder / name)) for name in shared]
+
+
+def linked_artifacts(folder: Path) -> list[Path]:
+    """The artifacts whose datasets an EpisodeSet shares."""
+    places = shared_datasets(folder)
     owners = [next((above for above in place.parents if (above / MANIFEST_NAME).is_file()), None) for place in places]
     return list(dict.fromkeys(owner for owner in owners if owner is not None))
 
@@ -147,10 +153,17 @@ def verify_inputs(inputs: Mapping[str, AnyPath], mode: VerifyMode) -> None:
         ArtifactError: files are not those that were written.
     """
     for name, folder in inputs.items():
-        if mode != "off" and not is_remote(folder):
+        if is_remote(folder):
+            continue
+        if mode != "off":
             _verify_input(name, folder, mode)
-            for artifact in linked_artifacts(folder):
-                _verify_input(name, artifact, mode)
+        if missing := [place for place in shared_datasets(folder) if not place.is_dir()]:
+            raise ArtifactError(
+                f"Input {name} shares recordings that are not there", where=folder,
+                expected=", ".join(map(str, missing[:3])), got="no such folder", next_step=how_to_rebuild(missing[0].parents[1]),
+            )  # fmt: skip
+        for artifact in linked_artifacts(folder) if mode != "off" else ():
+            _verify_input(name, artifact, mode)
 
 
 def _verify_input(name: str, folder: Path, mode: VerifyMode) -> None:
