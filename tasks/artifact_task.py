@@ -111,7 +111,7 @@ class ArtifactTask:
         runner: RunnerConfig | None,
     ) -> tuple[Task[..., dict[str, Any]], dict[str, Any], bool, FindArtifact]:
         """Prefect's task, its parameters, whether the store has the artifact, and what finds it there."""
-        store = ArtifactStore(store_root)
+        store = ArtifactStore(store_root, (runner or RunnerConfig()).verify)
         references = {key: _reference(value, store) for key, value in inputs.items()}
         key = _key(store, self.step, config, references)
         find = partial(_stored, store, self.step, key)

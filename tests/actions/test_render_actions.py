@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.pipeline.steps import run_step
+from worldline_core.store.artifact_files import read_json
+from worldline_core.store.store import ArtifactStore
 
 N = 5
 
@@ -154,6 +159,64 @@ def test_damaged_shard_is_named(rendered, tmp_path):
     (tmp_path / "tracks-00000.safetensors").write_bytes(b"broken")
     with pytest.raises(ArtifactError, match=r"cannot be read[\s\S]*tracks-00000|tracks-00000[\s\S]*cannot be read"):
         list(ActionTracks.open(tmp_path))
+
+
+@pytest.fixture
+def linked(episode_set, tmp_path) -> tuple[Path, Path]:
+    """An index over a curated set of a store, as filter writes it, and that set."""
+    curated, filtered = tmp_path / "store" / "curate" / ("a" * 16), tmp_path / "store" / "filter" / ("b" * 16)
+    shutil.copytree(episode_set, curated)
+    rows = read_index(curated)
+    filtered.mkdir(parents=True)
+    write_index(filtered, [replace(row, dataset=f"../../curate/{curated.name}/{row.dataset}") for row in rows])
+    return filtered, curated
+
+
+@pytest.mark.parametrize("mode", ["full", "fast", "off"])
+def test_data_that_is_gone_is_no_verdict_on_an_episode(linked, tmp_path, mode):
+    filtered, curated = linked
+    store = ArtifactStore(tmp_path / "store", mode)
+    curated.rename(tmp_path / "elsewhere")
+    with pytest.raises(ArtifactError, match="shares recordings that are not there"):
+        run_step(store, "render_actions", CONFIG, {"episodes": filtered})
+    (tmp_path / "elsewhere").rename(curated)
+    tracks = run_step(store, "render_actions", CONFIG, {"episodes": filtered})
+    assert read_json(tracks.path / "manifest.json")["metrics"]["kept"] == 3
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:-9])])
+def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage):
+    filtered, curated = linked
+    damage(sorted(curated.rglob("cameras.parquet"))[0])
+    with pytest.raises(ArtifactError, match="An input of this step is missing or damaged"):
+        run_step(ArtifactStore(tmp_path / "store", "off"), "render_actions", CONFIG, {"episodes": filtered})
+    assert not list((tmp_path / "store" / "render_actions").glob("*/manifest.json"))
+
+
+def test_previews_have_names_of_their_own_however_long_or_alike_ids_are(tmp_path):
+    ids = ["a/b", "a_b", "x" * 400, "../../up"]
+    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(64, 96)) as writer:
+        for name in ids:
+            episode = replace(episode_of("so101", 0), episode_id=name)
+            writer.add(episode, {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras})
+    config = CONFIG.model_copy(update={"previews": 4})
+    render_actions(config, {"episodes": tmp_path / "set"}, tmp_path / "tracks")
+    assert len(list((tmp_path / "tracks" / "previews").glob("*.mp4"))) == 4
+    assert {path.name for path in tmp_path.iterdir()} == {"set", "tracks"}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value):
+    """Whoever reads them (a rollout, a training): they never become maps, nor a video."""
+    shutil.copytree(rendered[0], tmp_path / "tracks")
+    shards = sorted((tmp_path / "tracks").glob("tracks-*.safetensors"))
+    path, arrays = next((path, found) for path in shards if "ur5e_pair-0/uv" in (found := load_file(path)))
+    arrays["ur5e_pair-0/uv"][2, 0, 0] = value
+    save_file(arrays, path)
+    tracks = ActionTracks.open(tmp_path / "tracks")
+    with pytest.raises(ArtifactError, match=r"not finite[\s\S]*ur5e_pair-0[\s\S]*uv"):
+        tracks.tracks("ur5e_pair-0")
+    assert tracks.tracks("ur5e_pair-1").num_frames == N
 
 
 def test_a_set_without_any_tracks_is_an_error(tmp_path):

@@ -108,6 +108,15 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
 
 
 @pytest.fixture(scope="session")
+def oddly_named(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, SmallWorld]:
+    """Recordings and a bank whose names lead out of every folder, or are longer than a file's name may be."""
+    cases = {"../../../../outside": True, "/tmp/outside": False, "x" * 400: True, "x" * 399 + "y": False}
+    root = tmp_path_factory.mktemp("oddly named")
+    recordings = _write(root / "recordings", cases, split="test", bank=None)
+    return recordings, _write(root / "bank", cases, split="bank", bank="../../../outside" + "b" * 300)
+
+
+@pytest.fixture(scope="session")
 def bank(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     """One bank of six candidates, the fifth one alone succeeds; labels are sealed nowhere yet."""
     cases = {f"cand-{number}": number == 4 for number in range(6)}

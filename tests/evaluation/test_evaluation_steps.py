@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -70,6 +71,25 @@ def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, tmp_path):
     assert contents(tmp_path / "whole") == contents(tmp_path / "again")
 
 
+def test_names_of_episodes_and_banks_never_become_names_of_files(oddly_named, tmp_path):
+    recordings, bank = oddly_named
+    _seal(bank.inputs["banks"], bank.outcomes)
+    steps = (
+        (evaluate_video, VIDEO, recordings), (evaluate_policy, POLICY, recordings),
+        (evaluate_planning, PLANNING.model_copy(update={"budgets": (2, 4)}), bank),
+    )  # fmt: skip
+    for step, config, world in steps:
+        output = tmp_path / "store" / step.__name__ / "key"
+        step(config, world.inputs, output)
+        parts = [
+            path for path in (output / "run" / "parts").iterdir() if re.fullmatch(r"[0-9a-f]{32}\.json", path.name)
+        ]
+        assert len(parts) >= 3
+    assert {path.name for path in tmp_path.iterdir()} == {"store"}
+    assert not list(tmp_path.rglob("*outside*"))
+    assert not list(Path("/tmp").glob("outside*"))
+
+
 def test_predictions_of_unknown_episodes_are_refused(recordings, bank, tmp_path):
     inputs = recordings.inputs | {"rollouts.other": bank.inputs["rollouts.good"]}
     with pytest.raises(DataError, match="not in the EpisodeSet"):
@@ -90,6 +110,21 @@ def test_policy_accuracy_against_recorded_outcomes(recordings, tmp_path):
     decisions = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
     evidence = json.loads(decisions[0]["evidence"])
     assert "head_view_confirms_target_displacement" in evidence[0]
+
+
+def test_nothing_to_judge_is_an_error_that_says_why(recordings, tmp_path):
+    with pytest.raises(DataError, match=r"No video can be judged[\s\S]*4 in other splits[\s\S]*evaluate_policy: null"):
+        evaluate_policy(POLICY.model_copy(update={"splits": ("nowhere",)}), recordings.inputs, tmp_path / "none")
+    counts = evaluate_policy(POLICY.model_copy(update={"max_per_group": 1}), recordings.inputs, tmp_path / "few")
+    assert (counts["found"], counts["kept"]) == (4, 2)
+    assert {reason: count for reason, count in counts["left_out"].items() if count} == {
+        "not drawn (evaluate_policy.balanced, max_per_group)": 2
+    }
+
+
+def test_no_bank_large_enough_is_an_error(sealed, tmp_path):
+    with pytest.raises(DataError, match=r"enough candidates[\s\S]*at least 32[\s\S]*up to 6"):
+        evaluate_planning(PLANNING.model_copy(update={"budgets": (32,)}), sealed, tmp_path)
 
 
 def test_policy_evaluation_is_balanced(recordings, tmp_path):

@@ -170,11 +170,11 @@ ODD_VIDEOS = {
 @pytest.mark.parametrize("change", ODD_VIDEOS.values(), ids=ODD_VIDEOS)
 def test_tables_of_a_video_that_say_other_things_end(video: Path, change: Callable[[bytes], bytes]) -> None:
     """In the frames that were recorded, or in a named rejection; never in a wait, nor in memory of the machine."""
-    expected = [picture.rgb().copy() for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
+    expected = [picture.rgb.copy() for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
     video.write_bytes(change(video.read_bytes()))
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
     try:
-        pictures = [picture.rgb() for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
+        pictures = [picture.rgb for picture in read_clip(VideoClip.whole_file(video, 9, 8.0))]
         found = all(np.array_equal(one, other) for one, other in zip(pictures, expected, strict=True))
     except RejectedInputError as error:
         found = error.reason

@@ -36,7 +36,7 @@ def test_every_chosen_episode_is_predicted_in_every_view_and_seed(predicted: tup
     output, summary = predicted
     assert summary == {
         "method": "causal", "episodes": 4, "predictions": 8, "frames": 8 * N, "checkpoint_kind": "causal", "steps": 4,
-        "recent_blocks": 1,
+        "recent_blocks": 1, "found": 5, "kept": 4, "left_out": {"in other splits": 1},
     }  # fmt: skip
     rollouts = RolloutSet.open(output)
     assert rollouts.method == "causal"

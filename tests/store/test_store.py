@@ -17,7 +17,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.store.artifact_files import digest_folder, digest_value
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
-from worldline_core.store.store import ArtifactStore
+from worldline_core.store.store import ArtifactStore, alone_in
 
 
 class CountConfig(StrictModel):
@@ -212,3 +212,30 @@ def test_what_a_kill_left_unfinished_does_not_reach_the_artifact(tmp_path: Path)
     (partial / "videos" / ".head.123.tmp.mp4").write_bytes(b"half")
     killed = store.run("count", 1, count, CountConfig(), {})
     assert killed.digest == ArtifactStore(tmp_path / "other").run("count", 1, count, CountConfig(), {}).digest
+
+
+def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    from worldline_core.exports.export import export
+    from worldline_core.shipped import shipped_folder
+
+    with alone_in(tmp_path / "out", "exporting"):
+        with pytest.raises(ArtifactError, match="Another command is exporting into this folder"):
+            export(shipped_folder() / "recordings", tmp_path / "out", ["mcap"])
+        assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
+    with alone_in(tmp_path / "out", "exporting"):
+        pass
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_two_recordings_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+    from worldline_core.recorder.record import record_with_manifest
+
+    def never(config: CountConfig, output: Path) -> dict[str, Any]:
+        raise AssertionError("it waits for the other one's end")
+
+    with (
+        alone_in(tmp_path, "recording"),
+        pytest.raises(ArtifactError, match="Another command is recording into this folder"),
+    ):
+        record_with_manifest("record_episodes", never, CountConfig(), tmp_path)

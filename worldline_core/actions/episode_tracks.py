@@ -31,6 +31,7 @@ from worldline_core.actions.tool_projection import project_tools
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.store.artifact_files import how_to_rebuild
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 
 WristProjection = Literal["current_camera", "clip_start_camera"]
@@ -322,7 +323,7 @@ class ActionTracks:
 
         Raises:
             DataError: there are no tracks of this episode.
-            ArtifactError: the shard is missing or damaged.
+            ArtifactError: the shard is missing or damaged, or holds numbers that are not finite.
         """
         if episode_id not in self._rows:
             raise DataError(
@@ -339,6 +340,12 @@ class ActionTracks:
                 arrays = {name: shard.get_tensor(f"{episode_id}/{name}") for name in ARRAYS}
         except (OSError, SafetensorError) as error:
             raise ArtifactError("Shard of action tracks cannot be read", where=path, got=str(error)) from error
+        # Of a view without calibration K says so by not being finite; what maps are drawn from is, valid or not.
+        if unusable := [name for name in SAMPLES if not np.isfinite(arrays[name]).all()]:
+            raise ArtifactError(
+                "Action tracks are not finite", where=f"{path}, episode {episode_id}", got=", ".join(unusable),
+                next_step=how_to_rebuild(self.root),
+            )  # fmt: skip
         return EpisodeTracks(
             episode_id=episode_id,
             embodiment=row["embodiment"],

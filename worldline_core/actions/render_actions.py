@@ -29,13 +29,14 @@ from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
+from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
 from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_transient
 
@@ -64,6 +65,7 @@ class RenderActionsConfig(StrictModel):
     episodes_per_shard: int = Field(256, ge=1)
 
 
+_LONGEST_NAME = 200
 _ACCOUNT = ("episode_id", "source", "status", "reason", "stored_bytes")
 
 
@@ -109,8 +111,9 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
         return () if done else episodes
 
     def do(self, episode: int) -> ProjectedEpisode:
-        try:
+        with reading_input(f"{self.folder}, episode {self.episodes.rows[episode].episode_id}"):
             recorded = self.episodes.episode(episode)
+        try:
             controls = self.config.source
             needed = recorded.T_base_ee is None if controls == "state" else recorded.commanded
             tracks, counts = compute_tracks(
@@ -266,10 +269,13 @@ def _preview_positions(config: RenderActionsConfig, episodes: EpisodeSet, tracks
 
 def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionTracks, output: Path) -> None:
     """Overlay video and contact sheet of a few episodes, under `previews/`."""
-    folder = output / "previews"
+    folder, used = output / "previews", set[str]()
     for position in _preview_positions(config, episodes, tracks):
         row = episodes.rows[position]
         name = row.episode_id.replace("/", "_")
+        if name in used or len(name.encode()) > _LONGEST_NAME:
+            name = part_name(row.episode_id)
+        used.add(name)
         sheet_path, video_path = folder / f"{name}.png", folder / f"{name}.mp4"
         if sheet_path.is_file() and video_path.is_file():
             continue

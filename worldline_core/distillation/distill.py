@@ -73,10 +73,14 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
     torch.manual_seed(config.teacher_forcing.trainer.seed)
     run = DistillationRun.open(config, inputs, output)
     metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
+    kept = sum(row.split in config.splits for row in run.rows)
     return {
+        "found": len(run.rows),
+        "kept": kept,
+        "left_out": {"in other splits": len(run.rows) - kept},
         "steps": {name: getattr(config, name).trainer.steps for name in STEPS},
         "lpips": run.lpips,
-        "episodes": len([row for row in run.rows if row.split in config.splits]),
+        "episodes": kept,
         **metrics,
     }
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from worldline_core.errors import DataError
+from worldline_core.store.artifact_files import digest_value
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SCORES_FILE = "scores.parquet"
@@ -143,6 +144,11 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence
     schema = pa.schema([(name, _TYPES.get(name, pa.string())) for name in columns])
     with atomic_path(path) as temporary:
         pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema), temporary)
+
+
+def part_file(folder: Path, *of: str | int) -> Path:
+    """Where the part of an evaluation lies that `of` names (a method, an episode, a seed): in `folder`, whatever they are."""
+    return folder / f"{digest_value(of)[:32]}.json"
 
 
 def kept_part(path: Path, make: Callable[[], Any]) -> Any:

@@ -142,7 +142,7 @@ def write_mcap_recordings(content: RecordingContent, output: Path, stem: str, wa
         facts = {"method": method} | {
             name: getattr(episode, name) for name in ("episode_id", "embodiment", "instruction")
         }
-        written.append(mcap_file(output, f"{stem}_{method}", wanted))
+        written.append(mcap_file(output, f"{stem}_{safe_stem(method)}", wanted))
         write_rollout_mcap(
             written[-1],
             {view: frames[:count] for view, frames in views.items()},

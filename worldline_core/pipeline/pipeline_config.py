@@ -69,7 +69,9 @@ class PipelineConfig(StrictModel):
     distill: DistillConfig
     rollouts: dict[str, RolloutRun]
     evaluate_video: VideoEvaluationConfig
-    evaluate_policy: PolicyEvaluationConfig
+    evaluate_policy: PolicyEvaluationConfig | None = Field(
+        default=None, description="none: predictions are not judged, where recordings say no outcome"
+    )
     evaluate_planning: PlanningConfig | None = None
     report: ReportConfig
     runner: RunnerConfig = Field(

@@ -114,8 +114,10 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
     if recordings:
         shared: dict[str, str | Path] = {"episodes": "filter", "tracks": "render_actions", **segmenter}
         yield Node("evaluate_video", "evaluate_video", config.evaluate_video, {**shared, **recordings})
-        yield Node("evaluate_policy", "evaluate_policy", config.evaluate_policy, {**shared, **recordings})
-        scores |= {"evaluate_video": "evaluate_video", "evaluate_policy": "evaluate_policy"}
+        scores["evaluate_video"] = "evaluate_video"
+        if config.evaluate_policy is not None:
+            yield Node("evaluate_policy", "evaluate_policy", config.evaluate_policy, {**shared, **recordings})
+            scores["evaluate_policy"] = "evaluate_policy"
     if config.evaluate_planning is not None and (banks := rollouts("banks")):
         inputs: dict[str, str | Path] = {
             "banks": "curate.banks",

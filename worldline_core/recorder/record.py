@@ -285,8 +285,6 @@ def record_with_manifest[C: StrictModel](
         ArtifactError: another command is recording into it.
         WorldLineError: what ``run`` raises.
     """
-    if (output / MANIFEST_NAME).exists():
-        raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
     with alone_in(output, "recording"):
         return _recorded(step, run, config, output)
 
@@ -294,6 +292,8 @@ def record_with_manifest[C: StrictModel](
 def _recorded[C: StrictModel](
     step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
 ) -> dict[str, Any]:
+    if (output / MANIFEST_NAME).exists():
+        raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
     remove_unfinished(output)
     counts = run(config, output)
     environment = describe_environment()

@@ -130,25 +130,29 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     if config.timed_blocks and isinstance(world, WorldLine):
         facts["long_rollout"] = _timed_blocks(config, world, episodes, tracks, planned[0])
     speed.close(facts)
+    in_splits = len(episodes.select(split=config.splits))
+    reasons = {"in other splits": len(episodes) - in_splits, "not among those asked for": in_splits - len(chosen)}
+    reasons |= Counter(row.reason for row in left_out)
     return {
         "method": config.method,
+        "found": len(episodes),
+        "kept": len({item.position for item in planned}),
+        "left_out": {name: count for name, count in reasons.items() if count},
         "episodes": len({item.position for item in planned}),
         "predictions": len(planned),
         "frames": sum(item.frames for item in planned),
         "checkpoint_kind": world.info.kind if isinstance(world, WorldLine) else None,
         "steps": world.steps,
         "recent_blocks": None if world.causal is None else world.causal.recent_blocks,
-        **_account(world, planned, Counter(row.reason for row in left_out)),
+        **_account(world, planned),
     }
 
 
-def _account(
-    world: WorldLine | FirstFrameCopy, planned: Sequence[Prediction], left_out: Mapping[str, int]
-) -> dict[str, Any]:
-    """What was not, or not wholly, predicted; nothing where all was."""
+def _account(world: WorldLine | FirstFrameCopy, planned: Sequence[Prediction]) -> dict[str, Any]:
+    """What was not wholly predicted; nothing where all was."""
     lacking = Counter(view for item in planned for view in world.views if view not in item.views)
     cut = sum(item.sampled - item.frames for item in planned)
-    account = {"left_out": dict(left_out), "without_view": dict(lacking), "cut_frames": cut}
+    account = {"without_view": dict(lacking), "cut_frames": cut}
     return {name: value for name, value in account.items() if value}
 
 

@@ -20,6 +20,7 @@ from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import atomic_path
 
 INDEX_FILE = "index.parquet"
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,10 @@ _SCHEMA = row_schema(RolloutRow)
 
 
 def video_path(episode_id: str, seed: int, view: str) -> str:
-    """Where a prediction lies in its set; odd characters of the id are replaced and a digest keeps names apart."""
+    """Where a prediction lies in its set; odd characters of the id are replaced, long ones cut; a digest keeps names apart."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in episode_id)
-    if safe != episode_id or safe.startswith("."):
-        safe = f"{safe.lstrip('.')}-{hashlib.sha256(episode_id.encode()).hexdigest()[:8]}"
+    if safe != episode_id or safe.startswith(".") or not 0 < len(safe) <= _LONGEST_NAME:
+        safe = f"{safe.lstrip('.')[:_LONGEST_NAME]}-{hashlib.sha256(episode_id.encode()).hexdigest()[:8]}"
     return f"videos/{safe}/seed-{seed}/{view}.mp4"
 
 

@@ -290,7 +290,8 @@ class RunnerConfig(StrictModel):
     nodes_at_once: int = Field(
         default=1,
         ge=1,
-        description="nodes of a run side by side, each in a process with its share of the cores; for runs on a CPU",
+        description="nodes of a run side by side, each in a process with its share of the cores; for runs on a CPU, whose"
+        " last bits depend on the number of threads",
     )
 
     @model_validator(mode="after")

@@ -93,17 +93,20 @@ def alone_in(folder: Path, doing: str) -> Iterator[None]:
     path = folder / VOLATILE_FOLDER / ".lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-        path.unlink(missing_ok=True)
-        with suppress(OSError):  # others have something in there
-            path.parent.rmdir()
-    except BlockingIOError as error:
-        raise ArtifactError(
-            f"Another command is {doing} into this folder",
-            where=folder,
-            next_step="wait for it, or choose another folder",
-        ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ArtifactError(
+                f"Another command is {doing} into this folder",
+                where=folder,
+                next_step="wait for it, or choose another one",
+            ) from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            with suppress(OSError):  # others have something in there
+                path.parent.rmdir()
     finally:
         os.close(descriptor)
 

@@ -238,7 +238,9 @@ class Stage:
                 state_dict=weights,
             )
         clips = trainer.steps * trainer.batch_size * self.plan.per_step
-        return {"steps": trainer.steps, "clips": clips}
+        found, fit, kept = len(self.episodes), len(self.rows), len(self.training_rows)
+        left_out = {"in other splits": fit - kept, "not fit for this stage, or without latents or tracks": found - fit}
+        return {"steps": trainer.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
 
     def _input_facts(self) -> dict[str, Any]:
         """How clips were read, for the checkpoint; nothing where they were cached latents in the default order."""

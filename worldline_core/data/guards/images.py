@@ -36,7 +36,7 @@ def image_size(content: bytes, where: object) -> tuple[int, int]:
     Raises: RejectedInputError: unreadable for another format or a header that breaks off.
     """
     with unreadable("Image header breaks off", where, (struct.error, IndexError)):
-        if content.startswith(_PNG) and content[12:16] == b"IHDR":
+        if content.startswith(_PNG) and content[12:16] == b"IHDR" and b"acTL" not in content[: content.find(b"IDAT")]:
             width, height = struct.unpack(">II", content[16:24])
             return height, width
         if content.startswith(_JPEG):
@@ -45,7 +45,7 @@ def image_size(content: bytes, where: object) -> tuple[int, int]:
         "unreadable",
         "Image is of no known format",
         where=where,
-        expected="PNG or JPEG",
+        expected="PNG (not animated) or JPEG",
         got=f"{len(content)} bytes that begin with {content[:8].hex() or 'nothing'}",
     )
 

@@ -9,6 +9,7 @@ identity are compared with what they were when this process first opened it (`un
 
 from __future__ import annotations
 
+import hashlib
 import re
 import stat
 from collections import Counter, OrderedDict
@@ -28,6 +29,8 @@ from worldline_core.store.remote import AnyPath, list_files, parse_location, pro
 type FileState = tuple[int, int, int, int]
 _REMEMBERED = 100_000
 """Of files shared by many episodes (joined videos, tables) the state before the first episode counts."""
+
+_LONGEST_STEM = 200
 
 _run = ""
 _first_seen: OrderedDict[Path, FileState] = OrderedDict()
@@ -317,8 +320,11 @@ def fill_template(template: str, **values: int | str) -> str:
 
 
 def safe_stem(name: str) -> str:
-    """Any name as the beginning of a file name: what is no letter, digit, - or _ becomes _."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+    """Any name as the beginning of a file name: what is no letter, digit, - or _ becomes _; of a long one a digest ends it."""
+    stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+    if len(stem.encode()) <= _LONGEST_STEM:
+        return stem
+    return f"{stem[: _LONGEST_STEM // 4]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def safe_name(name: str, what: str) -> str:

@@ -34,7 +34,15 @@ from worldline_core.evaluation.planning.selectors import (
     planning_indices,
 )
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
-from worldline_core.evaluation.scores import SUMMARY_FILE, Score, bootstrap_mean, kept_part, write_scores, write_table
+from worldline_core.evaluation.scores import (
+    SUMMARY_FILE,
+    Score,
+    bootstrap_mean,
+    kept_part,
+    part_file,
+    write_scores,
+    write_table,
+)
 from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
 from worldline_core.evaluation.vlm_models import VLMConfig, open_vlm
 from worldline_core.progress import with_progress
@@ -82,16 +90,25 @@ def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output
     choices: list[dict[str, Any]] = []
     for method in (TRUE_METHOD, *rollouts):
         for bank in with_progress(banks, f"evaluate_planning {method}", "bank"):
-            part = output / "run" / "parts" / method / f"{bank}.json"
+            part = part_file(output / "run" / "parts", method, bank)
             found = kept_part(part, partial(choose_in_bank, method, bank))
             choices += [{"method": method, "bank": bank, **choice} for choice in found]
+    found, kept = len(banks), len({choice["bank"] for choice in choices})
+    if not kept:
+        raise DataError(
+            "No bank has enough candidates to choose among", where=inputs["banks"],
+            expected=f"at least {min(config.budgets)}, the smallest of evaluate_planning.budgets",
+            got=f"{found} banks of up to {max(map(len, banks.values()), default=0)}",
+        )  # fmt: skip
     table = [choice | {"trace": json.dumps(choice["trace"], sort_keys=True)} for choice in choices]
     write_table(output / CHOICES_FILE, table, _CHOICE_COLUMNS)
     # Only now: nothing above has read, or could read, how any candidate ended.
     outcomes = read_outcomes(
         inputs.get("sealed", inputs["banks"]) / SEALED_FILE, [row.episode_id for rows in banks.values() for row in rows]
     )
-    return write_results(config, selector.name, banks, choices, outcomes, output)
+    left_out = {"with fewer candidates than the smallest budget": found - kept}
+    counts = write_results(config, selector.name, banks, choices, outcomes, output)
+    return {"found": found, "kept": kept, "left_out": left_out, **counts}
 
 
 def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:

@@ -23,6 +23,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
@@ -40,6 +41,7 @@ from worldline_core.evaluation.scores import (
     bootstrap_mean,
     kept_part,
     method_differences,
+    part_file,
     write_scores,
     write_table,
 )
@@ -87,7 +89,8 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     judge = open_judge(config, inputs.get("segmenter"))
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
     times = Counter(name for names in predicted.values() for name in names)
-    chosen = choose_trajectories(config, rows_of(episodes, times), times)
+    rows = rows_of(episodes, times)
+    chosen = choose_trajectories(config, rows, times)
 
     def verdict_on(row: EpisodeRow, method: str, seed: int) -> dict[str, Any]:
         rollout = rollouts.get(method)
@@ -109,7 +112,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             ),
         ]
         for method, seed in videos:
-            part = output / "run" / "parts" / method / f"{name}.{seed}.json"
+            part = part_file(output / "run" / "parts", method, name, seed)
             verdict = kept_part(part, partial(verdict_on, row, method, seed))
             if verdict["num_frames"] < row.video_frames:
                 too_short[method] += 1  # the outcome may lie after the end of this video
@@ -125,7 +128,30 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             })  # fmt: skip
     if too_short:
         logger.warning("Predictions shorter than their recordings were not judged: %s", dict(too_short))
-    return _write(config, decisions, dict(too_short), judge.name, output)
+    judgeable = [row for row in rows if row.split in config.splits and row.outcome in _OUTCOMES]
+    judged = {row["episode_id"] for row in decisions if row["method"] != TRUE_METHOD}
+    counts: dict[str, Any] = {
+        "found": len(rows),
+        "kept": len(judged),
+        "left_out": {
+            "in other splits": sum(row.split not in config.splits for row in rows),
+            "without a recorded success or failure": sum(
+                row.split in config.splits and row.outcome not in _OUTCOMES for row in rows
+            ),
+            "not drawn (evaluate_policy.balanced, max_per_group)": len(judgeable) - len(chosen),
+            "predicted shorter than recorded": len(chosen) - len(judged),
+        },
+    }
+    if not decisions:
+        left_out = ", ".join(f"{count} {reason}" for reason, count in counts["left_out"].items() if count)
+        raise DataError(
+            "No video can be judged",
+            where=inputs["episodes"],
+            expected=f"predictions of recordings of the splits {', '.join(config.splits)} that ended in success or failure",
+            got=f"{len(rows)} predicted episodes: {left_out}",
+            next_step="predict recordings with known outcomes, or leave the judgement out: evaluate_policy: null",
+        )
+    return counts | _write(config, decisions, dict(too_short), judge.name, output)
 
 
 def choose_trajectories(

@@ -21,7 +21,8 @@ from torch.nn import functional
 
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metrics import frames_to_unit
-from worldline_core.model.checkpoint import check_fit, fill, read_weights
+from worldline_core.model.checkpoint import check_fit, fill
+from worldline_core.model.weight_files import read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 

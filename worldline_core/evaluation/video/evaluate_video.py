@@ -29,7 +29,15 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, rows_of
-from worldline_core.evaluation.scores import SUMMARY_FILE, Score, kept_part, summarise, write_scores, write_table
+from worldline_core.evaluation.scores import (
+    SUMMARY_FILE,
+    Score,
+    kept_part,
+    part_file,
+    summarise,
+    write_scores,
+    write_table,
+)
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, SegmenterName, open_segmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
 from worldline_core.model.lpips import LPIPS, load_lpips
@@ -78,8 +86,8 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
 
     def measure(row: EpisodeRow) -> list[tuple[str, EpisodeRow, dict[str, Any]]]:
         name = row.episode_id
-        files = {method: parts / method / f"{name}.json" for method in rollouts if name in predicted[method]}
-        files[TRUE_METHOD] = parts / TRUE_METHOD / f"{name}.json"
+        files = {method: part_file(parts, method, name) for method in rollouts if name in predicted[method]}
+        files[TRUE_METHOD] = part_file(parts, TRUE_METHOD, name)
         made: dict[str, dict[str, Any]] = {}
         if not all(path.is_file() for path in files.values()):
             of_episode = {method: rollouts[method] for method in files if method != TRUE_METHOD}
@@ -146,6 +154,13 @@ def _write(
     write_by_frame(output / BY_FRAME_FILE, by_frame)
     options = {"comparisons": config.comparisons, "resamples": config.resamples, "seed": config.seed, "by_view": True}
     predicted = [score for score in scores if score.method != TRUE_METHOD]
+    found, kept = {row.episode_id for _, row, _ in records}, {score.episode_id for score in predicted}
+    if not kept:
+        raise DataError(
+            "No prediction could be measured", where=", ".join(sorted(found)[:5]),
+            expected=f"predictions of the views {', '.join(config.views)}",
+            next_step="evaluate_video.views names what is measured",
+        )  # fmt: skip
     accuracy = summarise([score for score in scores if score.method == TRUE_METHOD], **options)["metrics"]
     accuracy = {group: methods[TRUE_METHOD] for group, methods in accuracy.items()}
     summary = {
@@ -157,11 +172,18 @@ def _write(
             for suffix, s in segmenters.items()
         ],
         "units": {"psnr": "dB", "end_effector_error_px": "px"},
-        "num_episodes": len({row.episode_id for _, row, _ in records}),
+        "num_episodes": len(found),
         "interval": "95 % bootstrap over trajectories",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
-    return {"episodes": summary["num_episodes"], "methods": summary["methods"], "scores": len(scores)}
+    return {
+        "found": len(found),
+        "kept": len(kept),
+        "left_out": {"without a view that is measured": len(found - kept)},
+        "episodes": summary["num_episodes"],
+        "methods": summary["methods"],
+        "scores": len(scores),
+    }
 
 
 def write_by_frame(path: Path, videos: Sequence[tuple[str, str, str, str, Sequence[float | None]]]) -> None:
