@@ -186,27 +186,31 @@ def rolled(output: Path, history: History, batch: int) -> Rolled:
     return found
 
 
-def curve(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
-    """Error over copying of every group of blocks, with its 95 % interval over episodes: ``(3, groups)``."""
-    error, copy = (rearrange(values, "n (g s) -> s n g", s=GROUP).mean(axis=0) for values in (error, copy))
+def curve(error: np.ndarray, copy: np.ndarray, size: int = GROUP) -> np.ndarray:
+    """One error over another in every group of blocks, with its 95 % interval over episodes: ``(3, groups)``."""
+    error, copy = (rearrange(values, "n (g s) -> s n g", s=size).mean(axis=0) for values in (error, copy))
     draws = np.random.default_rng(0).integers(len(error), size=(2000, len(error)))
     ratios = error[draws].sum(axis=1) / copy[draws].sum(axis=1)
     return np.stack((error.sum(axis=0) / copy.sum(axis=0), *np.quantile(ratios, (0.025, 0.975), axis=0)))
 
 
-STYLE = """<style>text{font:11px sans-serif;fill:#333}.grid,line{stroke:#ddd}.axis{stroke:#888}polyline{fill:none;
-stroke-width:2}.c0{stroke:#1f6fb4}.c3{stroke:#c23b22}polygon{opacity:.18;stroke:none}polygon.c0{fill:#1f6fb4;stroke:none}
-polygon.c3{fill:#c23b22;stroke:none}</style>"""
+STYLE = """<style>text{font:11px sans-serif;fill:#333}.end{text-anchor:end}.middle{text-anchor:middle}.grid{stroke:#ddd}
+.axis{stroke:#888}.series *{fill:none;stroke-width:2}.series polygon{stroke:none;opacity:.2}.c0 *{stroke:#1f6fb4}
+.c3 *{stroke:#c23b22}.c0 polygon{fill:#1f6fb4}.c3 polygon{fill:#c23b22}</style><rect width="480" height="270" fill="#fff"/>
+<text x="264" y="268" class="middle">block of the rollout</text>
+<text x="68" y="22" style="fill:#1f6fb4">trained on the window</text>
+<text x="68" y="36" style="fill:#c23b22">trained on the full history</text>"""
 
 
 def measure(output: Path, batch: int, figure: Path | None) -> None:
     """Roll out both models, print their curves, and draw them."""
     series: list[Series] = []
     figures: dict[str, object] = {}
-    found: Rolled = {}
+    errors: list[np.ndarray] = []
     drawn: tuple[tuple[History, str, str], ...] = (("window", "c0", "window"), ("full_history", "c3", "full history"))
     for history, colour, label in drawn:
         found = rolled(output, history, batch)
+        errors.append(np.array(found["error"]))
         value, low, high = curve(np.array(found["error"]), np.array(found["copy"]))
         blocks = [GROUP * group + (GROUP + 1) / 2 for group in range(len(value))]
         series.append(Series(label, blocks, value.tolist(), low.tolist(), high.tolist(), colour))
@@ -217,7 +221,16 @@ def measure(output: Path, batch: int, figure: Path | None) -> None:
             "cache_bytes": sorted({size for sizes in found["cache_bytes"] for size in sizes}),
             **json.loads((output / history / "steps.json").read_text(encoding="utf-8")),
         }
-    figures["episodes"] = len(found["error"])
+    figures["window_over_full_history"] = {
+        f"blocks {first + 1} to {first + 16}": curve(
+            errors[0][:, first : first + 16], errors[1][:, first : first + 16], 16
+        )
+        .flatten()
+        .round(3)
+        .tolist()
+        for first in range(0, errors[0].shape[1] - 15, 16)
+    }
+    figures["episodes"] = len(errors[0])
     print(json.dumps(figures, indent=1))
     if figure is not None:
         chart = str(line_chart(series, title="", x_label="block of the rollout", y_label="squared error over copying"))
