@@ -42,6 +42,13 @@ def test_importing_the_core_does_not_import_torch(project_root: Path) -> None:
     assert result.stdout.strip() == "False"
 
 
+def test_recordings_are_curated_without_torch(project_root: Path) -> None:
+    """A process that only reads and writes episodes is spared a second and a half."""
+    code = "import sys; sys.modules['torch'] = None; import worldline_core.data.curation.curate, worldline_core.filters.filter_config"
+    result = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
 def test_unknown_preset_ends_with_a_clear_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["task", "curate", "--preset", "tinny"])

@@ -9,7 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldline_core.geometry.cameras import inside_image, project_points, valid_intrinsics
+from worldline_core.geometry.cameras import inside_image, project_points
+from worldline_core.geometry.tensor_transforms import valid_intrinsics
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
 K = np.array([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])

@@ -26,14 +26,8 @@ from worldline_core.geometry.rotations import (
     rotation_from_quaternion_xyzw,
     rotation_from_rot6d,
 )
-from worldline_core.geometry.transforms import (
-    invert,
-    is_rigid,
-    pose_from_quaternion_wxyz,
-    rigid_inverse,
-    rot6d_from_rotation,
-    transform_points,
-)
+from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
+from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, rigid_inverse
 
 K = np.array([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
 steady = settings(derandomize=True, deadline=None)

@@ -24,7 +24,7 @@ from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import invert, is_rigid
+from worldline_core.geometry.tensor_transforms import invert, is_rigid
 
 Controls = Literal["action", "state"]
 Fallback = Literal["recorded", "first_frame_mount"]

@@ -21,7 +21,7 @@ from torch.nn import functional
 from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.transforms import invert, transform_points
+from worldline_core.geometry.tensor_transforms import invert, transform_points
 
 NEAR_PLANE_M = 0.02
 TOUCH_MARGIN_CELLS = 0.6

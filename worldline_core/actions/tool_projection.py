@@ -25,8 +25,8 @@ from einops import rearrange
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, valid_intrinsics
-from worldline_core.geometry.transforms import is_rigid, rot6d_from_rotation
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image
+from worldline_core.geometry.tensor_transforms import is_rigid, rot6d_from_rotation, valid_intrinsics
 
 CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
 """What the numbers of `Projection.cause` mean; 0 is valid."""

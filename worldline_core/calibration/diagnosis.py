@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2, norm
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
@@ -225,7 +224,9 @@ class Residual:
     def deviations(self) -> float:
         """How many standard deviations of a single number are as unlikely as this estimate without an error."""
         distance = self.estimate @ np.linalg.solve(self.covariance, self.estimate)
-        return float(norm.isf(max(float(chi2.sf(distance, len(self.estimate))), 1e-300) / 2))
+        from scipy.special import chdtrc, ndtri  # scipy.stats takes a second to import, this a third
+
+        return 0.0 - float(ndtri(max(float(chdtrc(len(self.estimate), distance)), 1e-300) / 2))
 
 
 @dataclass(frozen=True)

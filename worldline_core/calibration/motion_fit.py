@@ -208,6 +208,8 @@ class WristView:
     ) -> None:
         """camera of n + 1 poses, gray (n + 1, h, w), motion of the n steps; hand (n + 1, p, 3), radii (p,) [m]."""
         self.camera = camera
+        self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        self._found: dict[bytes, Equations] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
         shows &= ~_covered(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
@@ -225,15 +227,19 @@ class WristView:
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
         """With one plane of inverse depth for each step, fitted as well."""
         del blur
+        if theta.tobytes() not in self._found:
+            self._found[theta.tobytes()] = self._equations(theta)
+        return self._found[theta.tobytes()]
+
+    def _equations(self, theta: np.ndarray) -> Equations:
         if len(self.step) < MIN_CELLS:
             return Equations(np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0)
         depth = np.full(len(self.step), DEPTH_START_PER_M)
         for _ in range(2):
-            error, by_depth, weight = self._errors(theta, depth)
+            error, by_depth, weight, _ = self._errors(theta, depth)
             fitted = self._per_step(by_depth, weight, error[..., None])[1]
             depth = np.clip(depth + (self.plane * fitted[self.step, :, 0]).sum(-1), 0.0, MOST_PER_M)
-        error, by_depth, weight = self._errors(theta, depth)
-        now = self._predicted(theta, depth)
+        error, by_depth, weight, now = self._errors(theta, depth)
         both = np.zeros((*self.flow.shape, PARAMETERS + 1))
         both[..., -1] = error
         for i in np.flatnonzero(_STEPS):
@@ -246,13 +252,14 @@ class WristView:
         found, likelihood = found / SAMPLE_CELLS_WRIST, likelihood / SAMPLE_CELLS_WRIST
         return Equations(found[:-1, :-1], found[:-1, -1], likelihood)
 
-    def _errors(self, theta: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Measured less predicted flow (m, 2), its slope by the plane of inverse depths (m, 2, 3), weights (m, 2, 2)."""
+    def _errors(self, theta: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Measured less predicted flow (m, 2), its slope by the plane of inverse depths (m, 2, 3), weights (m, 2, 2), and
+        the predicted flow (m, 2)."""
         now = self._predicted(theta, depth)
         slope = (self._predicted(theta, depth + 0.5) - now) / 0.5
         error = self.flow - now
         distance = np.einsum("mi,mij,mj->m", error, self.certainty, error)
-        return error, slope[..., None] * self.plane[:, None], self.certainty / (1 + distance)[:, None, None]
+        return error, slope[..., None] * self.plane[:, None], self.certainty / (1 + distance)[:, None, None], now
 
     def _per_step(self, by_depth: np.ndarray, weight: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of each step: projections (n, 3, l) of values (m, 2, l) on the plane of inverse depths, and that plane fitted."""
@@ -266,15 +273,22 @@ class WristView:
     def _predicted(self, theta: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """(m, 2) flow [px] at the inverse depths (m,) [1/m]."""
         camera = moved_camera(self.camera, theta)
-        poses = camera.T_base_camera
-        relative = rigid_inverse(poses[1:]) @ poses[:-1]
-        vectors = np.stack([cv2.Rodrigues(pose[:3, :3])[0][:, 0] for pose in relative])
-        turns = np.stack([cv2.Rodrigues(vector)[0] for vector in _delayed(vectors, float(theta[9]))])
-        places = _delayed(relative[:, :3, 3], float(theta[9]))
+        moves = theta[[0, 1, 2, 3, 4, 5, 9]].tobytes()  # the others change K alone
+        if moves not in self._steps:
+            self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[9]))
+        turns, places = self._steps[moves]
         rays = np.c_[self.uv, np.ones(len(self.uv))] @ np.linalg.inv(camera.K).T
         moved = (turns[self.step] @ rays[:, :, None])[..., 0] + depth[:, None] * places[self.step]
         seen = moved @ camera.K.T
         return seen[:, :2] / np.maximum(seen[:, 2:], 0.1) - self.uv
+
+
+def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.ndarray]:
+    """Turns (n, 3, 3) and moves (n, 3) [m] of a camera from each of its poses (n + 1, 4, 4) to the next, so late."""
+    relative = rigid_inverse(poses[1:]) @ poses[:-1]
+    vectors = np.stack([cv2.Rodrigues(pose[:3, :3])[0][:, 0] for pose in relative])
+    turns = np.stack([cv2.Rodrigues(vector)[0] for vector in _delayed(vectors, frames)])
+    return turns, _delayed(relative[:, :3, 3], frames)
 
 
 def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -28,8 +28,7 @@ from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
-from worldline_core.geometry.cameras import valid_intrinsics
-from worldline_core.geometry.transforms import is_rigid
+from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
 from worldline_core.model.lpips import LPIPS, load_lpips
 from worldline_core.model.video_tokenizer import VideoTokenizer
 

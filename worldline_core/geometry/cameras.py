@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from worldline_core.errors import CalibrationError, ConfigError, DataError
 from worldline_core.geometry.transforms import RotationRepair, repair_rotations, rigid_inverse
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MIN_DEPTH_M = 0.01
 """A point nearer to the camera plane than this counts as behind the camera."""
@@ -44,14 +44,6 @@ def inside_image[Array: (np.ndarray, Tensor)](uv: Array, image_size: tuple[int, 
     height, width = image_size
     u, v = uv[..., 0], uv[..., 1]
     return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
-
-
-def valid_intrinsics(K: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
-    """Finite, invertible, last row 0 0 1, positive focal lengths."""
-    last_row = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
-    finite = torch.isfinite(K).all(-1).all(-1)
-    upper = (K[..., 0, 0] > 1e-6) & (K[..., 1, 1] > 1e-6) & (K[..., 1, 0].abs() < 1e-6)
-    return finite & upper & ((K[..., 2, :] - last_row).abs() <= 1e-6).all(-1)
 
 
 CameraAxes = Literal["opencv", "opengl"]

@@ -19,7 +19,7 @@ from torch import Tensor
 from worldline_core.errors import ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment, read_description
 from worldline_core.geometry.kinematic_tree import TreeBody, mounted, read_mjcf, read_urdf
-from worldline_core.geometry.transforms import invert
+from worldline_core.geometry.tensor_transforms import invert
 
 if TYPE_CHECKING:  # imports a plotting library: seconds that most commands and processes need not wait
     from pytorch_kinematics.chain import Chain

@@ -4,7 +4,7 @@ The one place where a rotation is read or written in another form. Every name sa
 `_xyzw`; Euler angles (about x, y, z, radians) about *fixed* axes, R = Rz Ry Rx (URDF's roll pitch yaw), or about
 *moving* axes, R = Rx Ry Rz. Rot6D is a rotation as its first two columns (Zhou et al., CVPR 2019, "On the Continuity
 of Rotation Representations"), laid out as column x, then column y: `[R00, R10, R20, R01, R11, R21]`; it is computed
-with gradients in `transforms.rot6d_from_rotation`.
+with gradients in `tensor_transforms.rot6d_from_rotation`.
 
 The formulas are written out because scipy's `Rotation` rounds the last bit differently, which would change the digest
 of every track and curated pose; the tests hold each function against scipy.

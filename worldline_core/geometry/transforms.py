@@ -1,8 +1,7 @@
 """Rigid transforms as 4x4 matrices.
 
-`T_a_b` maps points given in frame b to frame a, so `T_a_c = T_a_b @ T_b_c`. The NumPy functions (float64) are what
-recordings are read and measured with; the torch functions at the end are differentiable, batched over leading axes,
-and keep dtype and device. Rotations in other forms: `rotations`.
+`T_a_b` maps points given in frame b to frame a, so `T_a_c = T_a_b @ T_b_c`. NumPy, float64: recordings are read and
+measured with these. With gradients: `tensor_transforms`. Rotations in other forms: `rotations`.
 """
 
 from __future__ import annotations
@@ -10,9 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.rotations import (
@@ -28,8 +24,6 @@ MAX_ROTATION_DEVIATION = 1e-3
 """A recorded rotation with R R^T further from the identity (largest entry) is refused, not repaired."""
 ROTATION_ROUNDING = 1e-6
 """Up to here a deviation is the rounding of float32 storage: left as it is, and not reported."""
-RIGID_TOLERANCE = 1e-4
-"""`is_rigid`: largest deviation of R R^T from the identity that still counts as a rotation."""
 
 
 def pose_from_rotation(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -122,33 +116,3 @@ def hand_eye_residual(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tup
     mount = mean_pose(T_tool_camera)
     apart = rigid_inverse(mount)[None] @ T_tool_camera
     return mount, np.linalg.norm(T_tool_camera[:, :3, 3] - mount[:3, 3], axis=1), rotation_angle_deg(apart[:, :3, :3])
-
-
-def invert(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """`rigid_inverse` of tensors."""
-    rotation = T[..., :3, :3].mT
-    top = torch.cat([rotation, -(rotation @ T[..., :3, 3:])], dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
-    return torch.cat([top, bottom], dim=-2)
-
-
-def transform_points(T: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
-    """Points of frame b in frame a; leading axes broadcast."""
-    return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
-
-
-def is_rigid(T: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Whether transforms are finite, orthonormal and right-handed, with last row 0 0 0 1."""
-    rotation = T[..., :3, :3]
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
-    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)
-    finite = torch.isfinite(T).all(-1).all(-1)
-    orthonormal = ((rotation @ rotation.mT - eye).abs() <= RIGID_TOLERANCE).all(-1).all(-1)
-    right_handed = (torch.linalg.det(torch.nan_to_num(rotation)) - 1).abs() <= 3 * RIGID_TOLERANCE
-    return finite & orthonormal & right_handed & ((T[..., 3, :] - last_row).abs() <= RIGID_TOLERANCE).all(-1)
-
-
-def rot6d_from_rotation(rotation: Float[Tensor, "*b 3 columns"]) -> Float[Tensor, "*b 6"]:
-    """Rot6D (see `rotations`): the first two columns, one after the other."""
-    return rotation[..., :2].mT.flatten(-2)
