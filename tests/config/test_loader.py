@@ -162,7 +162,7 @@ def test_a_preset_cannot_extend_one_that_does_not_exist(tmp_path: Path) -> None:
 
 
 def test_null_takes_away_what_the_file_has() -> None:
-    from worldline_core.pipeline.pipeline_config import PipelineConfig
+    from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 
     def load(*overrides: str) -> PipelineConfig:
         return load_config(PipelineConfig, preset="smoke", overrides=overrides)
@@ -171,7 +171,9 @@ def test_null_takes_away_what_the_file_has() -> None:
     name = next(iter(whole.rollouts))
     assert set(load(f"rollouts.{name}=null").rollouts) == set(whole.rollouts) - {name}
     assert load("train_stage2.relational=null").train_stage2.relational is None
-    assert load("evaluate_policy=null").evaluate_policy is None
+    unjudged = load("evaluate_policy=null")
+    assert unjudged.evaluate_policy is None
+    check_weights(unjudged, Path(__file__).resolve().parents[2])
     with pytest.raises(ConfigError, match=r"rollouts\.nobody"):
         load("rollouts.nobody=null")
     with pytest.raises(ConfigError, match=r"rolouts: unknown key; did you mean 'rollouts'"):

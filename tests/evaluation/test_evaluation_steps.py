@@ -122,6 +122,12 @@ def test_nothing_to_judge_is_an_error_that_says_why(recordings, tmp_path):
     }
 
 
+def test_nothing_to_measure_is_an_error_that_says_why(recordings, tmp_path):
+    without_views = VIDEO.model_copy(update={"views": ()})
+    with pytest.raises(DataError, match=r"No prediction could be measured"):
+        evaluate_video(without_views, recordings.inputs, tmp_path)
+
+
 def test_no_bank_large_enough_is_an_error(sealed, tmp_path):
     with pytest.raises(DataError, match=r"enough candidates[\s\S]*at least 32[\s\S]*up to 6"):
         evaluate_planning(PLANNING.model_copy(update={"budgets": (32,)}), sealed, tmp_path)

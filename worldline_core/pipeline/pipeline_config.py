@@ -118,9 +118,10 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
         "distill.lpips_weights": config.distill.lpips_weights,
         "evaluate_video.lpips_weights": config.evaluate_video.lpips_weights,
         "evaluate_video.sam3_weights": config.evaluate_video.sam3_weights,
-        "evaluate_policy.sam3_weights": config.evaluate_policy.sam3_weights,
-        "evaluate_policy.vlm.weights": config.evaluate_policy.vlm.weights,
     }
+    if config.evaluate_policy is not None:
+        named["evaluate_policy.sam3_weights"] = config.evaluate_policy.sam3_weights
+        named["evaluate_policy.vlm.weights"] = config.evaluate_policy.vlm.weights
     for key, path in named.items():
         if path is None:
             continue

@@ -27,7 +27,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import DataError, UnavailableError
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, rows_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
