@@ -1,11 +1,14 @@
 """How well the measured judge tells success from failure: in true videos, in these through a tokenizer, in predictions.
 
-    python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER | --rollouts FOLDER] [--segmenter FOLDER]
-        [--split train validation] [--limit 500]
+    python benchmarks/judge_recordings.py RECORDINGS [--tokenizer FOLDER | --rollouts FOLDER | --model FOLDER --level 0.75]
+        [--segmenter FOLDER] [--split train validation] [--every 3] [--limit 500]
 
 RECORDINGS is an EpisodeSet of `worldline record` (episodes, or banks with their sealed outcomes). By default the robot masks
 that the judge needs are the exact ones of the recording, so that nothing but the judge (and the tokenizer, or the
-prediction) is measured; with a segmenter, they are its masks of what is shown. Per task the area under the curve of the
+prediction) is measured; with a segmenter, they are its masks of what is shown. These are the upper rungs of the ladder of
+benchmarks/outcome_ladder.py: (d) true latents are `--tokenizer`; (e) true latents, noised to a level and denoised by a
+Stage II model under the recording's own controls, are `--model` with `--level` (and `--steps`); (f) samples are level 1, or
+`--rollouts`. Per task the area under the curve of the
 judge's score, the same within banks with its 95 % interval over banks, and the share of outcomes that its rules tell rightly.
 """
 
@@ -24,6 +27,9 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.outcome_ladder import IMAGE, area
+from worldline_core.actions.action_maps import latent_frame_indices
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.planning.selectors import planning_indices
 from worldline_core.evaluation.policy.evidence import establishes_success, route
@@ -31,10 +37,14 @@ from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts,
 from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import load_tokenizer
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.recorder.banks import SEALED_FILE
 from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.rollout.samplers import Noise, integrate, shifted_sigmas
+from worldline_core.rollout.worldline import WorldLine
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,35 @@ class KnownMasks:
 def shrunk(images: np.ndarray) -> np.ndarray:
     """Images (n, h, w, 3) at the model's resolution."""
     return np.stack([cv2.resize(image, IMAGE[::-1], interpolation=cv2.INTER_AREA) for image in images])
+
+
+class Denoiser:
+    """A Stage II model that restores true latents from noise of a level, knowing the first frame and the controls."""
+
+    def __init__(self, checkpoint: Path, level: float, steps: int, shift: float) -> None:
+        self.world = WorldLine.from_pretrained(checkpoint, expect_kind="stage2")
+        self.sigmas = [level * sigma for sigma in shifted_sigmas(steps, shift)]
+
+    @torch.no_grad()
+    def __call__(self, episode: Episode, frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Frames (n, h, w, 3) of each view, restored."""
+        world = self.world
+        kinematics = ArmKinematics(load_embodiment(str(episode.embodiment)))
+        tracks, _ = compute_tracks(episode, kinematics)
+        video = torch.stack([frames_to_video(frames[view], world.image_size) for view in world.views])
+        maps = world.action_maps([tracks], latent_frame_indices(video.shape[2]), start=0, views=world.views)
+        clean = world.tokenizer.encode(video)[None]
+        noise = Noise([42]).draw(clean.shape[1:])
+        first, level = clean[:, :, :, :1], self.sigmas[0]
+        state = torch.cat([first, ((1 - level) * clean + level * noise)[:, :, :, 1:]], dim=3)
+
+        def velocity(state: torch.Tensor, sigma: float) -> torch.Tensor:
+            return world.model(state, torch.tensor([sigma]), action_maps=maps, views=world.views).velocity
+
+        with torch.autocast("cpu", torch.bfloat16):
+            state = integrate(velocity, state, self.sigmas)
+            decoded = world.tokenizer.decode(state[0], video[:, :, 0])
+        return {view: video_to_frames(decoded[v]) for v, view in enumerate(world.views)}
 
 
 @torch.no_grad()
@@ -82,8 +121,13 @@ def main() -> None:
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--tokenizer", type=Path)
     parser.add_argument("--rollouts", type=Path)
+    parser.add_argument("--model", type=Path, help="a Stage II checkpoint")
+    parser.add_argument("--level", type=float, default=1.0, help="noise that the model starts from, 0..1")
+    parser.add_argument("--steps", type=int, default=1, help="Euler steps of the model")
+    parser.add_argument("--shift", type=float, default=5.0, help="of the model's noise levels towards noise")
     parser.add_argument("--segmenter", type=Path)
     parser.add_argument("--split", nargs="+", help="splits; all by default")
+    parser.add_argument("--every", type=int, default=1, help="only each so many-th recording")
     parser.add_argument("--limit", type=int)
     arguments = parser.parse_args()
     episodes = EpisodeSet.open(arguments.recordings)
@@ -94,8 +138,11 @@ def main() -> None:
     rollouts = None if arguments.rollouts is None else RolloutSet.open(arguments.rollouts)
     learned = None if arguments.segmenter is None else LearnedSegmenter.load(arguments.segmenter)
     tokenizer = None if arguments.tokenizer is None else load_tokenizer(arguments.tokenizer)
+    denoiser = None
+    if arguments.model is not None:
+        denoiser = Denoiser(arguments.model, arguments.level, arguments.steps, arguments.shift)
     judged: dict[str, list[tuple[float, bool, bool, str | None]]] = defaultdict(list)
-    for position in tqdm(episodes.select(split=arguments.split)[: arguments.limit], disable=None):
+    for position in tqdm(episodes.select(split=arguments.split)[:: arguments.every][: arguments.limit], disable=None):
         row = episodes.rows[position]
         outcome = outcomes.get(row.episode_id, row.outcome)
         if outcome == "unknown" or (rollouts is not None and row.episode_id not in rollouts.episode_ids):
@@ -107,6 +154,8 @@ def main() -> None:
             frames = {view: shrunk(episodes.frames(position, view)) for view in row.views}
         if tokenizer is not None:
             frames = {view: through(tokenizer, video) for view, video in frames.items()}
+        if denoiser is not None:
+            frames = denoiser(episodes.episode(position), frames)
         segmenter: Segmenter | None = learned
         if segmenter is None:
             masks = episodes.robot_masks(position, "head")

@@ -12,6 +12,9 @@ within each task, with a bootstrap interval over episodes:
     (c)  what the model is given: first frames of three views, and action maps on the latent grid at those frames
     (c4) the same with the maps of every frame
 
+The upper rungs (d) to (f), true latents, noised and restored latents, and samples, are told by the judge:
+benchmarks/judge_recordings.py.
+
 The colours that the instruction names are given to (c) as pictures of where they are, so that it need not learn to read.
 """
 
