@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
+from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
 from flows.rehearsal import add_rehearse_command
 from tasks.temporary_server import prepare_prefect
@@ -29,7 +30,10 @@ def build_parser() -> argparse.ArgumentParser:
     nightly.add_argument(
         "--accept", metavar="NAME", help="evaluate nothing: hold later nights against this one, though it became worse"
     )
-    for parser_with_config in (pipeline, nightly):
+    ablations = commands.add_parser("ablations", help="train and evaluate the paper's ablations, print their table")
+    ablations.add_argument("--variant", action="append", metavar="NAME", help="only this one and the full model")
+    ablations.set_defaults(run=_ablations)
+    for parser_with_config in (pipeline, nightly, ablations):
         _add_config_arguments(parser_with_config)
     task = commands.add_parser("task", help="run one step alone", formatter_class=argparse.RawDescriptionHelpFormatter)
     task.add_argument("step", choices=sorted(STEPS), metavar="STEP", help="one of: " + ", ".join(STEPS))
@@ -83,35 +87,12 @@ def build_parser() -> argparse.ArgumentParser:
     verify.set_defaults(run=_verify)
     add_exchange_commands(commands)
     add_rehearse_command(commands)
-    _add_embodiment(commands)
+    add_embodiment_commands(commands)
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
     doctor.add_argument("--json", action="store_true", help="print JSON")
     doctor.set_defaults(run=_doctor)
     return parser
-
-
-def _add_embodiment(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    embodiment = commands.add_parser("embodiment", help="list robots, show one, prove its kinematics")
-    actions = embodiment.add_subparsers(dest="embodiment_command", required=True, metavar="ACTION")
-    listing = actions.add_parser("list", help="all robots: arms, state size, whether the description is here, verified")
-    listing.set_defaults(run=_embodiment_list)
-    show = actions.add_parser("show", help="state columns, limits, grippers, tools and cameras of a robot")
-    show.set_defaults(run=_embodiment_show)
-    check = actions.add_parser(
-        "check",
-        help="compare forward kinematics with MuJoCo (extra: sim)",
-        description="Compare forward kinematics with MuJoCo at random joint positions within the limits. Exit status:"
-        " 0 all frames agree, 1 not (or nothing could be compared), 2 wrong usage.",
-    )
-    check.add_argument("--samples", type=int, default=1000, help="random joint positions (default: 1000)")
-    check.add_argument("--seed", type=int, default=0)
-    check.set_defaults(run=_embodiment_check)
-    for action in (show, check):
-        action.add_argument("name", metavar="NAME", help="a name of the list, or a YAML file")
-        action.add_argument("--description", type=Path, metavar="FILE", help="the kinematic description to use")
-    for action in (listing, check):
-        action.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -193,6 +174,16 @@ def _nightly(arguments: argparse.Namespace) -> None:
 
     values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
     print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
+
+
+def _ablations(arguments: argparse.Namespace) -> None:
+    preset = _checked_preset(arguments)
+    prepare_prefect(arguments.artifacts)
+    from flows.ablations import ablations
+
+    variants = None if arguments.variant is None else tuple(arguments.variant)
+    table = ablations(preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, variants)
+    print((Path(str(table.path)) / "table.md").read_text(), f"table: {table.path / 'index.html'}", sep="\n")
 
 
 def _task(arguments: argparse.Namespace) -> None:
@@ -280,40 +271,6 @@ def _calibrate_check(arguments: argparse.Namespace) -> None:
     raise SystemExit(0 if found.consistent else 1)
 
 
-def _embodiment_list(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment_listing import format_list, list_embodiments
-
-    rows = list_embodiments()
-    if arguments.json:
-        import json
-
-        print(json.dumps(rows, indent=1))
-    else:
-        print(format_list(rows))
-
-
-def _embodiment_show(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_listing import describe_embodiment
-
-    print(describe_embodiment(load_embodiment(arguments.name, arguments.description)))
-
-
-def _embodiment_check(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_check import check_as_json, check_embodiment, format_check
-
-    check = check_embodiment(load_embodiment(arguments.name, arguments.description), arguments.samples, arguments.seed)
-    if arguments.json:
-        import json
-
-        print(json.dumps(check_as_json(check), indent=1))
-    else:
-        print(format_check(check))
-    if not check.passed:
-        raise SystemExit(1)
-
-
 def _doctor(arguments: argparse.Namespace) -> None:
     from worldline_core.doctor import examine_machine, format_findings
 
@@ -339,7 +296,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = build_parser().parse_args(argv)
     if argv is None:
-        continues = arguments.run in (_pipeline, _nightly, _task, _record)
+        continues = arguments.run in (_pipeline, _nightly, _ablations, _task, _record)
         run_supervised(lambda: exit_with_clear_errors(lambda: arguments.run(arguments)), continues=continues)
     else:
         exit_with_clear_errors(lambda: arguments.run(arguments))

@@ -64,7 +64,7 @@ class PipelineConfig(StrictModel):
     filter: FilterConfig
     render_actions: RenderActionsConfig
     encode_latents: EncodeLatentsConfig
-    train_stage1: Stage1Config
+    train_stage1: Stage1Config | None = Field(description="null: Stage II starts from models.base")
     train_stage2: Stage2Config
     distill: DistillConfig
     rollouts: dict[str, RolloutRun]
@@ -86,6 +86,8 @@ class PipelineConfig(StrictModel):
             shipped = {"shipped_stage2": self.models.stage2, "shipped_causal": self.models.causal}
             if run.checkpoint in shipped and shipped[run.checkpoint] is None:
                 raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
+        if self.train_stage1 is None and self.models.base is None:
+            raise ValueError("train_stage1: without it Stage II starts from models.base, and there is none")
         return self
 
 

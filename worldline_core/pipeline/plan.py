@@ -56,13 +56,15 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
         return {"episodes": "filter", "latents": "encode_latents"}
 
     base: dict[str, str | Path] = {"base": models["base"]} if "base" in models else {}
-    yield Node("train_stage1", "train_stage1", config.train_stage1, {**clips(config.train_stage1), **base})
+    if config.train_stage1 is not None:
+        yield Node("train_stage1", "train_stage1", config.train_stage1, {**clips(config.train_stage1), **base})
+    start = models["base"] if config.train_stage1 is None else "train_stage1"
     teacher: dict[str, str | Path] = {"teacher": models["teacher"]} if "teacher" in models else {}
     yield Node(
         "train_stage2",
         "train_stage2",
         config.train_stage2,
-        {**clips(config.train_stage2), "tracks": "render_actions", "stage1": "train_stage1", **teacher},
+        {**clips(config.train_stage2), "tracks": "render_actions", "stage1": start, **teacher},
     )
     yield Node(
         "distill",
@@ -131,7 +133,8 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
         yield Node("evaluate_planning", "evaluate_planning", config.evaluate_planning, inputs)
         scores["evaluate_planning"] = "evaluate_planning"
     trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")
-    report: dict[str, str | Path] = {name: name for name in trained}
+    left_out = {"train_stage1"} if config.train_stage1 is None else set[str]()
+    report: dict[str, str | Path] = {name: name for name in trained if name not in left_out}
     report |= {f"rollout.{name}": f"rollout.{name}" for name in config.rollouts}
     report |= {f"models.{name}": path for name, path in models.items()}
     yield Node("report", "report", config.report, {**report, **scores})

@@ -274,6 +274,16 @@ _STEPS = (
         summary="bracket selection among candidate controls, success of the choice",
     ),
     Step(
+        "ablation_table",
+        1,
+        "worldline_core.report.ablation_table",
+        "ablation_table",
+        "AblationTableConfig",
+        ("evaluate_video.*",),
+        ("evaluate_planning.*",),
+        summary="the paper's ablations as one table beside the paper's numbers",
+    ),
+    Step(
         "report",
         10,
         "worldline_core.report.report",

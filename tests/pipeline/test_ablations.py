@@ -1,0 +1,181 @@
+"""The paper's ablations: what each variant changes, what all share, and the table beside the paper's numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from worldline_core.config import load_config
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.evaluation.scores import Score, summarise, write_scores
+from worldline_core.pipeline.ablations import ablation_plan, matched_steps, tokens_a_step
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import Node
+from worldline_core.pipeline.steps import STEPS
+from worldline_core.report.ablation_table import AblationTableConfig, ablation_table, load_variants
+from worldline_core.store.atomic import write_json_atomic
+
+VARIANTS = ("no_action_free", "head_only", "success_only", "native_film", "no_regularization")
+
+
+def load(changes: Sequence[str] = (), preset: str = "smoke") -> PipelineConfig:
+    return load_config(PipelineConfig, preset=preset, overrides=list(changes))
+
+
+@pytest.fixture(scope="module")
+def nodes(project_root: Path) -> dict[str, Node]:
+    return {node.name: node for node in ablation_plan(load, project_root)}
+
+
+def test_what_variants_share_is_one_node(nodes: dict[str, Node]) -> None:
+    assert [name for name in nodes if name.startswith("train_stage2")] == [
+        "train_stage2", *(f"train_stage2.{name}" for name in VARIANTS)
+    ]  # fmt: skip
+    shared = {"curate", "filter", "render_actions", "encode_latents", "train_stage1", "curate.banks"}
+    assert shared <= nodes.keys()
+    assert not [
+        name
+        for name in nodes
+        for one in shared
+        if name.startswith(f"{one}.") and name not in shared | {"render_actions.banks"}
+    ]
+    assert not any(name.startswith(("distill", "evaluate_policy", "report")) for name in nodes)
+    for node in nodes.values():
+        STEPS[node.step].check_inputs(node.inputs)
+        assert all(source in nodes for source in node.inputs.values() if isinstance(source, str))
+    assert set(nodes["ablation_table"].inputs) == {
+        f"{step}.{name}" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)
+    }
+
+
+def test_each_variant_changes_what_it_says_and_nothing_else(nodes: dict[str, Node]) -> None:
+    full = nodes["train_stage2"]
+
+    def changed(variant: str) -> dict[str, object]:
+        own, before = nodes[f"train_stage2.{variant}"].config.model_dump(), full.config.model_dump()
+        return {key: own.get(key) for key in own.keys() | before.keys() if own.get(key) != before.get(key)}
+
+    assert changed("success_only") == {"outcomes": ("success",)}
+    assert changed("native_film") == {"native_size": 32}
+    assert changed("no_regularization") == {"relational": None}
+    assert changed("head_only") == {"clips": {**full.config.model_dump()["clips"], "view_weights": {"head": 1.0}}}
+    assert set(changed("no_action_free")) == {"trainer"}
+    # 2 steps of Stage I on one view beside 2 steps of Stage II on three: two thirds of a step more.
+    assert changed("no_action_free")["trainer"]["steps"] == 3  # type: ignore[index]
+    base = nodes["train_stage2.no_action_free"].inputs["stage1"]
+    assert isinstance(base, Path)
+    assert base.name == "base"
+    assert all(nodes[f"train_stage2.{name}"].inputs["stage1"] == "train_stage1" for name in VARIANTS[1:])
+    assert nodes["rollout.stage2.head_only"].config.model_dump()["views"] == ("head",)
+    assert nodes["evaluate_video.head_only"].config.model_dump()["views"] == ("head",)
+    assert nodes["rollout.stage2.native_film"].config == nodes["rollout.stage2"].config
+
+
+def test_compute_is_matched_by_video_tokens() -> None:
+    mixed = load(["train_stage2.clips={lengths: [17, 33], view_weights: {joint: 1, head: 1}, single_view_factor: 2}",
+                  "train_stage1.trainer.steps=300", "train_stage2.trainer.steps=100"])  # fmt: skip
+    assert mixed.train_stage1 is not None
+    assert tokens_a_step(mixed.train_stage1, 3) == 2 * 9  # two clips of 9 latent frames
+    assert tokens_a_step(mixed.train_stage2, 3) == 2 * 7 * 2.5  # of 5 or 9; three views, or twice as many clips of one
+    assert matched_steps(mixed) == 100 + round(300 * 18 / 35)
+
+
+@pytest.mark.parametrize("preset", ["demo", "tiny", "cosmos3-nano"])
+def test_every_preset_has_ablations(preset: str, project_root: Path) -> None:
+    names = {node.name for node in ablation_plan(partial(load, preset=preset), project_root)}
+    assert {f"evaluate_video.{variant}" for variant in VARIANTS} <= names
+
+
+def test_mistakes_are_named(project_root: Path) -> None:
+    with pytest.raises(ConfigError, match=r"(?s)Unknown ablation.*no_regularization.*got.*no_actions"):
+        ablation_plan(load, project_root, ["no_actions"])
+    with pytest.raises(ConfigError, match="predicts nothing with its own"):
+        ablation_plan(lambda changes: load([*changes, "rollouts.stage2.checkpoint=causal"]), project_root)
+    with pytest.raises(ConfigError, match=r"train_stage1: without it Stage II starts from models\.base"):
+        load(["train_stage1=null", "models.base=null"])
+
+
+def test_the_paper_s_numbers_are_those_of_its_table(project_root: Path) -> None:
+    file = Path(os.environ.get("WORLDLINE_SHARED", project_root.parent / "shared")) / "paper" / "results.json"
+    if not file.is_file():
+        pytest.skip(f"the paper's tables are not here (looked in {file})")
+    table = json.loads(file.read_text())["ablations"]
+    names = {"full": "full", "no_action_free": "no_action_free", "head_only": "head_only",
+             "success_only": "success_only", "native_film": "native_film", "no_regularization": "no_regularization"}  # fmt: skip
+    columns = ("held_out_lpips", "held_out_robot_iou", "ood_lpips", "ood_robot_iou", "success_pi05", "success_lingbot")
+    for name, variant in load_variants().items():
+        assert [variant.paper.get(column) for column in columns] == table[names[name]], name
+        for policy, direct in (("pi05", 58.9), ("lingbot", 41.0)):  # gains are over direct execution
+            assert variant.paper[f"gain_{policy}"] == pytest.approx(variant.paper[f"success_{policy}"] - direct)
+
+
+def evaluation(folder: Path, values: dict[str, float], split: str = "test") -> Path:
+    scores = [Score("stage2", name, "arm", split, "head", 42, "robot_iou", value) for name, value in values.items()]
+    write_scores(folder, scores)
+    summary = {**summarise(scores, comparisons=None, resamples=200, seed=0), "methods": ["stage2"],
+               "unavailable": {"lpips": "no folder configured"}}  # fmt: skip
+    write_json_atomic(folder / "summary.json", summary)
+    return folder
+
+
+def test_the_table_shows_numbers_counts_intervals_and_reasons(tmp_path: Path) -> None:
+    variants = {name: load_variants()[name] for name in ("full", "head_only", "success_only")}
+    config = AblationTableConfig(variants=variants, resamples=200)
+    good = {"a": 0.6, "b": 0.8, "c": 0.7}
+    inputs = {
+        "evaluate_video.full": evaluation(tmp_path / "full", good),
+        "evaluate_video.head_only": evaluation(tmp_path / "head", {k: v - 0.1 for k, v in good.items()}),
+        "evaluate_video.success_only": evaluation(tmp_path / "success", {"a": 0.5}),
+    }
+    planning = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 4}
+    budget = {"success": planning, "gain": planning | {"mean": 0.25}, "banks": {"x": 1.0, "y": 0.5}}
+    write_json_atomic(
+        tmp_path / "plan/summary.json", {"methods": {"banks_stage2": {"budgets": {"8": {}, "32": budget}}}}
+    )
+    counts = ablation_table(config, inputs | {"evaluate_planning.full": tmp_path / "plan"}, tmp_path / "out")
+    assert (counts["cells"], counts["measured"]) == (18, 5)
+    rows = {(row["variant"], row["column"]): row for row in pq.read_table(tmp_path / "out/table.parquet").to_pylist()}
+    full, head = rows["full", "held_out_robot_iou"], rows["head_only", "held_out_robot_iou"]
+    assert (full["mean"], full["count"], full["paper"]) == (pytest.approx(0.7), 3, "0.5622")
+    assert full["low"] < full["mean"] < full["high"]
+    assert full["difference"] is None
+    assert [head[key] for key in ("difference", "difference_low", "difference_high")] == pytest.approx([-0.1] * 3)
+    assert rows["success_only", "held_out_robot_iou"]["difference"] == pytest.approx(-0.1)  # of the one in common
+    assert rows["full", "held_out_lpips"]["reason"] == "no folder configured"
+    assert rows["head_only", "held_out_lpips"]["reason"] == "does not compare with the other rows"
+    assert rows["full", "ood_robot_iou"]["reason"] == "no recordings of the split ood_test"
+    assert (rows["full", "success"]["mean"], rows["full", "success"]["paper"]) == (75.0, "78 / 62.4")
+    assert rows["head_only", "gain"]["reason"] == "this run plans over no banks"
+    text = (tmp_path / "out/table.md").read_text()
+    assert "| Full WorldLine | not measured (0.1804) | 0.700 [" in text
+    assert "n=3 (0.5622)" in text
+    page = (tmp_path / "out/index.html").read_text()
+    assert all(word in page for word in ("Success-only trajectories", "0.4348", "This run, less the full model"))
+    with pytest.raises(ArtifactError, match=r"(?s)not those of the variants.*evaluate_video\.head_only"):
+        ablation_table(config, {"evaluate_video.full": inputs["evaluate_video.full"]}, tmp_path / "few")
+
+
+@pytest.mark.slow
+def test_all_five_run_on_the_smallest_preset(project_root: Path, tmp_path: Path) -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "flows.command_line", "ablations", "--preset", "smoke", "--artifacts", tmp_path],
+        cwd=project_root, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert run.stdout.count("\n| ") == 1 + 1 + len(VARIANTS)
+    assert len(list((tmp_path / "train_stage2").glob("*/checkpoint.json"))) == 1 + len(VARIANTS)
+    assert len(list((tmp_path / "train_stage1").glob("*/checkpoint.json"))) == 1
+    (table,) = (tmp_path / "ablation_table").glob("*/table.parquet")
+    rows = {(row["variant"], row["column"]): row for row in pq.read_table(table).to_pylist()}
+    for variant in ("full", *VARIANTS):
+        assert rows[variant, "held_out_robot_iou"]["count"] == 2
+        assert rows[variant, "success"]["count"] == 1
+    assert rows["native_film", "held_out_robot_iou"]["difference"] is not None

@@ -1,0 +1,153 @@
+"""The paper's ablations as variants of one run (paper, "Ablation Studies" and appendix, "Ablation Protocol").
+
+A variant is a named set of changes to a run's configuration. The plan of all variants holds every node once: what a variant
+does not change (recordings, filters, Stage I) has the same key in the store, and is one node here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from worldline_core.config import validate
+from worldline_core.errors import ConfigError
+from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
+from worldline_core.pipeline.plan import Node, plan
+from worldline_core.report.ablation_table import AblationTableConfig, Variant, load_variants
+from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.training.stage import StageConfig
+
+FULL, METHOD = "full", "stage2"
+TABLE = "ablation_table"
+
+
+def ablation_plan(
+    load: Callable[[Sequence[str]], PipelineConfig], project: Path, names: Sequence[str] | None = None
+) -> list[Node]:
+    """The nodes of the full model's row and of those of ``names`` (default: all five), and the table at the end.
+
+    Args:
+        load: the run's configuration with some more ``a.b=value`` overrides.
+
+    Raises:
+        ConfigError: there is no such variant; or the run has no rollout of its Stage II model, or no base model.
+    """
+    variants = load_variants()
+    if unknown := sorted(set(names or ()) - set(variants)):
+        raise ConfigError("Unknown ablation", expected=f"some of {', '.join(variants)}", got=unknown)
+    chosen = [name for name in variants if name == FULL or names is None or name in names]
+    full = _with_rows(load([]))
+    nodes: list[Node] = []
+    known: dict[tuple[str, str, tuple[tuple[str, str | Path], ...]], str] = {}
+    results: dict[str, str | Path] = {}
+    for name in chosen:
+        renamed: dict[str, str] = {}
+        for node in _evaluated(plan(variant_config(load, full, variants[name]), project)):
+            inputs = {key: renamed.get(f"{s}", s) if isinstance(s, str) else s for key, s in node.inputs.items()}
+            content = (node.step, node.config.model_dump_json(), tuple(sorted(inputs.items(), key=str)))
+            if content not in known:
+                known[content] = node.name if name == FULL else f"{node.name}.{name}"
+                nodes.append(Node(known[content], node.step, node.config, inputs))
+            renamed[node.name] = known[content]
+        results |= {f"{step}.{name}": renamed[step] for step in EVALUATIONS if step in renamed}
+    rows = {name: variants[name] for name in chosen}
+    return [*nodes, Node(TABLE, TABLE, AblationTableConfig(method=METHOD, variants=rows), results)]
+
+
+EVALUATIONS = ("evaluate_video", "evaluate_planning")
+
+
+def variant_config(
+    load: Callable[[Sequence[str]], PipelineConfig], full: PipelineConfig, variant: Variant
+) -> PipelineConfig:
+    """The configuration of a variant of the run whose configuration, with the table's rollouts, is ``full``."""
+    changes = [change for change in variant.changes if _section(full, change) is not None]
+    if variant.matched_compute:
+        changes.append(f"train_stage2.trainer.steps={matched_steps(full)}")
+    rollouts = {
+        name: run.model_copy(update={"config": _changed(run.config, variant)}) for name, run in full.rollouts.items()
+    }
+    return load(changes).model_copy(update={"rollouts": rollouts})
+
+
+def matched_steps(config: PipelineConfig) -> int:
+    """Steps of a Stage II without a Stage I before it that cost what both stages of ``config`` do.
+
+    A step's cost is counted in video tokens, which the linear layers' FLOPs are proportional to. Attention over three views
+    costs more than that, so the variant gets no less than the full model: what it loses is not for want of compute.
+    """
+    stage1, stage2 = config.train_stage1, config.train_stage2
+    if stage1 is None:
+        return stage2.trainer.steps
+    views = len(stage1.model.views)
+    return stage2.trainer.steps + round(
+        stage1.trainer.steps * tokens_a_step(stage1, views) / tokens_a_step(stage2, views)
+    )
+
+
+def tokens_a_step(stage: StageConfig, views: int) -> float:
+    """Expected latent frames of one view that an optimiser step is trained on; all of a run have one size."""
+    clips = stage.clips
+    weights = clips.length_weights or (1.0,) * len(clips.lengths)
+    latent_frames = sum(w * (1 + (n - 1) // 4) for w, n in zip(weights, clips.lengths, strict=True)) / sum(weights)
+    drawn = clips.view_weights or {"joint": 1.0}
+    shown = {name: views if name == "joint" else clips.single_view_factor for name in drawn}
+    mean_views = sum(weight * shown[name] for name, weight in drawn.items()) / sum(drawn.values())
+    return stage.trainer.batch_size * stage.trainer.accumulation * latent_frames * mean_views
+
+
+def _with_rows(config: PipelineConfig) -> PipelineConfig:
+    """The run with the rollouts of the table's rows alone: its Stage II model on recordings, and on banks where it plans."""
+    runs = [run for run in config.rollouts.values() if run.checkpoint == METHOD and _true_actions(run)]
+    recordings = next((run for run in runs if run.episodes == "recordings"), None)
+    if recordings is None:
+        raise ConfigError(
+            "The ablations compare Stage II models, and this run predicts nothing with its own",
+            where="rollouts",
+            expected="a rollout with checkpoint: stage2 on the recordings",
+            got=list(config.rollouts),
+        )
+    rows = {METHOD: recordings}
+    on_banks = [run for run in config.rollouts.values() if run.episodes == "banks"]
+    if config.evaluate_planning is not None and on_banks:
+        banks = next((run for run in runs if run.episodes == "banks"), None)
+        rows[f"banks_{METHOD}"] = banks or RolloutRun(
+            checkpoint=METHOD,
+            episodes="banks",
+            config=_checked({**_values(recordings.config), **{k: getattr(on_banks[0].config, k) for k in _CHOICE}}),
+        )
+    return config.model_copy(update={"rollouts": rows})
+
+
+_CHOICE = ("splits", "banks", "embodiments", "max_episodes_per_embodiment", "num_frames", "batch_size")
+"""Which candidates, and how much of them: as another model's rollout of the banks has it."""
+
+
+def _true_actions(run: RolloutRun) -> bool:
+    return run.config.actions == "true"
+
+
+def _changed(config: RolloutConfig, variant: Variant) -> RolloutConfig:
+    return _checked({**_values(config), **variant.rollout}) if variant.rollout else config
+
+
+def _values(config: RolloutConfig) -> dict[str, object]:
+    return config.model_dump()
+
+
+def _checked(values: dict[str, object]) -> RolloutConfig:
+    return validate(RolloutConfig, values, where="a rollout of the ablations")
+
+
+def _section(config: PipelineConfig, change: str) -> object:
+    """The section that a change is of; None where the run has none."""
+    return getattr(config, change.partition(".")[0].partition("=")[0], None)
+
+
+def _evaluated(nodes: Sequence[Node]) -> list[Node]:
+    """The evaluations of the table, and what they need."""
+    needed: set[str] = set(EVALUATIONS)
+    for node in reversed(nodes):
+        if node.name in needed:
+            needed |= {source for source in node.inputs.values() if isinstance(source, str)}
+    return [node for node in nodes if node.name in needed]
