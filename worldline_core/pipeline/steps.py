@@ -244,6 +244,15 @@ _STEPS = (
         summary="predict videos from a first observation and controls",
     ),
     Step(
+        "import_rollouts",
+        1,
+        "worldline_core.rollout.import_rollouts",
+        "import_rollouts",
+        "ImportRolloutsConfig",
+        ("videos", "episodes"),
+        summary="any folder of predicted videos as a set of rollouts, every file accounted for",
+    ),
+    Step(
         "evaluate_video",
         2,
         "worldline_core.evaluation.video.evaluate_video",
