@@ -166,6 +166,43 @@ def test_a_model_with_film_is_driven_by_the_control_vectors_of_the_recording(
     assert len(set(seen)) == 3
 
 
+def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    """The paper's first rows: the pretrained backbone, and Stage I."""
+    models = inputs["checkpoint"].parent
+    config = RolloutConfig(
+        method="base", sampler="text_to_video", steps=2, num_frames=7, embodiments=("aloha_viperx",), bfloat16=False
+    )
+    base = inputs | {"checkpoint": models / "base"}
+    summary = rollout(config, base, tmp_path / "base")
+    assert (summary["checkpoint_kind"], summary["steps"], summary["frames"]) == ("base", 2, 3 * 5)
+    found = RolloutSet.open(tmp_path / "base")
+    assert set(found.views("b-1")) == set(VIEWS)
+    assert found.frames("b-1", "head").shape == (5, *SIZE, 3)
+    # A prediction does not depend on those beside it, but on its text and seed; controls reach nothing.
+    changes = {"alone": {"batch_size": 1}, "cut": {"text": {"max_length": 2}}, "seed": {"seeds": (7,)}}
+    frames = {}
+    for name, change in changes.items():
+        rollout(RolloutConfig.model_validate({**config.model_dump(), **change}), base, tmp_path / name)
+        frames[name] = RolloutSet.open(tmp_path / name).frames("b-1", "head").astype(int)
+    reference = found.frames("b-1", "head")
+    assert np.abs(frames["alone"] - reference).max() <= 2
+    assert np.abs(frames["cut"] - reference).max() > 2
+    assert np.abs(frames["seed"] - reference).max() > 2
+    for folder, message in (
+        ("stage2", "wrong kind"),
+        ("silent", "how this model reads text"),
+        ("foreign", "another tokenizer"),
+    ):
+        with pytest.raises((CheckpointError, ConfigError), match=message):
+            rollout(config, inputs | {"checkpoint": models / folder}, tmp_path / folder)
+    with pytest.raises(ValidationError, match="text_to_video takes none"):
+        RolloutConfig(sampler="text_to_video", actions="zero")
+    with pytest.raises(ValidationError, match="text needs the sampler text_to_video"):
+        RolloutConfig.model_validate({"text": {}})
+
+
 def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:
     model, info = load_checkpoint(inputs["checkpoint"])
     for name, value in (

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import cast
 
 from worldline_core.config import validate
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
 from worldline_core.pipeline.plan import Node, plan
 from worldline_core.report.ablation_table import AblationTableConfig, Variant, load_variants
-from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.training.stage import StageConfig
 
 FULL, METHOD = "full", "stage2"
 TABLE = "ablation_table"
+EVALUATIONS = ("evaluate_video", "evaluate_planning")
 
 
 def ablation_plan(
@@ -54,9 +56,6 @@ def ablation_plan(
     return [*nodes, Node(TABLE, TABLE, AblationTableConfig(method=METHOD, variants=rows), results)]
 
 
-EVALUATIONS = ("evaluate_video", "evaluate_planning")
-
-
 def variant_config(
     load: Callable[[Sequence[str]], PipelineConfig], full: PipelineConfig, variant: Variant
 ) -> PipelineConfig:
@@ -65,7 +64,8 @@ def variant_config(
     if variant.matched_compute:
         changes.append(f"train_stage2.trainer.steps={matched_steps(full)}")
     rollouts = {
-        name: run.model_copy(update={"config": _changed(run.config, variant)}) for name, run in full.rollouts.items()
+        name: run.model_copy(update={"config": _changed(_settings(run), variant)})
+        for name, run in full.rollouts.items()
     }
     return load(changes).model_copy(update={"rollouts": rollouts})
 
@@ -98,7 +98,7 @@ def tokens_a_step(stage: StageConfig, views: int) -> float:
 
 def _with_rows(config: PipelineConfig) -> PipelineConfig:
     """The run with the rollouts of the table's rows alone: its Stage II model on recordings, and on banks where it plans."""
-    runs = [run for run in config.rollouts.values() if run.checkpoint == METHOD and _true_actions(run)]
+    runs = [run for run in config.rollouts.values() if run.checkpoint == METHOD and _settings(run).actions == "true"]
     recordings = next((run for run in runs if run.episodes == "recordings"), None)
     if recordings is None:
         raise ConfigError(
@@ -108,13 +108,13 @@ def _with_rows(config: PipelineConfig) -> PipelineConfig:
             got=list(config.rollouts),
         )
     rows = {METHOD: recordings}
-    on_banks = [run for run in config.rollouts.values() if run.episodes == "banks"]
+    on_banks = [_settings(run) for run in config.rollouts.values() if run.episodes == "banks" and run.imported is None]
     if config.evaluate_planning is not None and on_banks:
         banks = next((run for run in runs if run.episodes == "banks"), None)
         rows[f"banks_{METHOD}"] = banks or RolloutRun(
             checkpoint=METHOD,
             episodes="banks",
-            config=_checked({**_values(recordings.config), **{k: getattr(on_banks[0].config, k) for k in _CHOICE}}),
+            config=_checked({**_settings(recordings).model_dump(), **{k: getattr(on_banks[0], k) for k in _CHOICE}}),
         )
     return config.model_copy(update={"rollouts": rows})
 
@@ -123,16 +123,12 @@ _CHOICE = ("splits", "banks", "embodiments", "max_episodes_per_embodiment", "num
 """Which candidates, and how much of them: as another model's rollout of the banks has it."""
 
 
-def _true_actions(run: RolloutRun) -> bool:
-    return run.config.actions == "true"
+def _settings(run: RolloutRun) -> RolloutConfig:
+    return cast("RolloutConfig", run.config)  # a run with a checkpoint has one
 
 
 def _changed(config: RolloutConfig, variant: Variant) -> RolloutConfig:
-    return _checked({**_values(config), **variant.rollout}) if variant.rollout else config
-
-
-def _values(config: RolloutConfig) -> dict[str, object]:
-    return config.model_dump()
+    return _checked({**config.model_dump(), **variant.rollout}) if variant.rollout else config
 
 
 def _checked(values: dict[str, object]) -> RolloutConfig:

@@ -6,7 +6,7 @@ The folders that curation reads, as inputs of its cache key: a changed recording
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -21,6 +21,7 @@ from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.cosmos3 import ImportBackboneConfig
 from worldline_core.report.report import ReportConfig
+from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
@@ -44,14 +45,22 @@ class ModelPaths(StrictModel):
 
 
 class RolloutRun(StrictModel):
-    """One named set of predicted videos."""
+    """One named set of predicted videos: of a model or a baseline (``config``), or ``imported`` from a folder ``videos``."""
 
-    checkpoint: Literal["stage2", "causal", "shipped_stage2", "shipped_causal"] | None = Field(
+    checkpoint: Literal["base", "stage1", "stage2", "causal", "shipped_stage2", "shipped_causal"] | None = Field(
         default=None,
         description="this run's checkpoints, or the long-trained ones; none for a baseline without a model",
     )
     episodes: Literal["recordings", "banks"] = "recordings"
-    config: RolloutConfig
+    config: RolloutConfig | None = None
+    videos: Path | None = Field(default=None, description="folder of another simulator's videos")
+    imported: ImportRolloutsConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_origin(self) -> Self:
+        if (self.config is None) == (self.imported is None) or (self.videos is None) != (self.imported is None):
+            raise ValueError("give either config, or videos and imported")
+        return self
 
 
 class PipelineConfig(StrictModel):
@@ -83,9 +92,15 @@ class PipelineConfig(StrictModel):
         for name, run in self.rollouts.items():
             if run.episodes == "banks" and self.curate_banks is None:
                 raise ValueError(f"rollouts.{name} needs curate_banks")
-            shipped = {"shipped_stage2": self.models.stage2, "shipped_causal": self.models.causal}
+            shipped = {
+                "shipped_stage2": self.models.stage2,
+                "shipped_causal": self.models.causal,
+                "base": self.models.base,
+            }
             if run.checkpoint in shipped and shipped[run.checkpoint] is None:
                 raise ValueError(f"rollouts.{name} needs models.{run.checkpoint.removeprefix('shipped_')}")
+            if run.checkpoint == "stage1" and self.train_stage1 is None:
+                raise ValueError(f"rollouts.{name} needs train_stage1")
         if self.train_stage1 is None and self.models.base is None:
             raise ValueError("train_stage1: without it Stage II starts from models.base, and there is none")
         return self

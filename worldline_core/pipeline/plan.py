@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError
@@ -82,16 +83,22 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
         yield Node("curate.banks", "curate", config.curate_banks, source_inputs(config.curate_banks, project))
         yield Node("render_actions.banks", "render_actions", config.render_actions, {"episodes": "curate.banks"})
     for name, run in config.rollouts.items():
-        yield _rollout_node(name, run, models)
+        yield _rollout_node(name, run, models, project)
     yield from _evaluation_nodes(config, models, project)
 
 
-def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path]) -> Node:
+def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path], project: Path) -> Node:
     banks = run.episodes == "banks"
+    if run.imported is not None and run.videos is not None:
+        episodes = "curate.banks" if banks else "filter"
+        videos = project_path(project, run.videos)
+        return Node(f"rollout.{name}", "import_rollouts", run.imported, {"episodes": episodes, "videos": videos})
     checkpoints: dict[str, str | Path] = {
+        "stage1": "train_stage1",
         "stage2": "train_stage2",
         "causal": "distill",
         **{f"shipped_{kind}": models[kind] for kind in ("stage2", "causal") if kind in models},
+        **{name: path for name, path in models.items() if name == "base"},
     }
     inputs: dict[str, str | Path] = {
         "episodes": "curate.banks" if banks else "filter",
@@ -100,7 +107,7 @@ def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path]) -> Nod
     }
     if run.checkpoint is not None:
         inputs["checkpoint"] = checkpoints[run.checkpoint]
-    return Node(f"rollout.{name}", "rollout", run.config, inputs)
+    return Node(f"rollout.{name}", "rollout", cast("StrictModel", run.config), inputs)
 
 
 def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], project: Path) -> Iterator[Node]:

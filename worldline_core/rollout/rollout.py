@@ -27,6 +27,7 @@ from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 from worldline_core.rollout.session import Frames, encode_images
 from worldline_core.rollout.speed import BatchTime, SpeedLog, device_name, long_rollout, timed
+from worldline_core.rollout.text_to_video import TextToVideo
 from worldline_core.rollout.worldline import WorldLine
 
 _COPIED_AT_ONCE = 64
@@ -68,6 +69,9 @@ class FirstFrameCopy:
             yield [{view: np.repeat(still, count, axis=0) for view, still in clip.items()} for clip in clips]
 
 
+World = WorldLine | TextToVideo | FirstFrameCopy
+
+
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Predict episodes of ``episodes`` with ``tracks``, ``tokenizer`` and, but for copying, ``checkpoint``.
 
@@ -94,8 +98,13 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     tracks = ActionTracks.open(Path(inputs["tracks"]))
     chosen = choose_episodes(config, episodes)
     rates = [float(episodes.rows[position].fps) for position in chosen]
-    copying = config.sampler == "copy_first_frame"
-    world = FirstFrameCopy(episodes) if copying else _load(config, inputs, rates)
+    world: World
+    if config.sampler == "copy_first_frame":
+        world = FirstFrameCopy(episodes)
+    elif config.sampler == "text_to_video":
+        world = TextToVideo(config, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
+    else:
+        world = _load(config, inputs, rates)
     if isinstance(world, WorldLine) and world.info.config.native_size is not None:
         tracks.episodes = episodes
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
@@ -141,14 +150,14 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         "episodes": len({item.position for item in planned}),
         "predictions": len(planned),
         "frames": sum(item.frames for item in planned),
-        "checkpoint_kind": world.info.kind if isinstance(world, WorldLine) else None,
+        "checkpoint_kind": None if isinstance(world, FirstFrameCopy) else world.info.kind,
         "steps": world.steps,
         "recent_blocks": None if world.causal is None else world.causal.recent_blocks,
         **_account(world, planned),
     }
 
 
-def _account(world: WorldLine | FirstFrameCopy, planned: Sequence[Prediction]) -> dict[str, Any]:
+def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:
     """What was not wholly predicted; nothing where all was."""
     lacking = Counter(view for item in planned for view in world.views if view not in item.views)
     cut = sum(item.sampled - item.frames for item in planned)
@@ -179,9 +188,7 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
     return world
 
 
-def _observed(
-    world: WorldLine | FirstFrameCopy, episodes: EpisodeSet, batch: Sequence[Prediction]
-) -> Float[Tensor, "b v 3 h w"]:
+def _observed(world: World, episodes: EpisodeSet, batch: Sequence[Prediction]) -> Float[Tensor, "b v 3 h w"]:
     """First frames of every view in [-1, 1]."""
     firsts = []
     for item in batch:
@@ -192,7 +199,7 @@ def _observed(
 
 def _predicted(
     config: RolloutConfig,
-    world: WorldLine | FirstFrameCopy,
+    world: World,
     episodes: EpisodeSet,
     tracks: ActionTracks,
     batch: Sequence[Prediction],

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.actions.action_maps import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
+from worldline_core.model.text import TextConfig
 
 Controls = Literal["true", "zero", "shuffled"]
 """Whose controls drive a prediction: the episode's own, none, or those of another episode."""
@@ -18,7 +19,7 @@ class RolloutConfig(StrictModel):
 
     method: str = Field(default="worldline", min_length=1)
     """Name the predictions carry in scores and reports."""
-    sampler: Literal["full_clip", "block_causal", "copy_first_frame"] = "block_causal"
+    sampler: Literal["full_clip", "block_causal", "text_to_video", "copy_first_frame"] = "block_causal"
     steps: int | None = Field(default=None, ge=1)
     """Euler steps; by default 35 for a whole clip, and per block those the causal model was trained with."""
     # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
@@ -49,6 +50,8 @@ class RolloutConfig(StrictModel):
     recent_blocks: int | None = Field(default=None, ge=0)
     """Window of the cache; by default the one that the causal model was trained with."""
     crf: int = Field(default=8, ge=0, le=51)
+    text: TextConfig | None = Field(default=None, exclude_if=lambda value: value is None)
+    """Text to video: how instructions become ids; by default as the checkpoint says that it was trained."""
     bfloat16: bool = True
     device: str = "cpu"
     timed_blocks: int = Field(default=0, ge=0)
@@ -60,8 +63,12 @@ class RolloutConfig(StrictModel):
             raise ValueError(f"seeds repeat: {self.seeds}")
         if self.timed_blocks and self.sampler != "block_causal":
             raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
-        if self.shift != 1.0 and self.sampler != "full_clip":
-            raise ValueError(f"shift needs the sampler full_clip, not {self.sampler}")
+        if self.shift != 1.0 and self.sampler not in ("full_clip", "text_to_video"):
+            raise ValueError(f"shift needs the sampler full_clip or text_to_video, not {self.sampler}")
+        if self.sampler == "text_to_video" and self.actions != "true":
+            raise ValueError(f"actions: text_to_video takes none, so {self.actions} ones have no meaning")
+        if self.sampler != "text_to_video" and self.text is not None:
+            raise ValueError(f"text needs the sampler text_to_video, not {self.sampler}")
         if self.clip_frames is not None and (self.sampler != "full_clip" or (self.clip_frames - 1) % TEMPORAL_FACTOR):
             raise ValueError(
                 f"clip_frames needs the sampler full_clip and 1 + a multiple of {TEMPORAL_FACTOR} frames, not "

@@ -1,0 +1,204 @@
+"""Folders of videos as sets of rollouts: names, indexes and tiles; every file accounted for; counts, rates and sizes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from pydantic import ValidationError
+
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.rollout.import_rollouts import ImportRolloutsConfig, import_rollouts
+from worldline_core.rollout.rollout_set import RolloutSet
+
+SIZE, N = (32, 48), 9
+EPISODES = ("robot_a-1", "robot_a-2")
+
+
+def recorded(episode: str, view: str) -> np.ndarray:
+    generator = np.random.default_rng([len(view), *episode.encode()])
+    frames = np.repeat(generator.integers(60, 190, (1, 4, 6, 3)).repeat(8, 1).repeat(8, 2), N, axis=0)
+    for frame in range(N):
+        frames[frame, 8:20, frame : frame + 10] = (220, 40, 40)
+    return frames.astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("import") / "episodes"
+    K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
+    joints = np.zeros((N, 14), np.float32)
+    with EpisodeSetWriter(root, fps=8, image_size=SIZE) as writer:
+        for name in (*EPISODES, "robot_train"):
+            episode = Episode(
+                episode_id=name, source="synthetic", embodiment="ur5e_pair", scene="s", task_family="lift",
+                instruction="lift", outcome="unknown", split="train" if "train" in name else "test", fps=8.0,
+                state=joints, action=joints, timestamps=np.arange(N) / 8.0,
+                cameras={view: CameraTrack(view, K, np.eye(4)[None], SIZE[1], SIZE[0]) for view in VIEWS},
+            )  # fmt: skip
+            writer.add(episode, {view: recorded(name, view) for view in VIEWS})
+    return root
+
+
+def encode(path: Path, frames: np.ndarray, fps: float = 8) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encode_video(path, frames, fps, crf=0, pixel_format="yuv444p")
+
+
+def close(found: np.ndarray, wanted: np.ndarray) -> bool:
+    return found.shape == wanted.shape and float(np.abs(found.astype(int) - wanted).mean()) < 2
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    """Predictions that are the recordings, of every view of both test episodes."""
+    for episode in EPISODES:
+        for view in VIEWS:
+            encode(tmp_path / "videos" / f"{episode}_{view}.mp4", recorded(episode, view))
+    return tmp_path / "videos"
+
+
+def run(videos: Path, episodes: Path, **config: object) -> tuple[RolloutSet, dict, list[dict]]:
+    output = videos.parent / "out"
+    counts = import_rollouts(
+        ImportRolloutsConfig.model_validate({"method": "theirs", **config}), {"videos": videos, "episodes": episodes}, output
+    )  # fmt: skip
+    return RolloutSet.open(output), counts, pq.read_table(output / "files.parquet").to_pylist()
+
+
+def test_named_files_become_a_set_of_the_same_bytes(videos: Path, episodes: Path) -> None:
+    found, counts, files = run(videos, episodes)
+    assert (found.method, found.fps, found.episode_ids) == ("theirs", 8.0, list(EPISODES))
+    assert set(found.views(EPISODES[0])) == set(VIEWS)
+    assert close(found.frames("robot_a-2", "left_wrist", 0), recorded("robot_a-2", "left_wrist"))
+    copied = found.root / found.rows[0].path
+    assert copied.read_bytes() == (videos / "robot_a-1_head.mp4").read_bytes()
+    assert counts["files"] == {"matched": 6}
+    assert counts["frames"] == 6 * N
+    assert counts["lowest_first_frame_psnr"] > 30
+    assert {(file["status"], file["view"]) for file in files} == {("matched", view) for view in VIEWS}
+
+
+def test_every_file_and_every_expected_video_is_accounted_for(videos: Path, episodes: Path) -> None:
+    (videos / "robot_a-1_head.mp4").rename(videos / "robot_a-9_head.mp4")
+    encode(videos / "robot_train_head.mp4", recorded("robot_train", "head"))
+    encode(videos / "sub" / "notes.mp4", recorded("robot_train", "head"))
+    (videos / "readme.txt").write_text("no video")
+    with pytest.raises(DataError, match=r"(?s)not those of the recordings.*'matched': 5.*'missing': 1") as refused:
+        run(videos, episodes)
+    for line in (
+        "unknown: robot_a-9_head.mp4 (no episode robot_a-9)",
+        "unknown: robot_train_head.mp4 (of the split train)",
+        "unknown: sub/notes.mp4 (its name does not fit)",
+        "missing: robot_a-1 head seed 0 (no file)",
+    ):
+        assert line in str(refused.value)
+    found, counts, files = run(videos, episodes, missing="report", unknown="report")
+    assert counts["files"] == {"matched": 5, "missing": 1, "unknown": 3}
+    assert found.views("robot_a-1") == ["left_wrist", "right_wrist"]
+    assert [file["episode_id"] for file in files if file["status"] == "missing"] == ["robot_a-1"]
+    with pytest.raises(DataError, match="not those of the recordings"):
+        run(videos, episodes, name="other_{episode}_{view}.mp4", missing="report", unknown="report")
+
+
+def test_counts_rates_and_sizes_are_compared_before_anything_is_written(videos: Path, episodes: Path) -> None:
+    frames = recorded("robot_a-1", "head")
+    encode(videos / "robot_a-1_head.mp4", frames, fps=16)
+    encode(videos / "robot_a-1_left_wrist.mp4", np.concatenate([frames, frames[:2]]))
+    encode(videos / "robot_a-2_head.mp4", frames.repeat(2, axis=1))
+    with pytest.raises(DataError, match=r"(?s)do not fit together.*got: 4 problems") as refused:
+        run(videos, episodes)
+    for line in (
+        "robot_a-1_head.mp4: 16 frames per second, the recording has 8",
+        "robot_a-1_left_wrist.mp4: 11 frames, the recording has 9",
+        "robot_a-2_head.mp4: pictures of (64, 48), the recording's are (32, 48)",
+        "robot_a-1, seed 0: views of [9, 11] frames",
+    ):
+        assert line in str(refused.value)
+    assert not (videos.parent / "out").exists()
+    found, _, _ = run(videos, episodes, fps=8, resize=True, num_frames=5)
+    assert {row.num_frames for row in found.rows} == {5}
+    assert close(found.frames("robot_a-2", "head"), frames[:5])
+    (videos / "robot_a-1_head.mp4").write_bytes((videos / "robot_a-2_left_wrist.mp4").read_bytes()[:400])
+    with pytest.raises(DataError, match="cannot be decoded"):
+        run(videos, episodes, fps=8, resize=True, num_frames=5)
+
+
+def test_templates_with_folders_seeds_and_other_names_of_views(videos: Path, episodes: Path) -> None:
+    folder = videos.parent / "theirs"
+    for episode in EPISODES:
+        for seed in (1, 2):
+            encode(folder / f"run7/{episode[8:]}/cam_high-{seed}.mp4", recorded(episode, "head"))
+    config = {"name": "*/{episode}/{view}-{seed}.mp4", "views": {"cam_high": "head"}, "episode_prefix": "robot_a-"}
+    with pytest.raises(DataError, match=r"unknown: run7/1/cam_high-1.mp4 \(no episode robot_a-1robot|no episode"):
+        run(folder, episodes, **{**config, "episode_prefix": "robot-"})
+    found, counts, _ = run(folder, episodes, **config)
+    assert counts["views"] == ["head"]
+    assert found.seeds("robot_a-1") == [1, 2]
+
+
+@pytest.mark.parametrize("form", ["csv", "json"])
+def test_an_index_lists_files_of_any_name(videos: Path, episodes: Path, form: str) -> None:
+    rows = []
+    for number, path in enumerate(sorted(videos.glob("*.mp4"))):
+        episode, _, view = path.stem.partition("_")[2].partition("_")
+        rows.append({"path": f"{number}.mp4", "episode": f"robot_{episode}", "view": view})
+        path.rename(videos / f"{number}.mp4")
+
+    def write(rows: list[dict[str, str]]) -> None:
+        lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
+        (videos / f"index.{form}").write_text("\n".join(lines) if form == "csv" else json.dumps(rows))
+
+    write(rows)
+    found, counts, _ = run(videos, episodes, index=f"index.{form}")
+    assert counts["files"] == {"matched": 6}
+    assert close(found.frames("robot_a-2", "right_wrist"), recorded("robot_a-2", "right_wrist"))
+    write([*rows[1:], rows[1]])
+    with pytest.raises(DataError, match="lists a file twice"):
+        run(videos, episodes, index=f"index.{form}")
+    write([*rows[1:], rows[0] | {"path": "9.mp4"}])
+    with pytest.raises(
+        DataError, match=r"(?s)unknown: 0\.mp4 \(not listed\).*missing: 9\.mp4 \(listed, but not there\)"
+    ):
+        run(videos, episodes, index=f"index.{form}")
+    write([{**row, "camera": "x"} for row in rows])
+    with pytest.raises(ConfigError, match="camera: unknown key"):
+        run(videos, episodes, index=f"index.{form}")
+    write([*rows[1:], rows[0] | {"path": "../secret.mp4"}])
+    with pytest.raises(DataError, match=r"\.\./secret"):
+        run(videos, episodes, index=f"index.{form}")
+
+
+def test_ctrl_world_s_pictures_of_two_rows_are_taken_apart(videos: Path, episodes: Path) -> None:
+    """As its replay script writes them: recorded views above, predicted ones below, three side by side, at 4 frames/s."""
+    folder = videos.parent / "synthetic_traj/Rollouts_replay/video"
+    for episode in EPISODES:
+        shown = [recorded(episode, view) for view in VIEWS]
+        predicted = [255 - frames for frames in shown]
+        picture = np.concatenate([np.concatenate(row, axis=2) for row in (shown, predicted)], axis=1)
+        encode(folder / f"time_20251103_101500_traj_{episode[8:]}_0_5_lift_the_cube.mp4", picture, fps=4)
+    config = {
+        "name": "Rollouts_replay/video/time_*_traj_{episode}_0_5_*.mp4", "episode_prefix": "robot_a-", "fps": 8,
+        "tiles": [[None, None, None], list(VIEWS)],
+    }  # fmt: skip
+    found, counts, _ = run(videos.parent / "synthetic_traj", episodes, **config)
+    assert counts["frames"] == 2 * 3 * N
+    assert close(found.frames("robot_a-1", "right_wrist"), 255 - recorded("robot_a-1", "right_wrist"))
+    assert counts["lowest_first_frame_psnr"] < 20  # the first frame is not the observed one: worth a look
+    with pytest.raises(DataError, match="do not divide into 5 x 3 tiles"):
+        run(videos.parent / "synthetic_traj", episodes, **config | {"tiles": [["head", None, None], *[[None] * 3] * 4]})
+
+
+def test_configurations_that_name_no_episode_or_no_view_are_refused() -> None:
+    for values in ({"name": "{view}.mp4"}, {"name": "{episode}.mp4"}, {"name": "{episode}_{view}_{camera}.mp4"}):
+        with pytest.raises(ValidationError, match="needed are"):
+            ImportRolloutsConfig.model_validate({"method": "m", **values})
+    for values in ({"views": {"top": "ceiling"}}, {"tiles": [["head", "head"]], "name": "{episode}.mp4"}):
+        with pytest.raises(ValidationError, match="each once"):
+            ImportRolloutsConfig.model_validate({"method": "m", **values})
