@@ -12,43 +12,13 @@ import argparse
 from pathlib import Path
 
 from worldline_core.actions.render_actions import RenderActionsConfig
-from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frame_decoder import decode_video
-from worldline_core.errors import DataError
 from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
 from worldline_core.pipeline.steps import run_step
-from worldline_core.rollout.rollout_set import RolloutSetWriter
+from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
-
-VIEWS = ("head", "left_wrist", "right_wrist")
-
-
-def import_videos(videos: Path, episodes: EpisodeSet, method: str, output: Path) -> tuple[int, tuple[str, ...]]:
-    """Write the videos as a RolloutSet; returns how many episodes they show, and the views that all of these have."""
-    fps = {row.fps for row in episodes.rows}
-    if len(fps) != 1:
-        raise DataError("The recordings have several rates", where=episodes.root, got=sorted(fps))
-    files = {
-        row.episode_id: [view for view in VIEWS if _file(videos, row.episode_id, view).is_file()]
-        for row in episodes.rows
-    }
-    shown = {episode: views for episode, views in files.items() if views}
-    views = tuple(view for view in VIEWS if shown and all(view in there for there in shown.values()))
-    if not views:
-        raise DataError(
-            "No view has a video of every episode", where=videos, expected="{episode}_{view}.mp4", got=shown
-        )
-    writer = RolloutSetWriter(output, method, fps.pop())
-    for episode in shown:
-        writer.add(episode, 0, {view: decode_video(_file(videos, episode, view)) for view in views})
-    writer.close()
-    return len(shown), views
-
-
-def _file(videos: Path, episode: str, view: str) -> Path:
-    return videos / f"{episode}_{view}.mp4"
 
 
 def main() -> None:
@@ -59,10 +29,13 @@ def main() -> None:
     parser.add_argument("--method", default="theirs", help="the name of the simulator in scores and reports")
     parser.add_argument("--artifacts", type=Path, default=Path("artifacts"))
     arguments = parser.parse_args()
-    episodes = EpisodeSet.open(arguments.episode_set)
-    imported = arguments.artifacts / "imported" / arguments.method
-    count, views = import_videos(arguments.videos, episodes, arguments.method, imported)
     store = ArtifactStore(arguments.artifacts)
+    config = ImportRolloutsConfig(method=arguments.method, missing="report")
+    imported = run_step(
+        store, "import_rollouts", config, {"videos": arguments.videos, "episodes": arguments.episode_set}
+    ).path
+    predicted = RolloutSet.open(imported)
+    count, views = len(predicted.episode_ids), sorted({row.view for row in predicted.rows})
     tracks = run_step(store, "render_actions", RenderActionsConfig(), {"episodes": arguments.episode_set})
     scores = run_step(
         store, "evaluate_video", VideoEvaluationConfig.model_validate({"views": views}),

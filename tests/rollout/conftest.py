@@ -101,6 +101,13 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     save_checkpoint(root / "causal", model, kind="causal", action_contract=contract, causal=SPEC)
     small = make_spec(recent_blocks=1, sigmas=(1.0, 0.5, 0.0))
     save_checkpoint(root / "small_blocks", model, kind="causal", action_contract=contract, causal=small)
+    torch.manual_seed(1)
+    both = WorldModel(config.model_copy(update={"towers": "both", "vocab_size": 300}))
+    torch.nn.init.normal_(both.proj_out.weight, std=0.2)
+    facts = {"tokenizer": tokenizer.encoder_digest[:16], "text": {"kind": "bytes", "max_length": 48, "path": None}}
+    save_checkpoint(root / "base", both, kind="base", action_contract=None, metadata=facts)
+    save_checkpoint(root / "silent", both, kind="base", action_contract=None)
+    save_checkpoint(root / "foreign", both, kind="base", action_contract=None, metadata=facts | {"tokenizer": "0123"})
     film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
     contract = contract.model_copy(update={"maps": NATIVE_VECTORS})
     model.config, model.action_encoder = film, new_action_branch(film)
