@@ -83,9 +83,12 @@ def test_blocks_computed_again_give_the_same_gradients(
 def test_compiled_blocks_give_the_same_gradients(
     make_small: Make, passing: Callable[[WorldModel], torch.Tensor]
 ) -> None:
+    # In tests every function is wrapped to check its shapes, and each wrapper counts as compiling the same one again.
+    torch._dynamo.reset()
     plain, _ = gradients(make_small(), passing)
     config = ShardingConfig(compile=True, checkpointing="block")
-    compiled, _ = gradients(place_model(make_small(), config, precision="fp32", device="cpu"), passing)
+    with torch._dynamo.config.patch(recompile_limit=100):
+        compiled, _ = gradients(place_model(make_small(), config, precision="fp32", device="cpu"), passing)
     assert plain.keys() == compiled.keys()
     for name, value in plain.items():
         torch.testing.assert_close(compiled[name], value, rtol=1e-4, atol=1e-6)
