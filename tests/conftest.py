@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import signal
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +16,7 @@ from typing import TYPE_CHECKING
 import jaxtyping
 import pytest
 
-from tools.runtime_shapes import checked
+from tools.runtime_shapes import check_shapes_of
 
 if TYPE_CHECKING:
     from worldline_core.model.contracts import ActionContract, CausalSpec
@@ -18,9 +24,7 @@ if TYPE_CHECKING:
 
 CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", "rollout")
 """Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
-jaxtyping.install_import_hook(
-    [f"worldline_core.{name}" for name in CHECKED_PACKAGES], f"{checked.__module__}.{checked.__name__}"
-)
+check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
@@ -45,6 +49,77 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the real samples are not here (looked in {folder})")
     return folder
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of this run, the same for all of its processes (pytest-xdist)."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@pytest.fixture(scope="session")
+def prefect_server(shared_folder: Path) -> Iterator[None]:
+    """One Prefect server for all tests that need one, in all processes: to start it takes ten seconds of a core.
+
+    It keeps what runs tell it; tests ask for the runs of their own flows. The last process that needs it stops it.
+    """
+    from prefect.events.worker import EventsWorker
+    from prefect.server.api.server import SubprocessASGIServer
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    # What sends task states is one for the process: another server's, where tests before this one had one.
+    EventsWorker.drain_all(timeout=10)
+    told, lock = shared_folder / "prefect_server.txt", shared_folder / "prefect_server.lock"
+    with lock.open("w") as users:
+        fcntl.flock(users, fcntl.LOCK_EX)
+        if not told.exists():
+            told.write_text(" ".join(map(str, _start_prefect_server(shared_folder))))
+        fcntl.flock(users, fcntl.LOCK_SH)
+        process, port = map(int, told.read_text().split())
+        server = SubprocessASGIServer(port)
+        server.running, server.server_process = True, subprocess.Popen(["true"])  # it wants a process to be there
+        with pytest.MonkeyPatch.context() as patch, temporary_settings({PREFECT_API_URL: server.api_url}):
+            # Threads have settings of their own: those of Prefect would start the server of runs that have none.
+            patch.setitem(SubprocessASGIServer._instances, None, server)
+            yield
+            EventsWorker.drain_all(timeout=10)
+        try:
+            fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        told.unlink()
+        os.kill(process, signal.SIGTERM)
+
+
+def _start_prefect_server(folder: Path) -> tuple[int, int]:
+    """Its process and its port, once it answers. Its database and its log lie in the folder."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    settings = {
+        "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{folder / 'prefect.db'}",
+        "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_UI_ENABLED": "false",
+        # A command that a test ran in this process has chosen a temporary server, which keeps no task runs.
+        "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_ENABLED": "true",
+        "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "true",
+    }
+    create = "from prefect.server.api.server import create_app; import uvicorn; uvicorn.run"
+    with (folder / "prefect_server.log").open("w") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"{create}(create_app(), port={port}, log_level='error')"],
+            env=os.environ | settings, stdout=log, stderr=log, start_new_session=True,
+        )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        with socket.socket() as asking:
+            if asking.connect_ex(("127.0.0.1", port)) == 0:  # it listens when it is ready
+                return process.pid, port
+        time.sleep(0.1)
+    process.kill()
+    raise RuntimeError(f"the Prefect server did not start:\n{(folder / 'prefect_server.log').read_text()}")
 
 
 @pytest.fixture(scope="session")

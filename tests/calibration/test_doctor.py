@@ -23,7 +23,7 @@ from worldline_core.geometry.kinematics import ArmKinematics
 CONFIG = CalibrationDoctorConfig()
 
 
-@pytest.mark.parametrize("number", [0, 2])
+@pytest.mark.parametrize("number", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_every_mistake_is_named(benchmark: ModuleType, healthy: list, number: int) -> None:
     item = healthy[number]
     names = []

@@ -138,6 +138,7 @@ def test_the_filter_says_which_camera_is_off(healthy: list) -> None:
     json.dumps(clean.numbers, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_two_degrees_are_found_in_twenty_episodes_and_healthy_ones_are_bounded(healthy: list, tmp_path: Path) -> None:
     clean = [quickly(item, item.joints) for item in healthy]
     assert len(clean) >= 20

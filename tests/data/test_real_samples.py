@@ -226,7 +226,7 @@ def test_wrist_views_that_are_enlarged_are_as_sharp_as_before(tmp_path: Path, sh
     }
     sharpness = {}
     for size in (None, (480, 640)):
-        config = CurateConfig.model_validate({"sources": [source], "image_size": size})
+        config = CurateConfig.model_validate({"sources": [source], "image_size": size, "video_preset": "ultrafast"})
         out = tmp_path / str(size)
         curate(config, {}, out / "set")
         sharpness[size] = EpisodeSet.open(out / "set").thumbnails(0, "right_wrist").sharpness

@@ -59,6 +59,7 @@ def still(recorder: EpisodeRecorder, layout: Layout) -> np.ndarray:
     return np.repeat(recorder._data.qpos[None].copy(), 8, axis=0)
 
 
+@pytest.mark.slow
 def test_every_task_succeeds_in_about_half_of_the_draws_and_fails_in_several_ways(recorder: EpisodeRecorder) -> None:
     found: dict[str, Counter[str]] = {task: Counter() for task in TASKS}
     for number in range(200):

@@ -13,17 +13,11 @@ sys.path.insert(0, str(Path(__file__).parent))  # workers import the jobs of the
 
 
 @pytest.fixture(scope="session")
-def prefect_server() -> Iterator[None]:
-    from prefect.testing.utilities import prefect_test_harness
-
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), *filter(None, [before])])
-    with prefect_test_harness(server_startup_timeout=120):
+def prefect_server(prefect_server: None) -> Iterator[None]:
+    """The server of all tests; processes that are started here can import the jobs of these tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
         yield
-    if before is None:
-        del os.environ["PYTHONPATH"]
-    else:
-        os.environ["PYTHONPATH"] = before
 
 
 @pytest.fixture(scope="session")

@@ -206,7 +206,7 @@ def test_a_set_can_be_opened_where_it_is(recordings: Path, store: ObjectStore) -
 
 REAL = {
     "agibot_gesim": ("agibot_gesim", {"kind": "agibot_gesim", "fps": 30.0}),
-    "droid": ("droid_ctrl_world", {"kind": "droid_annotation"}),
+    "droid": ("droid_ctrl_world", {"kind": "droid_annotation", "include": ["*-0001", "*-0002"]}),
 }
 
 

@@ -14,10 +14,16 @@ from number_work import NumberFileWork, NumberWork, attempts, do_numbers
 
 from tasks.shard_mapper import shard_mapper
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard, TakeOutcome, map_episodes
+from worldline_core.scale.mapping import (
+    RunnerConfig,
+    SerialMapper,
+    Shard,
+    TakeOutcome,
+    WorkerDiedError,
+    do_shard,
+    map_episodes,
+)
 from worldline_core.store.remote import UnreachableInputError
-
-pytestmark = pytest.mark.usefixtures("prefect_server")
 
 
 def run(folder: Path, values: Sequence[int], size: int, kind: str, **settings: Any) -> None:
@@ -44,6 +50,7 @@ SEVEN = "Squaring ended with ZeroDivisionError: seven"
 THIRTEEN = "Squaring this episode alone ended its process, twice"
 
 
+@pytest.mark.usefixtures("prefect_server")
 @pytest.mark.parametrize("kind", ["processes", *SLOW])
 def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kind: str) -> None:
     # Asked without importing: what Ray reads at its import is set by the mapper.
@@ -59,9 +66,26 @@ def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kin
     assert str(os.getpid()) not in processes(tmp_path)
 
 
+class ForkingMapper:
+    """Does each shard in a process of its own, forked: what kills one is seen, and costs no second to start."""
+
+    episodes_per_shard = 4
+
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+        for shard in shards:
+            if not (process := os.fork()):
+                status = 1
+                try:
+                    do_shard(shard)
+                    status = 0
+                finally:
+                    os._exit(status)
+            _, status = os.waitpid(process, 0)
+            take(shard, WorkerDiedError("A worker ended without an answer") if status else None)
+
+
 def test_a_shard_with_one_file_is_made_again_without_the_episode_that_kills(tmp_path: Path) -> None:
-    config = RunnerConfig.model_validate({"kind": "processes", "workers": 1, "retry_seconds": 0.1})
-    map_episodes(shard_mapper(config), NumberFileWork(tmp_path), [[8, 9], [12, 13, 14]])
+    map_episodes(ForkingMapper(), NumberFileWork(tmp_path), [[8, 9], [12, 13, 14]])
     assert (tmp_path / "shard-0.txt").read_text() == "8:kept 9:kept"
     assert (tmp_path / "shard-1.txt").read_text() == "12:kept 13:quarantined 14:kept"
     assert attempts(tmp_path, 13) == 2
@@ -75,10 +99,11 @@ def test_in_this_process_an_unforeseen_error_costs_one_episode(tmp_path: Path) -
     assert processes(tmp_path) == {str(os.getpid())}
 
 
+@pytest.mark.usefixtures("prefect_server")
 @pytest.mark.parametrize("kind", ["serial", "processes"])
 def test_an_unreachable_input_is_said_after_all_else_is_done(tmp_path: Path, kind: str) -> None:
     with pytest.raises(UnreachableInputError, match="1 of 3 shards could not read all of their inputs"):
-        run(tmp_path, [0, 1, 2, 3, 4, 6, 8, 9, 10], 3, kind)
+        run(tmp_path, [0, 1, 2, 3, 4, 6, 8, 9, 10], 3, kind, workers=1)
     assert results(tmp_path) == {value: value**2 for value in (0, 1, 2, 4, 6, 8, 9, 10)}
     assert attempts(tmp_path, 3) == 3
 
@@ -88,6 +113,7 @@ def test_few_episodes_stay_in_this_process(tmp_path: Path) -> None:
     assert processes(tmp_path) == {str(os.getpid())}
 
 
+@pytest.mark.usefixtures("prefect_server")
 def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path) -> None:
     """Ten shards wait as plain values; no more than `in_flight` are with the runner when one is answered."""
     begun_before_taken: list[int] = []

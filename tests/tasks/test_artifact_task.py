@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from prefect import flow
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.filters import TaskRunFilter
+from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from tasks.artifact_task import ArtifactReference, artifact_task
@@ -53,7 +53,9 @@ def _run(root: Path, first: str, second: str) -> tuple[ArtifactReference, Artifa
 
 def _last_states() -> dict[str, str]:
     with get_client(sync_client=True) as client:
-        runs = client.read_task_runs(task_run_filter=TaskRunFilter(), sort="EXPECTED_START_TIME_ASC")  # type: ignore[arg-type]
+        runs = client.read_task_runs(
+            flow_filter=FlowFilter(name=FlowFilterName(any_=["two-steps"])), sort="EXPECTED_START_TIME_ASC"
+        )  # type: ignore[arg-type]
     return {run.name: run.state.name for run in runs if run.state is not None}
 
 

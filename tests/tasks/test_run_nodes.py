@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from prefect import flow
 from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from tasks.artifact_task import ArtifactReference
@@ -87,7 +88,7 @@ def test_what_the_longest_work_waits_for_starts_first(project_root: Path) -> Non
 
 
 def run(store: Path, second: str = "b", watcher: Any = None) -> dict[str, ArtifactReference]:
-    @flow
+    @flow(name=store.parent.name)
     def some_nodes() -> dict[str, ArtifactReference]:
         return run_nodes(nodes(second), store, RunnerConfig(), watcher)
 
@@ -112,7 +113,7 @@ def test_prefect_shows_what_depends_on_what(storage: Path) -> None:
     deadline = time.monotonic() + 30
     with get_client(sync_client=True) as client:
         while time.monotonic() < deadline:  # task runs reach the server as events, later
-            found = client.read_task_runs(sort="EXPECTED_START_TIME_DESC", limit=2)  # type: ignore[arg-type]
+            found = client.read_task_runs(flow_filter=FlowFilter(name=FlowFilterName(any_=[storage.parent.name])))
             if {run.name for run in found} == {"write_first", "write_next.second"}:
                 break
             time.sleep(0.2)
@@ -146,11 +147,21 @@ def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:
     assert "write_first" in text
 
 
+FEW = """
+extends: smoke
+curate:
+  sources: [{kind: episode_set, path: artifacts/shipped/recordings, include: ["viperx_pearl-train-s1-0000[12]"]}]
+curate_banks:
+  sources: [{kind: episode_set, path: artifacts/shipped/banks, include: [bank_lift_viperx-000]}]
+"""
+
+
 def test_nodes_side_by_side_give_the_artifacts_of_one_process(
     prefect_server: None, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(project_root)
-    settings = load_config(PipelineConfig, preset="smoke")
+    (tmp_path / "few.yaml").write_text(FEW)
+    settings = load_config(PipelineConfig, path=tmp_path / "few.yaml")
     some = [node for node in plan(settings, project_root) if node.step in ("curate", "render_actions", "filter")]
 
     @flow

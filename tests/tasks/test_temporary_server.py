@@ -90,6 +90,7 @@ def test_a_server_that_is_killed_fails_no_run_whose_work_is_done(tmp_path: Path,
     assert (ended.returncode, ended.stdout.split()[-2:]) == (0, ["sum", "6"]), ended.stderr
 
 
+@pytest.mark.slow
 def test_a_short_run_on_a_busy_machine_ends_without_a_traceback(tmp_path: Path, project_root: Path) -> None:
     home, patches = tmp_path / "home", tmp_path / "patches"
     home.mkdir()
