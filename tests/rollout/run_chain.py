@@ -1,6 +1,6 @@
 """Rollout, video metrics and policy rules of one set of recordings, in a process of its own: prints its peak memory [MiB].
 
-    python -m tests.rollout.run_chain FOLDER CONFIG.json
+    python tests/rollout/run_chain.py FOLDER CONFIG.json
 
 CONFIG.json: {"rollout": ..., "inputs": {name: folder}, "segmenter": folder or null}.
 """
@@ -8,7 +8,6 @@ CONFIG.json: {"rollout": ..., "inputs": {name: folder}, "segmenter": folder or n
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from pathlib import Path
 
@@ -40,4 +39,6 @@ def run_chain(output: Path, given: dict) -> dict[str, dict]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     run_chain(Path(sys.argv[1]), json.loads(Path(sys.argv[2]).read_text()))
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    # Not ru_maxrss: a process begins with that of the one that started it.
+    (peak,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    print(int(peak.split()[1]) / 1024)
