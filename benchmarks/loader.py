@@ -32,10 +32,11 @@ import numpy as np
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.frame_decoder import torchcodec_fault
+from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import ClipReader
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import Clip, FrameInput
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import Clip
 from worldline_core.training.frame_source import FrameSource, frame_rows
 
 TICK = os.sysconf("SC_CLK_TCK")

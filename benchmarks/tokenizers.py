@@ -18,13 +18,8 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.tokenizers import WanTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.training.frame_source import RecordedView, load_views
-from worldline_core.training.train_tokenizer import (
-    TokenizerConfig,
-    clip_of,
-    reconstruction_metrics,
-    select_episodes,
-    video_batch,
-)
+from worldline_core.training.train_tokenizer import clip_of, reconstruction_metrics, select_episodes, video_batch
+from worldline_core.training.training_config import TokenizerConfig
 
 
 def small_wan(latent_channels: int = 32) -> WanTokenizer:

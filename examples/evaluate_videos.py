@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from worldline_core.actions.render_actions import RenderActionsConfig
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
+from worldline_core.actions.actions_config import RenderActionsConfig
+from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.pipeline.steps import run_step
 from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet

@@ -19,8 +19,8 @@ from worldline_core.pipeline.steps import run_step
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
-from worldline_core.training.latent_store import EncodeLatentsConfig
-from worldline_core.training.stage1 import Stage1Config
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.training_config import Stage1Config
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import worldline_core
 from worldline_core.config import load_config
 from worldline_core.errors import TrainingError
-from worldline_core.model.cosmos3 import ImportBackboneConfig
+from worldline_core.model.world_model_config import ImportBackboneConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.pipeline.plan import find_artifacts, plan, run_node
 from worldline_core.pipeline.steps import get_step, run_step

@@ -28,8 +28,9 @@ from safetensors.numpy import save
 from torch import Tensor
 from tqdm import tqdm
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR, latent_frame_indices, render_action_maps
+from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import collate_tracks
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.distillation.auxiliary_losses import clip_robot_masks

@@ -17,8 +17,8 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import TrainingError
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.flow_matching import SigmaSampling
 from worldline_core.training.trainer import ParameterGroup
+from worldline_core.training.training_config import SigmaSampling
 
 
 class Timed(StrictModel):

@@ -67,13 +67,11 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.patch_tokenizer import PatchTokenizer, Refinement, fit_patch_tokenizer
-from worldline_core.model.text import TextConfig, load_text_encoder
+from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.flow_matching import (
-    LossWeighting,
-    SigmaSampling,
     add_noise,
     flow_matching_loss,
     motion_weights,
@@ -84,6 +82,7 @@ from worldline_core.training.stage1 import stage1_groups
 from worldline_core.training.stage2 import stage2_groups
 from worldline_core.training.train_tokenizer import DecoderBatch, DecoderObjective, reconstruction_metrics, to_video
 from worldline_core.training.trainer import ParameterGroup, step_generator
+from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 VIEW_SHARES = (0.5, 0.25, 0.25)
 """Of steps or clips on single views: the head view counts as much as both wrist views."""

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.actions.overlays import ARM_COLOURS, OverlayStyle, draw_overlay
-from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import along_tool_z

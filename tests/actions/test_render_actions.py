@@ -12,8 +12,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter

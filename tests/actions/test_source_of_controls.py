@@ -20,8 +20,9 @@ h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
 from tests.mcap.conftest import declared, robot
 from tools.corrupted.one_of_each import write_one_of_each
 from worldline_core.actions.action_tracks import MissingActionsError, compute_tracks
+from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import along_tool_z

@@ -49,6 +49,19 @@ def test_recordings_are_curated_without_torch(project_root: Path) -> None:
     assert result.returncode == 0, result.stderr
 
 
+def test_recordings_and_configurations_are_read_without_torch(project_root: Path) -> None:
+    """A process that only curates, or only reads what it is told, is spared a second and a half."""
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "import worldline_core.data.curation.curate\n"
+        "from worldline_core.pipeline.pipeline_config import PipelineConfig\n"
+        "from worldline_core.pipeline.steps import STEPS\n"
+        "print(len({step.load_config() for step in STEPS.values()}) == len(STEPS))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout.strip()) == (0, "True"), result.stderr
+
+
 def test_unknown_preset_ends_with_a_clear_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["task", "curate", "--preset", "tinny"])
@@ -70,7 +83,7 @@ def test_unknown_override_ends_with_a_clear_error(capsys: pytest.CaptureFixture[
     ("mistake", "blocked", "message"),
     [
         (["--preset", "tinny"], ["prefect", "torch"], "did you mean 'tiny'"),
-        (["--set", "curate.image_sice=[64, 96]"], ["prefect"], "unknown key"),
+        (["--set", "train_stage2.trainer.stepz=1"], ["prefect", "torch"], "unknown key; did you mean 'steps'"),
     ],
 )
 def test_a_mistake_in_the_configuration_is_reported_before_prefect_starts(

@@ -256,7 +256,8 @@ def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
 
 def test_the_clip_sampler_follows_these_weights() -> None:
     """Drawn clips against the shares that the weights were made for."""
-    from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+    from worldline_core.training.clip_config import ClipSampling
+    from worldline_core.training.clip_sampler import ClipSampler
     from worldline_core.training.clip_source import ClipRow
 
     rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]

@@ -12,7 +12,8 @@ import av
 import numpy as np
 import pytest
 
-from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.actions_config import RenderActionsConfig
+from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import Episode
@@ -203,9 +204,11 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
     import torch
 
     from worldline_core.data.episodes.episode_set import EpisodeSetWriter
+    from worldline_core.training.clip_config import EncodeLatentsConfig
     from worldline_core.training.clip_source import training_rows
-    from worldline_core.training.latent_store import EncodeLatentsConfig, LatentStore, encode_latents
-    from worldline_core.training.stage1 import Stage1Config, train_stage1
+    from worldline_core.training.latent_store import LatentStore, encode_latents
+    from worldline_core.training.stage1 import train_stage1
+    from worldline_core.training.training_config import Stage1Config
 
     torch.set_num_threads(1)
     root, robot = tmp_path / "raw", tmp_path / "robot"

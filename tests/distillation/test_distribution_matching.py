@@ -17,7 +17,7 @@ from worldline_core.distillation.distribution_matching import (
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise
-from worldline_core.training.flow_matching import LossWeighting
+from worldline_core.training.training_config import LossWeighting
 
 
 def gaussian_score(mean: torch.Tensor):

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from worldline_core.distillation.auxiliary_losses import (
-    AuxiliaryWeights,
     auxiliary_losses,
     boundary_loss,
     robot_motion_loss,
     robot_reconstruction_loss,
     view_weights,
 )
+from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.errors import ConfigError
 
 VIEWS = ("head", "left_wrist", "right_wrist")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
 from worldline_core.distillation.causal_objective import block_sigmas, frame_sigmas
 from worldline_core.distillation.causal_teacher_forcing import teacher_forcing_loss
-from worldline_core.distillation.distill_config import TrajectoryRegressionConfig
+from worldline_core.distillation.distill_config import AuxiliaryWeights, TrajectoryRegressionConfig
 from worldline_core.distillation.trajectory_regression import draw_nodes, trajectory_regression_loss
 from worldline_core.model.contracts import CAUSAL_SIGMAS as NODES
-from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
+from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 class StraightStudent:

@@ -8,15 +8,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.evaluation.planning import evaluate_planning as outcomes
-from worldline_core.evaluation.planning.evaluate_planning import (
-    CHOICES_FILE,
-    SEALED_FILE,
-    PlanningConfig,
-    evaluate_planning,
-)
-from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig, evaluate_policy
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig, evaluate_video
+from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
+from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)

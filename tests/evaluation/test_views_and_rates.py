@@ -6,10 +6,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig, evaluate_policy
+from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
 from worldline_core.evaluation.recordings import VideoFrames
 from worldline_core.evaluation.video import episode_measurement
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig, evaluate_video
+from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)

@@ -17,7 +17,8 @@ from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer,
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.frame_source import RecordedView
-from worldline_core.training.train_tokenizer import TokenizerConfig, decoder_batch, disturb, train_decoder
+from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder
+from worldline_core.training.training_config import TokenizerConfig
 
 
 def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:

@@ -17,9 +17,8 @@ import pytest
 from tasks.command_line import exit_with_clear_errors
 from tests.evaluation.conftest import _write as write_world
 from worldline_core.config import StrictModel
-from worldline_core.evaluation.planning.evaluate_planning import SEALED_FILE, PlanningConfig
-from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
+from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.planning.evaluate_planning import SEALED_FILE
 from worldline_core.pipeline.steps import run_step
 from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig

@@ -19,7 +19,7 @@ from worldline_core.calibration.diagnosis import CalibrationCheck, Finding
 from worldline_core.config import ConfigError, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import DataError
-from worldline_core.evaluation.vlm_models import VLMConfig
+from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.pages.page import Table, environment, markdown, render
 from worldline_core.pictures.labels import fit_text, text_width_px
 from worldline_core.report.dataset_card import markdown_table, plain

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import torch
 
-from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig, evaluate_policy
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig, evaluate_video
+from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
+from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 

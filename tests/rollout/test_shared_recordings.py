@@ -19,7 +19,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.rollout.run_chain import run_chain
-from worldline_core.actions.render_actions import RenderActionsConfig, render_actions
+from worldline_core.actions.actions_config import RenderActionsConfig
+from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode

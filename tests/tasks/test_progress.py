@@ -19,7 +19,8 @@ from torch import nn
 
 from worldline_core import progress
 from worldline_core.progress import Progress, with_progress
-from worldline_core.training.trainer import Objective, ParameterGroup, TrainerConfig, train
+from worldline_core.training.trainer import Objective, ParameterGroup, train
+from worldline_core.training.training_config import TrainerConfig
 
 
 @dataclass

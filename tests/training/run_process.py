@@ -20,8 +20,9 @@ from safetensors.torch import save_file
 from worldline_core.training import trainer
 from worldline_core.training.sharding import gathered
 from worldline_core.training.stage import Stage
-from worldline_core.training.stage1 import Stage1Config, train_stage1
-from worldline_core.training.stage2 import Stage2Config, train_stage2
+from worldline_core.training.stage1 import train_stage1
+from worldline_core.training.stage2 import train_stage2
+from worldline_core.training.training_config import Stage1Config, Stage2Config
 
 STEPS = {"train_stage1": (Stage1Config, train_stage1), "train_stage2": (Stage2Config, train_stage2)}
 RANK = int(os.environ.get("RANK", "0"))

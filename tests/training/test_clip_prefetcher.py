@@ -17,10 +17,11 @@ import pytest
 import torch
 
 from worldline_core.errors import DataError, TrainingError
+from worldline_core.training.clip_config import ClipSampling, ReadingConfig
 from worldline_core.training.clip_loader import ClipReader
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import Clip, ReadingConfig
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import Clip
 from worldline_core.training.latent_store import LatentStore
 
 VIEWS = ("head", "left_wrist", "right_wrist")

@@ -8,10 +8,11 @@ import pytest
 from pydantic import ValidationError
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_config import ClipSampling
+from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.processes import BatchPlan
-from worldline_core.training.stage1 import Stage1Config
+from worldline_core.training.training_config import Stage1Config
 
 
 @pytest.fixture

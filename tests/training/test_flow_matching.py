@@ -11,13 +11,12 @@ from worldline_core.model.world_model_config import VIEWS
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import (
     FlowMatchingObjective,
-    LossWeighting,
-    SigmaSampling,
     add_noise,
     flow_matching_loss,
     sample_sigmas,
     velocity_target,
 )
+from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 def test_clips_are_placed_in_time_by_their_own_rates(

@@ -13,11 +13,18 @@ import torch
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
 from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.training.clip_config import (
+    ClipSampling,
+    EncodeLatentsConfig,
+    FrameInput,
+    LatentInput,
+    ReadingConfig,
+)
 from worldline_core.training.clip_loader import ClipLoader, ClipReader, SkipLog
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
-from worldline_core.training.clip_source import Clip, ClipBatch, FrameInput, LatentInput, ReadingConfig, training_rows
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import Clip, ClipBatch, training_rows
 from worldline_core.training.frame_source import FrameSource, frame_rows
-from worldline_core.training.latent_store import EncodeLatentsConfig, LatentStore, encode_latents
+from worldline_core.training.latent_store import LatentStore, encode_latents
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 

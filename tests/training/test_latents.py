@@ -9,14 +9,9 @@ from einops import rearrange
 from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_source import latent_frame_count, longest_clip
-from worldline_core.training.latent_store import (
-    EncodeLatentsConfig,
-    LatentRow,
-    LatentStore,
-    choose_layout,
-    encode_episode,
-)
+from worldline_core.training.latent_store import LatentRow, LatentStore, choose_layout, encode_episode
 
 
 class Memoryless:

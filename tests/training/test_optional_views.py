@@ -25,12 +25,14 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import Clip, ClipBatch, ClipRow
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.latent_store import EncodeLatentsConfig, LatentStore, encode_latents
-from worldline_core.training.stage2 import Stage2Config, train_stage2
+from worldline_core.training.latent_store import LatentStore, encode_latents
+from worldline_core.training.stage2 import train_stage2
+from worldline_core.training.training_config import Stage2Config
 
 HEAD, RIGHT = ("head",), ("head", "right_wrist")
 OPTIONAL = ("left_wrist", "right_wrist")

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from worldline_core.training.relational import (
-    RelationalConfig,
     RelationalScales,
     Relations,
     common_shape,
@@ -12,6 +11,7 @@ from worldline_core.training.relational import (
     relational_losses,
     relations,
 )
+from worldline_core.training.training_config import RelationalConfig
 
 
 def features(seed: int, size: int = 6, requires_grad: bool = False) -> torch.Tensor:

@@ -18,10 +18,12 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import trainer as trainer_module
-from worldline_core.training.latent_store import EncodeLatentsConfig, encode_latents
-from worldline_core.training.stage1 import Stage1Config, train_stage1
-from worldline_core.training.stage2 import Stage2Config, train_stage2
-from worldline_core.training.train_teacher import TeacherConfig, train_teacher
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.latent_store import encode_latents
+from worldline_core.training.stage1 import train_stage1
+from worldline_core.training.stage2 import train_stage2
+from worldline_core.training.train_teacher import train_teacher
+from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
 
 TRAINER = {
     "steps": 4,

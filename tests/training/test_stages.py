@@ -21,9 +21,10 @@ from worldline_core.training import stage as stage_module
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_source import training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.stage1 import Stage1Config, stage1_groups, train_stage1
-from worldline_core.training.stage2 import Stage2Config, stage2_groups, train_stage2
-from worldline_core.training.train_teacher import TeacherConfig, train_teacher
+from worldline_core.training.stage1 import stage1_groups, train_stage1
+from worldline_core.training.stage2 import stage2_groups, train_stage2
+from worldline_core.training.train_teacher import train_teacher
+from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
 
 MakeConfig = Callable[..., WorldModelConfig]
 
@@ -311,7 +312,8 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
     from worldline_core.training.clip_source import Clip
-    from worldline_core.training.relational import RelationalConfig, TeacherRelations, relations
+    from worldline_core.training.relational import TeacherRelations, relations
+    from worldline_core.training.training_config import RelationalConfig
     from worldline_core.training.video_teacher import load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())

@@ -12,7 +12,8 @@ import torch
 from worldline_core.errors import ArtifactError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.pipeline.steps import get_step
-from worldline_core.training.train_tokenizer import TokenizerConfig, train_tokenizer
+from worldline_core.training.train_tokenizer import train_tokenizer
+from worldline_core.training.training_config import TokenizerConfig
 
 CONFIG = TokenizerConfig(
     image_size=(32, 32),

@@ -23,7 +23,8 @@ from worldline_core.errors import ArtifactError, ConfigError, StoppedError, Trai
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training import processes
 from worldline_core.training.processes import BatchPlan
-from worldline_core.training.trainer import Objective, ParameterGroup, TrainerConfig, TrainingResult, train
+from worldline_core.training.trainer import Objective, ParameterGroup, TrainingResult, train
+from worldline_core.training.training_config import TrainerConfig
 from worldline_core.training.training_state import identity_digests, newest_state
 
 STATES = Path("run") / "training_state"

@@ -21,14 +21,12 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
+from worldline_core.actions.actions_config import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import TrackBatch
 from worldline_core.errors import ConfigError
 
 NUM_CHANNELS = 9
 CHANNELS = ("h", "d", "r1", "r2", "r3", "r4", "r5", "r6", "g")
-SIGMA_PX_REFERENCE = 10.0
-REFERENCE_CANVAS = (384, 512)
-TEMPORAL_FACTOR = 4
 
 
 def latent_frame_indices(num_frames: int, temporal_factor: int = TEMPORAL_FACTOR) -> list[int]:

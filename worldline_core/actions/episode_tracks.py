@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +27,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
+from worldline_core.actions.actions_config import WristProjection
 from worldline_core.actions.tool_projection import project_tools
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -34,7 +35,6 @@ from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.artifact_files import how_to_rebuild
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 
-WristProjection = Literal["current_camera", "clip_start_camera"]
 HEAD_VIEW = "head"
 INDEX_FILE, DESCRIPTION_FILE = "index.parquet", "tracks.json"
 SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")

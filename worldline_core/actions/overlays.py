@@ -23,7 +23,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worldline_core.actions.action_maps import REFERENCE_CANVAS, SIGMA_PX_REFERENCE, grid_sigma
+from worldline_core.actions.action_maps import grid_sigma
+from worldline_core.actions.actions_config import REFERENCE_CANVAS, SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.errors import DataError

@@ -10,12 +10,10 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import batched
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-from pydantic import Field
-
-from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import MissingActionsError, compute_tracks
+from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import (
     ARRAYS,
     ActionTracks,
@@ -27,7 +25,6 @@ from worldline_core.actions.episode_tracks import (
 from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -39,31 +36,6 @@ from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_transient
-
-
-class RenderActionsConfig(StrictModel):
-    """What is projected, and how much is drawn.
-
-    Attributes:
-        source: `action` projects the commands (what a simulator is driven by) through kinematics, and refuses an episode
-            without commands; `state` the measured joints, or the recorded tool poses where there are any.
-        without_mount: what wrist cameras without a known mount follow.
-        description_paths: by embodiment, a kinematic description that is the user's own file.
-        preview_height: of one view in the previews, pixels; small frames are enlarged by a whole factor up to it.
-        sigma_px_ref: width of the Gaussian, pixels on the 384 x 512 reference canvas: in the previews, and in the
-            action maps of every model that is trained on these tracks. Coarse latent grids need more than the paper's
-            10, or a point between two cells vanishes.
-    """
-
-    source: Literal["action", "state"] = "action"
-    without_mount: Literal["recorded", "first_frame_mount"] = "recorded"
-    description_paths: dict[str, str] = Field(default_factory=dict)
-    previews: int = Field(3, ge=0)
-    preview_height: int = Field(256, ge=32)
-    preview_rows: int = Field(4, ge=1)
-    sigma_px_ref: float = Field(SIGMA_PX_REFERENCE, gt=0)
-    episodes_per_shard: int = Field(256, ge=1)
-
 
 _LONGEST_NAME = 200
 _ACCOUNT = ("episode_id", "source", "status", "reason", "stored_bytes")

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.tensor_transforms import invert, transform_points

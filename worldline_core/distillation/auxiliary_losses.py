@@ -21,12 +21,11 @@ import numpy as np
 import torch
 from einops import rearrange, reduce
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import kinematic_robot_masks
-from worldline_core.config import StrictModel
+from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
 from worldline_core.model.lpips import LPIPS, load_lpips
@@ -126,17 +125,6 @@ def robot_motion_loss(
 
 PerceptualDistance = Callable[[Tensor, Tensor], Tensor]
 """Distance of two latent clips `b v c t h w` after decoding; see :class:`PerceptualLoss`."""
-
-
-class AuxiliaryWeights(StrictModel):
-    """Weights of the auxiliaries; the defaults are the paper's. A weight of 0 turns its term off."""
-
-    anchor: float = Field(default=0.005, ge=0)
-    boundary: float = Field(default=0.05, ge=0)
-    lpips: float = Field(default=0.005, ge=0)
-    robot: float = Field(default=0.005, ge=0)
-    robot_motion: float = Field(default=0.1, ge=0)
-    wrist_view: float = Field(default=2.0, gt=0, description="weight of a wrist view against the head view")
 
 
 def anchor_loss(predicted: Float[Tensor, "b v c t h w"], target: Float[Tensor, "b v c t h w"]) -> Float[Tensor, ""]:

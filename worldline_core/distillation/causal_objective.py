@@ -21,8 +21,9 @@ from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import integrate
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.flow_matching import SigmaSampling, sample_sigmas
+from worldline_core.training.flow_matching import sample_sigmas
 from worldline_core.training.trainer import Objective
+from worldline_core.training.training_config import SigmaSampling
 
 
 def frame_sigmas(sigma: Float[Tensor, "b blocks"], block_size: int) -> Float[Tensor, "b t"]:

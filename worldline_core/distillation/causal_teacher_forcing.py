@@ -18,7 +18,8 @@ from worldline_core.distillation.causal_objective import CausalObjective, block_
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.flow_matching import LossWeighting, SigmaSampling, add_noise, flow_matching_loss
+from worldline_core.training.flow_matching import add_noise, flow_matching_loss
+from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 class TeacherForcingObjective(CausalObjective[Batch]):

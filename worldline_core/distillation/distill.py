@@ -45,14 +45,16 @@ from worldline_core.model.contracts import TrainedClips
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler, ClipSampling
+from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import ClipRow, named_rows, training_rows
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.processes import ALONE, BatchPlan, join_processes, processes, wait_for_all
 from worldline_core.training.sharding import gathered, place_model
 from worldline_core.training.stage import validation_function
-from worldline_core.training.trainer import ParameterGroup, TrainerConfig, batch_plan, train
+from worldline_core.training.trainer import ParameterGroup, batch_plan, train
+from worldline_core.training.training_config import TrainerConfig
 
 __all__ = ["DistillConfig", "distill"]
 

@@ -7,16 +7,25 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
-from worldline_core.distillation.auxiliary_losses import AuxiliaryWeights
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
-from worldline_core.training.clip_sampler import ClipSampling
-from worldline_core.training.flow_matching import LossWeighting, SigmaSampling
-from worldline_core.training.trainer import OptimizerConfig, TrainerConfig
+from worldline_core.training.clip_config import ClipSampling
+from worldline_core.training.training_config import LossWeighting, OptimizerConfig, SigmaSampling, TrainerConfig
 
 CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
+
+
+class AuxiliaryWeights(StrictModel):
+    """Weights of the auxiliaries; the defaults are the paper's. A weight of 0 turns its term off."""
+
+    anchor: float = Field(default=0.005, ge=0)
+    boundary: float = Field(default=0.05, ge=0)
+    lpips: float = Field(default=0.005, ge=0)
+    robot: float = Field(default=0.005, ge=0)
+    robot_motion: float = Field(default=0.1, ge=0)
+    wrist_view: float = Field(default=2.0, gt=0, description="weight of a wrist view against the head view")
 
 
 class WindowConfig(StrictModel):

@@ -33,8 +33,9 @@ from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.flow_matching import LossWeighting, add_noise, flow_matching_loss
+from worldline_core.training.flow_matching import add_noise, flow_matching_loss
 from worldline_core.training.trainer import step_generator
+from worldline_core.training.training_config import LossWeighting
 
 Score = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Velocity at (noisy clip, the clip's own clean latents, sigma of every block "b blocks")."""

@@ -20,10 +20,9 @@ import httpx
 import numpy as np
 import torch
 from einops import rearrange
-from pydantic import Field, field_validator
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, UnavailableError
+from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.vlm import (
     MAX_NEW_TOKENS,
     Image,
@@ -33,7 +32,7 @@ from worldline_core.evaluation.vlm import (
     Video,
     VisionLanguageModel,
 )
-from worldline_core.untrusted_text import HIDDEN, carries_credentials, cut
+from worldline_core.untrusted_text import HIDDEN, cut
 
 MAX_ANSWER_BYTES = 1 << 20
 """Of a server's whole reply."""
@@ -42,24 +41,6 @@ _REFUSED_STATUS = frozenset({301, 302, 303, 307, 308, 401, 403, 404, 405})
 """What a server answers to every message: the key, the address or the model's name is wrong."""
 _PATIENCE = 3
 """Messages in a row without an answer, after which a server cannot be used."""
-
-
-class VLMConfig(StrictModel):
-    """A local Qwen3-VL folder, or a server. A key is never configured: only the variable that holds it."""
-
-    weights: Path | None = Field(default=None, description="local Qwen3-VL folder")
-    url: str | None = Field(default=None, description="OpenAI-compatible server, up to and with /v1")
-    model: str = Field(default="Qwen/Qwen3-VL-8B-Instruct", description="the server's name of the model")
-    api_key_variable: str = "OPENAI_API_KEY"
-    timeout_s: float = Field(default=120.0, gt=0, description="for a whole answer")
-    attempts: int = Field(default=3, ge=1)
-
-    @field_validator("url")
-    @classmethod
-    def _no_credentials(cls, url: str | None) -> str | None:
-        if url is not None and carries_credentials(url):
-            raise ValueError("the address carries a password or a key, which would be written into manifests")
-        return url
 
 
 def open_vlm(kind: Literal["qwen3_vl", "openai"], config: VLMConfig) -> VisionLanguageModel:

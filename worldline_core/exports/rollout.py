@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
 from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, field_validator
-from torch import Tensor
 
-from worldline_core.actions.action_maps import REFERENCE_CANVAS
-from worldline_core.actions.episode_tracks import ActionTracks, WristProjection
+from worldline_core.actions.actions_config import REFERENCE_CANVAS, WristProjection
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
-from worldline_core.model.block_causal_attention import KVCache
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from worldline_core.actions.episode_tracks import ActionTracks
+    from worldline_core.model.block_causal_attention import KVCache
 
 NATIVE_VECTORS = "none: native control vectors, zero-padded"
 """In place of maps: what drives a model with FiLM. Their layout is that of the embodiment's state."""
@@ -150,4 +153,6 @@ class CausalSpec(StrictModel):
 
     def new_cache(self, fps: Tensor | None = None) -> KVCache:
         """An empty cache with this window, for clips of ``fps`` frames per second ``(b)``."""
+        from worldline_core.model.block_causal_attention import KVCache
+
         return KVCache(self.sink_blocks, self.recent_blocks, fps)

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, save_checkpoint
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.weight_files import read_weights
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_nano_config
+from worldline_core.model.world_model_config import ImportBackboneConfig, WorldModelConfig, cosmos3_nano_config
 from worldline_core.store.artifact_files import read_json
 
 CLASS_NAME = "Cosmos3OmniTransformer"
@@ -132,14 +131,6 @@ def load_cosmos3(
     new = sorted(name for name in own if name.startswith("action_encoder.") or name == "view_embedding")
     fill(model, kept | {name: own[name] for name in new}, where=root, dtype=dtype)
     return model, Cosmos3Report(tuple(sorted(ignored)), tuple(new))
-
-
-class ImportBackboneConfig(StrictModel):
-    """How the pretrained weights are read and stored."""
-
-    fps: float = Field(30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
-    dtype: Literal["bfloat16", "float16"] = "bfloat16"
-    changes: dict[str, Any] = Field({}, description="fields of the model's config to set besides (view slots)")
 
 
 def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

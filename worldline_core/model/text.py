@@ -8,16 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Int
-from pydantic import Field
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
+from worldline_core.model.world_model_config import TextConfig
 
 SYSTEM_PROMPT = "You are a helpful assistant who will generate videos from a give prompt."
 """As in training, the missing letter included."""
@@ -131,17 +130,6 @@ class Cosmos3Text:
 
 BYTE_OFFSET = 2
 END_OF_TEXT = 1
-
-
-class TextConfig(StrictModel):
-    """``bytes`` needs nothing; ``cosmos3`` reads the backbone's tokenizer from the local folder ``path``.
-
-    ``max_length``: tokens of a text; longer instructions are cut.
-    """
-
-    kind: Literal["bytes", "cosmos3"] = "bytes"
-    path: str | None = None
-    max_length: int = Field(default=48, ge=2)
 
 
 class TextEncoder(Protocol):

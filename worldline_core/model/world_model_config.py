@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -125,3 +125,22 @@ def cosmos3_nano_config(**changes: object) -> WorldModelConfig:
         "timestep_scale": 0.001,
     }
     return WorldModelConfig.model_validate(values | changes)
+
+
+class TextConfig(StrictModel):
+    """``bytes`` needs nothing; ``cosmos3`` reads the backbone's tokenizer from the local folder ``path``.
+
+    ``max_length``: tokens of a text; longer instructions are cut.
+    """
+
+    kind: Literal["bytes", "cosmos3"] = "bytes"
+    path: str | None = None
+    max_length: int = Field(default=48, ge=2)
+
+
+class ImportBackboneConfig(StrictModel):
+    """How the pretrained weights are read and stored."""
+
+    fps: float = Field(30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
+    dtype: Literal["bfloat16", "float16"] = "bfloat16"
+    changes: dict[str, Any] = Field({}, description="fields of the model's config to set besides (view slots)")

@@ -16,7 +16,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
 from worldline_core.pipeline.plan import Node, plan
 from worldline_core.report.ablation_table import AblationTableConfig, Variant, load_variants
 from worldline_core.rollout.rollout_config import RolloutConfig
-from worldline_core.training.stage import StageConfig
+from worldline_core.training.training_config import StageConfig
 
 FULL, METHOD = "full", "stage2"
 TABLE = "ablation_table"

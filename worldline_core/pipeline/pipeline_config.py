@@ -10,25 +10,22 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from worldline_core.actions.render_actions import RenderActionsConfig
+from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.config import StrictModel
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.distillation.distill import DistillConfig
+from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import UnavailableError
-from worldline_core.evaluation.planning.evaluate_planning import PlanningConfig
-from worldline_core.evaluation.policy.evaluate_policy import PolicyEvaluationConfig
-from worldline_core.evaluation.video.evaluate_video import VideoEvaluationConfig
+from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.model.cosmos3 import ImportBackboneConfig
-from worldline_core.report.report import ReportConfig
+from worldline_core.model.world_model_config import ImportBackboneConfig
+from worldline_core.report.context import ReportConfig
 from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
-from worldline_core.training.latent_store import EncodeLatentsConfig
-from worldline_core.training.stage1 import Stage1Config
-from worldline_core.training.stage2 import Stage2Config
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.training_config import Stage1Config, Stage2Config
 
 
 class ModelPaths(StrictModel):

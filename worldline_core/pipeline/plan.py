@@ -17,8 +17,8 @@ from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.scale.mapping import ShardMapper
 from worldline_core.shipped import project_path
 from worldline_core.store.store import Artifact, ArtifactStore
-from worldline_core.training.clip_source import FrameInput
-from worldline_core.training.stage import StageConfig
+from worldline_core.training.clip_config import FrameInput
+from worldline_core.training.training_config import StageConfig
 
 
 @dataclass(frozen=True)

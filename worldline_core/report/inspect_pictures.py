@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldline_core.actions.action_maps import SIGMA_PX_REFERENCE
+from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.actions.overlay_views import write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import write_quarantine

@@ -6,9 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
-from worldline_core.model.text import TextConfig
+from worldline_core.model.world_model_config import TextConfig
 
 Controls = Literal["true", "zero", "shuffled"]
 """Whose controls drive a prediction: the episode's own, none, or those of another episode."""

@@ -19,9 +19,10 @@ from worldline_core.config import validate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.text import ClipFacts, TextConfig, load_text_encoder
+from worldline_core.model.text import ClipFacts, load_text_encoder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import video_to_frames
+from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.samplers import FULL_STEPS, Noise, rollout_full_clip
 from worldline_core.rollout.session import Frames, encode_images

@@ -18,19 +18,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
-from worldline_core.actions.episode_tracks import (
-    ActionTracks,
-    EpisodeTracks,
-    WristProjection,
-    collate_tracks,
-    native_vectors,
-)
+from worldline_core.actions.actions_config import WristProjection
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.clip_config import ReadingConfig
 from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import Clip, ClipBatch, ClipSource, ReadingConfig
+from worldline_core.training.clip_source import Clip, ClipBatch, ClipSource
 
 logger = logging.getLogger(__name__)
 

@@ -10,50 +10,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float
-from pydantic import Field
 from torch import Tensor
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.processes import any_process
 from worldline_core.training.relational import RelationalTerm
-
-
-class SigmaSampling(StrictModel):
-    """Distribution of the noise level during training.
-
-    ``uniform``: u ~ U(0, 1). ``logit_normal``: u = sigmoid(mean + std n). ``mode``: the "waver" map of Cosmos3 video
-    training, u -> 1 - u - scale (cos^2(pi u / 2) - 1 + u). Then ``shift`` moves mass to high noise:
-    sigma = shift u / (1 + (shift - 1) u).
-    """
-
-    kind: Literal["uniform", "logit_normal", "mode"] = "uniform"
-    mean: float = 0.0
-    std: float = Field(default=1.0, gt=0)
-    mode_scale: float = Field(default=1.29, ge=-1, le=1.75)
-    shift: float = Field(default=1.0, gt=0)
-
-
-class LossWeighting(StrictModel):
-    """How the squared velocity error is weighted.
-
-    ``kind``: "velocity" leaves it as it is (the paper's objective); "sample" multiplies it by sigma^2, which is the
-    squared error of the predicted clean latents (stable for models that predict the sample).
-    ``motion``: extra weight of latent positions that differ from the clip's first frame: the weight is
-    ``1 + motion * min(m / mean(m), motion_cap)`` with m the mean absolute change over channels, renormalised to
-    mean one, so that a small model spends its capacity on what moves. 0 (the default) is the paper's objective.
-    """
-
-    kind: Literal["velocity", "sample"] = "velocity"
-    motion: float = Field(default=0.0, ge=0)
-    motion_cap: float = Field(default=5.0, gt=0)
+from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 def sample_sigmas(config: SigmaSampling, count: int, generator: torch.Generator) -> Float[Tensor, " b"]:

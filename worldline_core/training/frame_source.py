@@ -23,7 +23,8 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, resize_frame
 from worldline_core.progress import with_progress
-from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, FrameInput
+from worldline_core.training.clip_config import FrameInput
+from worldline_core.training.clip_source import Clip, ClipRow, ClipSource
 
 logger = logging.getLogger(__name__)
 

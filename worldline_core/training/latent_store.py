@@ -23,13 +23,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float
-from pydantic import Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from worldline_core.actions.action_maps import TEMPORAL_FACTOR
-from worldline_core.config import StrictModel
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError
@@ -37,6 +35,7 @@ from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprin
 from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.progress import with_progress
 from worldline_core.store.atomic import atomic_path, write_json_atomic
+from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, latent_frame_count, longest_clip
 
 Layout = Literal["groups", "clips"]
@@ -186,29 +185,6 @@ class LatentStore(ClipSource):
                 got=error,
                 next_step="encode the latents again",
             ) from error
-
-
-class EncodeLatentsConfig(StrictModel):
-    """Which latents are cached.
-
-    ``start_step``: clips may start at multiples of it. ``strides``: temporal strides that training may ask for.
-    ``primary_alone``: also encode, by their task-facing view alone, episodes that lack some of ``views``: Stage I takes
-    them (plain videos have one view), Stage II does not.
-    ``optional_views``: of ``views``, those that an episode may lack: its others are encoded.
-    ``layout``: "auto" compares both layouts on the first episode and takes ``groups`` only where it is exact.
-    """
-
-    splits: tuple[str, ...] | None = None
-    views: tuple[str, ...] = ("head", "left_wrist", "right_wrist")
-    primary_alone: bool = False
-    # Left out of dumps at its default: latents made before it existed keep their key in the store.
-    optional_views: tuple[str, ...] = Field(default=(), exclude_if=lambda value: not value)
-    image_size: tuple[int, int] = (64, 96)
-    start_step: int = Field(default=4, ge=1)
-    strides: tuple[int, ...] = Field(default=(1,), min_length=1)
-    layout: Literal["auto", "groups", "clips"] = "auto"
-    episodes_per_shard: int = Field(default=16, ge=1)
-    device: str = "cpu"
 
 
 class Encoder(Protocol):

@@ -16,35 +16,15 @@ import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Float, UInt8
-from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.processes import average_values
+from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import VideoTeacher
-
-
-class RelationalConfig(StrictModel):
-    """Targets and caps of the two terms (paper: 0.03 and 0.005 of the flow-matching loss, caps 0.20 and 0.10).
-
-    ``bins`` and ``grid`` are upper bounds: a clip with fewer latent frames gets one bin per frame, a coarser token grid
-    (of student or teacher, whichever is coarser) is not blown up.
-    """
-
-    intra_ratio: float = Field(default=0.03, ge=0)
-    cross_ratio: float = Field(default=0.005, ge=0)
-    intra_cap: float = Field(default=0.20, ge=0)
-    cross_cap: float = Field(default=0.10, ge=0)
-    ramp_steps: int = Field(default=250, ge=0)
-    ema_decay: float = Field(default=0.99, ge=0, lt=1)
-    bins: int = Field(default=8, ge=2)
-    grid: tuple[int, int] = (8, 8)
-    student_layer: int | None = Field(default=None, ge=1, description="None: the middle block")
-    cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher's relations stay in memory")
 
 
 def common_shape(config: RelationalConfig, *grids: tuple[int, ...]) -> tuple[int, int, int]:

@@ -11,38 +11,17 @@ from functools import cache
 from typing import TYPE_CHECKING, Literal, cast
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.model.layers import TextContext
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
 from worldline_core.training.processes import processes, reporting_lost_processes
+from worldline_core.training.training_config import ShardingConfig
 
 if TYPE_CHECKING:
     from torch.distributed.device_mesh import DeviceMesh
     from torch.distributed.tensor import DTensor
-
-
-class ShardingConfig(StrictModel):
-    """How a model shares memory among processes, and what it recomputes or compiles. None of it changes what is learnt.
-
-    Attributes:
-        shards: parts of every weight; None: as many as there are processes. With fewer, groups of this many processes
-            hold one copy each, and gradients are summed over the copies: 8 on nodes of 8 GPUs keeps gathering within a
-            node.
-        checkpointing: "block" keeps the input of every transformer block and computes the block again on the way back;
-            "selective" also keeps what attention returned, which costs most to compute again.
-        compile: torch.compile for the projections and the feed-forward half of each block.
-        reduce_every_micro_step: sum gradients over processes after every micro-step, not once a step: with accumulation
-            this saves a whole copy of the gradients on every device, and costs communication.
-    """
-
-    shards: int | None = Field(default=None, ge=1)
-    checkpointing: Literal["none", "block", "selective"] = "none"
-    compile: bool = False
-    reduce_every_micro_step: bool = False
 
 
 def device_mesh(config: ShardingConfig, device: str) -> DeviceMesh:

@@ -12,64 +12,28 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import torch
-from pydantic import Field
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
+from worldline_core.training.clip_config import JOINT, ClipSampling, FrameInput, ReadingConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader, ClipReader, SkipLog
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_sampler import JOINT, ClipSampler, ClipSampling
-from worldline_core.training.clip_source import (
-    PRIMARY,
-    ClipInput,
-    ClipRow,
-    ClipSource,
-    FrameInput,
-    LatentInput,
-    ReadingConfig,
-    named_rows,
-    training_rows,
-)
-from worldline_core.training.flow_matching import FlowMatchingObjective, LossWeighting, SigmaSampling
+from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_source import PRIMARY, ClipRow, ClipSource, named_rows, training_rows
+from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.frame_source import FrameSource
 from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.processes import BatchPlan, join_processes, processes
 from worldline_core.training.sharding import gathered, place_model
-from worldline_core.training.trainer import (
-    ParameterGroup,
-    TrainerConfig,
-    TrainingResult,
-    batch_plan,
-    held_out_losses,
-    train,
-)
+from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
+from worldline_core.training.training_config import StageConfig, TrainerConfig
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 20_000
-
-
-class StageConfig(StrictModel):
-    """What both stages are told of their clips, their loss and their run.
-
-    ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
-    and encodes them during training.
-    ``outcomes``: only episodes that ended so (``[success]``); None takes all. No outcome reaches the model either way.
-    """
-
-    trainer: TrainerConfig
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
-    clips: ClipSampling = ClipSampling()
-    splits: tuple[str, ...] = ("train",)
-    validation_splits: tuple[str, ...] = ("validation",)
-    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1, exclude_if=lambda value: value is None)
-    sigma: SigmaSampling = Field(default_factory=SigmaSampling)
-    weighting: LossWeighting = Field(default_factory=LossWeighting)
 
 
 @dataclass(frozen=True)

@@ -4,30 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from pydantic import Field
 
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.model.layers import is_text_parameter
-from worldline_core.model.text import TextConfig, load_text_encoder
-from worldline_core.model.world_model import WorldModel, WorldModelConfig
-from worldline_core.training.clip_sampler import ClipSampling
+from worldline_core.model.text import load_text_encoder
+from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
-from worldline_core.training.stage import Stage, StageConfig
+from worldline_core.training.stage import Stage
 from worldline_core.training.trainer import ParameterGroup
-
-
-class Stage1Config(StageConfig):
-    """``model`` describes a model that starts from scratch; with the input ``base``, that checkpoint's own is used."""
-
-    kind: Literal["base", "stage1"] = "stage1"
-    model: WorldModelConfig = Field(default_factory=lambda: WorldModelConfig.model_validate({}))
-    clips: ClipSampling = ClipSampling(view_weights={"primary": 1.0})
-    text: TextConfig = TextConfig()
-    text_dropout: float = Field(default=0.1, ge=0, le=1)
+from worldline_core.training.training_config import Stage1Config
 
 
 def stage1_groups(model: WorldModel) -> list[ParameterGroup]:

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any
 
-from pydantic import Field, model_validator
-
-from worldline_core.actions.episode_tracks import ActionTracks, WristProjection
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
@@ -20,38 +18,13 @@ from worldline_core.model.film import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
-from worldline_core.training.relational import RelationalConfig, RelationalTerm, TeacherRelations
-from worldline_core.training.stage import Stage, StageConfig
-from worldline_core.training.trainer import OptimizerConfig, ParameterGroup
+from worldline_core.training.relational import RelationalTerm, TeacherRelations
+from worldline_core.training.stage import Stage
+from worldline_core.training.trainer import ParameterGroup
+from worldline_core.training.training_config import OptimizerConfig, Stage2Config
 from worldline_core.training.video_teacher import load_teacher
 
 FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)
-
-
-class Stage2Config(StageConfig):
-    """``start_from``: "stage1" takes a base or Stage I checkpoint, "stage2" goes on with a Stage II checkpoint.
-
-    ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
-    ``action_frames``: control frames whose maps a latent frame takes: its own (1, the paper's), or all 4 of its interval,
-    for grippers that close faster than a latent frame. Those that the start does not know begin with weights of zero.
-    ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
-    ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
-    """
-
-    start_from: Literal["stage1", "stage2"] = "stage1"
-    action_multiplier: float = Field(default=66.0, gt=0)
-    action_dropout: float = Field(default=0.0, ge=0, lt=1)
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
-    wrist_projection: WristProjection = "current_camera"
-    relational: RelationalConfig | None = RelationalConfig()
-    native_size: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
-
-    @model_validator(mode="after")
-    def _one_frame_of_vectors(self) -> Self:
-        if self.native_size is not None and self.action_frames != 1:
-            raise ValueError("native_size: control vectors are those of one frame; leave action_frames out")
-        return self
 
 
 def stage2_groups(model: WorldModel, action_multiplier: float) -> list[ParameterGroup]:

@@ -10,50 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from pydantic import Field
 from safetensors.torch import save
 from torch import Tensor
 
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.frame_source import RecordedView, load_views
-from worldline_core.training.trainer import (
-    Objective,
-    OptimizerConfig,
-    ParameterGroup,
-    TrainerConfig,
-    held_out_losses,
-    train,
-)
-from worldline_core.training.video_teacher import (
-    DESCRIPTION,
-    FORMAT,
-    TUBELET,
-    WEIGHTS,
-    SmallTeacherShape,
-    SmallVideoTeacher,
-)
+from worldline_core.training.trainer import Objective, ParameterGroup, held_out_losses, train
+from worldline_core.training.training_config import TeacherConfig
+from worldline_core.training.video_teacher import DESCRIPTION, FORMAT, TUBELET, WEIGHTS, SmallVideoTeacher
 
 VALIDATION_SEED = 30_000
-
-
-class TeacherConfig(StrictModel):
-    """Masked-video training. ``hidden``: share of tubelets that are hidden (the first frame stays visible)."""
-
-    shape: SmallTeacherShape = SmallTeacherShape()
-    trainer: TrainerConfig = TrainerConfig(
-        steps=600,
-        batch_size=12,
-        ema_decay=0.99,
-        optimizer=OptimizerConfig(learning_rate=1e-3, decay_steps=200),
-    )
-    splits: tuple[str, ...] = ("train",)
-    max_episodes: int = Field(default=120, ge=2)
-    held_out_episodes: int = Field(default=8, ge=1)
-    clip_frames: int = Field(default=17, ge=5)
-    hidden: float = Field(default=0.75, gt=0, lt=1)
 
 
 @dataclass(frozen=True)

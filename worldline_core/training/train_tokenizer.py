@@ -5,7 +5,6 @@ The decoder learns on exact and on disturbed codes, because a world model's pred
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,73 +15,18 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer, Refinement, fit_patch_tokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.frame_source import RecordedView, load_views
-from worldline_core.training.trainer import (
-    Objective,
-    OptimizerConfig,
-    ParameterGroup,
-    TrainerConfig,
-    step_generator,
-    train,
-)
+from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
+from worldline_core.training.training_config import TokenizerConfig
 
 BASES = Path("run") / "bases"
 _SHORTEST = 5  # frames: a first frame and one group
-
-
-class TokenizerConfig(StrictModel):
-    """Everything the shipped tokenizer depends on."""
-
-    image_size: tuple[int, int] = (64, 96)
-    channels: int = Field(default=32, ge=1)
-    motion_weight: float = Field(default=4.0, ge=0)
-    whitening: float = Field(default=0.5, ge=0, le=1)
-    refinement_width: int = Field(default=48, ge=4)
-    refinement_depth: int = Field(default=2, ge=1)
-    splits: tuple[str, ...] = ("train",)
-    held_out_splits: tuple[str, ...] = ("validation", "test")
-    max_episodes: int | None = Field(default=None, ge=1)
-    held_out_episodes: int = Field(default=12, ge=0)
-    clip_frames: int = Field(default=33, ge=5)
-    fit_clips: int = Field(default=600, ge=1)
-    steps: int = Field(default=4000, ge=0)
-    batch_size: int = Field(default=8, ge=1)
-    """Clips per step; each gives its first frame and three groups of four frames."""
-    learning_rate: float = Field(default=2e-3, gt=0)
-    warmup_steps: int = Field(default=100, ge=0)
-    average_decay: float = Field(default=0.998, ge=0, lt=1)
-    reference_dropout: float = Field(default=0.1, ge=0, le=1)
-    disturbance: float = Field(default=0.3, ge=0)
-    """Largest standard deviation of the noise added to the codes of the groups (0 trains on exact codes only)."""
-    seed: int = Field(default=0, ge=0)
-    checkpoint_every: int = Field(default=500, ge=1)
-    bfloat16: bool = True
-
-    @property
-    def trainer(self) -> TrainerConfig:
-        """The training loop of the decoder."""
-        return TrainerConfig(
-            steps=self.steps,
-            batch_size=self.batch_size,
-            seed=self.seed,
-            optimizer=OptimizerConfig(learning_rate=self.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4),
-            ema_decay=self.average_decay,
-            precision="bf16" if self.bfloat16 else "fp32",
-            save_every_steps=self.checkpoint_every,
-        )
-
-    def schedule(self, step: int) -> float:
-        """Factor on the learning rate: a linear warm-up times a half cosine down to 0."""
-        warm = min(1.0, (step + 1) / max(self.warmup_steps, 1))
-        return warm * 0.5 * (1 + math.cos(math.pi * step / self.steps))
 
 
 def select_episodes(episodes: EpisodeSet, splits: tuple[str, ...], limit: int | None, seed: int) -> list[int]:

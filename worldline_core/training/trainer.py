@@ -13,74 +13,26 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Protocol
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError, StoppedError, TrainingError
 from worldline_core.progress import Progress
 from worldline_core.training.early_end import keep_batch, require_finite, stop_requests
 from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.processes import BatchPlan, average_values, processes, reporting_lost_processes
-from worldline_core.training.sharding import ShardingConfig, reduce_gradients, whole
+from worldline_core.training.sharding import reduce_gradients, whole
+from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.training.training_state import (
     MetricsLog,
-    SavingConfig,
     TrainingStates,
     identity_digests,
     json_numbers,
     newest_state,
     numbers_of,
 )
-
-
-class OptimizerConfig(StrictModel):
-    """AdamW with linear warm-up, a plateau, and an optional linear decay over the last ``decay_steps``."""
-
-    learning_rate: float = Field(default=1e-3, gt=0)
-    betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = Field(default=1e-6, ge=0)
-    warmup_steps: int = Field(default=100, ge=0)
-    decay_steps: int = Field(default=0, ge=0)
-    clip_norm: float = Field(default=1.0, gt=0)
-
-
-class TrainerConfig(StrictModel):
-    """Length, batch and bookkeeping of a run.
-
-    ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
-    ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
-    it, and the run learns the same on 8 or 64 devices.
-    """
-
-    steps: int = Field(ge=1)
-    batch_size: int = Field(default=8, ge=1)
-    accumulation: int = Field(default=1, ge=1)
-    seed: int = Field(default=0, ge=0)
-    optimizer: OptimizerConfig = OptimizerConfig()
-    ema_decay: float = Field(default=0.999, ge=0, lt=1)
-    precision: Literal["fp32", "bf16"] = "bf16"
-    device: str = "cpu"
-    log_every: int = Field(default=20, ge=1)
-    validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
-    validation_batches: int = Field(default=4, ge=0)
-    save_every_seconds: float = Field(default=20.0, ge=0)
-    save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
-    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
-    global_batch: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
-    sharding: ShardingConfig = Field(default=ShardingConfig(), exclude_if=lambda value: value == ShardingConfig())
-    saving: SavingConfig = Field(default=SavingConfig(), exclude_if=lambda value: value == SavingConfig())
-
-    @model_validator(mode="after")
-    def _whole_micro_batches(self) -> Self:
-        if self.global_batch is not None and self.global_batch % self.batch_size:
-            raise ValueError(f"global_batch ({self.global_batch}) must be a multiple of batch_size ({self.batch_size})")
-        if self.global_batch is not None and self.accumulation != 1:
-            raise ValueError("accumulation follows from global_batch and the number of processes: give one of the two")
-        return self
 
 
 @dataclass(frozen=True)

@@ -21,17 +21,17 @@ from types import TracebackType
 from typing import Any, Self, cast
 
 import torch
-from pydantic import Field
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from worldline_core.config import StrictModel, what_is_made
+from worldline_core.config import what_is_made
 from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.processes import processes, wait_for_all
 from worldline_core.training.sharding import own_part
+from worldline_core.training.training_config import SavingConfig
 
 logger = logging.getLogger(__name__)
 
@@ -39,21 +39,6 @@ STATES = Path("run") / "training_state"
 INDEX = "state.json"
 _FILE_BYTES = 2**31
 """Tensors are put together into files of about this size: a file is held in memory a second time while it is written."""
-
-
-class SavingConfig(StrictModel):
-    """When states are saved besides ``save_every_steps``, and which stay.
-
-    Attributes:
-        share: of the run's time that saving may take at most: after a save of 30 s the next begins 10 minutes later at
-            0.05 (and never sooner than ``save_every_seconds``).
-        keep: so many of the latest states stay.
-        best: also keep the state at which this held-out loss was lowest ("loss", "rollout_error").
-    """
-
-    share: float = Field(default=0.05, gt=0, le=1)
-    keep: int = Field(default=1, ge=1)
-    best: str | None = None
 
 
 def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:

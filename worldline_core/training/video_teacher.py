@@ -14,18 +14,18 @@ from typing import Protocol
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.checkpoint import fill, read_description
 from worldline_core.model.weight_files import read_weights
+from worldline_core.training.training_config import BLOCKS, SmallTeacherShape
 
 DESCRIPTION, WEIGHTS = "teacher.json", "teacher.safetensors"
 FORMAT = "worldline.small_video_teacher"
-TUBELET, BLOCKS = 4, 4
+TUBELET = 4
 
 
 class VideoTeacher(Protocol):
@@ -40,17 +40,6 @@ def concatenated(outputs: list[Tensor], rows: int, columns: int) -> Float[Tensor
     """Outputs of several blocks, ``(b n d)``, layer-normalised and side by side on their grid."""
     normalised = torch.cat([functional.layer_norm(output.float(), output.shape[-1:]) for output in outputs], dim=-1)
     return rearrange(normalised, "b (t h w) d -> b t h w d", h=rows, w=columns)
-
-
-class SmallTeacherShape(StrictModel):
-    """Size of the encoder. ``patch`` is the side of a tubelet in pixels of ``image_size`` (height, width)."""
-
-    image_size: tuple[int, int] = (64, 96)
-    patch: int = Field(default=16, ge=2)
-    max_groups: int = Field(default=33, ge=2, description="longest clip in latent frames")
-    hidden_size: int = Field(default=128, ge=8)
-    num_layers: int = Field(default=6, ge=BLOCKS)
-    num_heads: int = Field(default=4, ge=1)
 
 
 class SmallVideoTeacher(nn.Module):

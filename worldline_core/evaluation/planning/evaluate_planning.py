@@ -13,18 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from pydantic import Field
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.evaluation_config import PlanningConfig
 from worldline_core.evaluation.planning.bracket import choose, shown_order
 from worldline_core.evaluation.planning.selectors import (
     CandidateVideo,
@@ -43,8 +41,8 @@ from worldline_core.evaluation.scores import (
     write_scores,
     write_table,
 )
-from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
-from worldline_core.evaluation.vlm_models import VLMConfig, open_vlm
+from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.evaluation.vlm_models import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
@@ -53,22 +51,6 @@ CHOICES_FILE = "choices.parquet"
 SEALED_FILE = "sealed_outcomes.parquet"
 DIRECT = "direct_execution"
 _CHOICE_COLUMNS = ("method", "bank", "run", "budget", "episode_id", "trace")
-
-
-class PlanningConfig(StrictModel):
-    """Who selects, and among how many."""
-
-    selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
-    vlm: VLMConfig = VLMConfig()
-    segmenter: SegmenterName = Field(default="learned", description="used by the measured selector")
-    sam3_weights: Path | None = None
-    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
-    budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
-    runs: int = Field(
-        default=5, ge=1, description="orders of each bank's candidates; smaller budgets are prefixes of an order"
-    )
-    resamples: int = Field(default=2000, ge=100)
-    seed: int = Field(default=42, ge=0)
 
 
 def evaluate_planning(config: PlanningConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

@@ -14,16 +14,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
@@ -45,8 +43,8 @@ from worldline_core.evaluation.scores import (
     write_scores,
     write_table,
 )
-from worldline_core.evaluation.segmenters.segmenter import SegmenterName, open_segmenter
-from worldline_core.evaluation.vlm_models import VLMConfig, open_vlm
+from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.evaluation.vlm_models import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.store.atomic import write_json_atomic
 
@@ -60,21 +58,6 @@ _COLUMNS = (
     "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
 )  # fmt: skip
 _LABELS = ("episode_id", "embodiment", "split", "scene", "task_family", "instruction", "outcome")
-
-
-class PolicyEvaluationConfig(StrictModel):
-    """Who judges, and what."""
-
-    judge: Literal["measured", "qwen3_vl", "openai"] = "measured"
-    vlm: VLMConfig = VLMConfig()
-    segmenter: SegmenterName = Field(default="learned", description="used by the measured judge")
-    sam3_weights: Path | None = None
-    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
-    splits: tuple[str, ...] = ("test", "ood_test")
-    balanced: bool = True
-    max_per_group: int | None = Field(default=None, ge=1, description="of each outcome, in each split and family")
-    resamples: int = Field(default=2000, ge=100)
-    seed: int = Field(default=42, ge=0)
 
 
 def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

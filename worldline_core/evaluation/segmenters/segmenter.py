@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from worldline_core.errors import ArtifactError, UnavailableError
-
-SegmenterName = Literal["learned", "colour", "sam3"]
-
+from worldline_core.evaluation.evaluation_config import SegmenterName
 
 MaskStream = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 """Masks of the next frames of one video; arguments and result as of `Segmenter.segment`."""

@@ -17,73 +17,20 @@ import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit, video_iou
 from worldline_core.evaluation.recordings import HEAD
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training.trainer import (
-    Objective,
-    OptimizerConfig,
-    ParameterGroup,
-    TrainerConfig,
-    step_generator,
-    train,
-)
+from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 
 _BLOCK = 8
-
-
-class SegmenterConfig(StrictModel):
-    """Size and training of the learned segmenter."""
-
-    widths: tuple[int, ...] = Field(
-        default=(8, 24, 48, 96), min_length=2, description="channels, finest resolution first; multiples of 8"
-    )
-    steps: int = Field(default=1000, ge=1)
-    batch_size: int = Field(default=24, ge=1)
-    learning_rate: float = Field(default=3e-3, gt=0)
-    weight_decay: float = Field(default=1e-4, ge=0)
-    average_decay: float = Field(default=0.995, ge=0, lt=1, description="of the moving average that is kept")
-    image_size: tuple[int, int] | None = Field(
-        default=None, description="(height, width) to resize to; none: as stored"
-    )
-    frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
-    checkpoint_every: int = Field(default=200, ge=1)
-    evaluate_splits: tuple[str, ...] = ("validation", "test", "ood_test")
-    evaluate_frame_stride: int = Field(default=4, ge=1)
-    threshold: float = Field(default=0.5, gt=0, lt=1)
-    seed: int = Field(default=42, ge=0)
-
-    @property
-    def trainer(self) -> TrainerConfig:
-        """The training loop; every step's loss is logged."""
-        return TrainerConfig(
-            steps=self.steps,
-            batch_size=self.batch_size,
-            seed=self.seed,
-            optimizer=OptimizerConfig(
-                learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=self.weight_decay
-            ),
-            ema_decay=self.average_decay,
-            log_every=1,
-            save_every_steps=self.checkpoint_every,
-        )
-
-    def schedule(self, step: int) -> float:
-        """Factor on the learning rate: linear warm-up over 5 % of the steps, then a half cosine to 1 %."""
-        warmup = max(1, self.steps // 20)
-        if step < warmup:
-            return (step + 1) / warmup
-        progress = (step - warmup) / max(1, self.steps - warmup)
-        return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from pydantic import Field
 
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
+from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, rows_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
@@ -38,7 +36,7 @@ from worldline_core.evaluation.scores import (
     write_scores,
     write_table,
 )
-from worldline_core.evaluation.segmenters.segmenter import Segmenter, SegmenterName, open_segmenter
+from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
 from worldline_core.model.lpips import LPIPS, load_lpips
 from worldline_core.progress import Progress
@@ -48,22 +46,6 @@ logger = logging.getLogger(__name__)
 
 BY_FRAME_FILE = "by_frame.parquet"
 _BY_FRAME_COLUMNS: tuple[str, ...] = ("method", "split", "view", "metric", "frame", "mean", "count")
-
-
-class VideoEvaluationConfig(StrictModel):
-    """What evaluate_video measures."""
-
-    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
-    segmenters: tuple[SegmenterName, ...] = Field(
-        default=("learned",), min_length=1, description="the first one names the metrics without a suffix"
-    )
-    sam3_weights: Path | None = Field(default=None, description="local folder of SAM 3 weights")
-    lpips_weights: Path | None = Field(default=None, description="local folder of LPIPS weights; none: not available")
-    comparisons: tuple[tuple[str, str], ...] | None = Field(
-        default=None, description="pairs of methods whose differences are reported; none: every pair"
-    )
-    resamples: int = Field(default=2000, ge=100)
-    seed: int = Field(default=42, ge=0)
 
 
 def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

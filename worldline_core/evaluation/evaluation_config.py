@@ -1,0 +1,127 @@
+"""What the evaluations and the segmenter's training are told. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from worldline_core.config import StrictModel
+from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
+from worldline_core.untrusted_text import carries_credentials
+
+
+class VLMConfig(StrictModel):
+    """A local Qwen3-VL folder, or a server. A key is never configured: only the variable that holds it."""
+
+    weights: Path | None = Field(default=None, description="local Qwen3-VL folder")
+    url: str | None = Field(default=None, description="OpenAI-compatible server, up to and with /v1")
+    model: str = Field(default="Qwen/Qwen3-VL-8B-Instruct", description="the server's name of the model")
+    api_key_variable: str = "OPENAI_API_KEY"
+    timeout_s: float = Field(default=120.0, gt=0, description="for a whole answer")
+    attempts: int = Field(default=3, ge=1)
+
+    @field_validator("url")
+    @classmethod
+    def _no_credentials(cls, url: str | None) -> str | None:
+        if url is not None and carries_credentials(url):
+            raise ValueError("the address carries a password or a key, which would be written into manifests")
+        return url
+
+
+SegmenterName = Literal["learned", "colour", "sam3"]
+
+
+class SegmenterConfig(StrictModel):
+    """Size and training of the learned segmenter."""
+
+    widths: tuple[int, ...] = Field(
+        default=(8, 24, 48, 96), min_length=2, description="channels, finest resolution first; multiples of 8"
+    )
+    steps: int = Field(default=1000, ge=1)
+    batch_size: int = Field(default=24, ge=1)
+    learning_rate: float = Field(default=3e-3, gt=0)
+    weight_decay: float = Field(default=1e-4, ge=0)
+    average_decay: float = Field(default=0.995, ge=0, lt=1, description="of the moving average that is kept")
+    image_size: tuple[int, int] | None = Field(
+        default=None, description="(height, width) to resize to; none: as stored"
+    )
+    frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
+    checkpoint_every: int = Field(default=200, ge=1)
+    evaluate_splits: tuple[str, ...] = ("validation", "test", "ood_test")
+    evaluate_frame_stride: int = Field(default=4, ge=1)
+    threshold: float = Field(default=0.5, gt=0, lt=1)
+    seed: int = Field(default=42, ge=0)
+
+    @property
+    def trainer(self) -> TrainerConfig:
+        """The training loop; every step's loss is logged."""
+        return TrainerConfig(
+            steps=self.steps,
+            batch_size=self.batch_size,
+            seed=self.seed,
+            optimizer=OptimizerConfig(
+                learning_rate=self.learning_rate, betas=(0.9, 0.999), weight_decay=self.weight_decay
+            ),
+            ema_decay=self.average_decay,
+            log_every=1,
+            save_every_steps=self.checkpoint_every,
+        )
+
+    def schedule(self, step: int) -> float:
+        """Factor on the learning rate: linear warm-up over 5 % of the steps, then a half cosine to 1 %."""
+        warmup = max(1, self.steps // 20)
+        if step < warmup:
+            return (step + 1) / warmup
+        progress = (step - warmup) / max(1, self.steps - warmup)
+        return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+class VideoEvaluationConfig(StrictModel):
+    """What evaluate_video measures."""
+
+    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    segmenters: tuple[SegmenterName, ...] = Field(
+        default=("learned",), min_length=1, description="the first one names the metrics without a suffix"
+    )
+    sam3_weights: Path | None = Field(default=None, description="local folder of SAM 3 weights")
+    lpips_weights: Path | None = Field(default=None, description="local folder of LPIPS weights; none: not available")
+    comparisons: tuple[tuple[str, str], ...] | None = Field(
+        default=None, description="pairs of methods whose differences are reported; none: every pair"
+    )
+    resamples: int = Field(default=2000, ge=100)
+    seed: int = Field(default=42, ge=0)
+
+
+class PolicyEvaluationConfig(StrictModel):
+    """Who judges, and what."""
+
+    judge: Literal["measured", "qwen3_vl", "openai"] = "measured"
+    vlm: VLMConfig = VLMConfig()
+    segmenter: SegmenterName = Field(default="learned", description="used by the measured judge")
+    sam3_weights: Path | None = None
+    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    splits: tuple[str, ...] = ("test", "ood_test")
+    balanced: bool = True
+    max_per_group: int | None = Field(default=None, ge=1, description="of each outcome, in each split and family")
+    resamples: int = Field(default=2000, ge=100)
+    seed: int = Field(default=42, ge=0)
+
+
+class PlanningConfig(StrictModel):
+    """Who selects, and among how many."""
+
+    selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
+    vlm: VLMConfig = VLMConfig()
+    segmenter: SegmenterName = Field(default="learned", description="used by the measured selector")
+    sam3_weights: Path | None = None
+    views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
+    budgets: tuple[int, ...] = Field(default=(2, 4, 8, 16, 24, 32), min_length=1)
+    runs: int = Field(
+        default=5, ge=1, description="orders of each bank's candidates; smaller budgets are prefixes of an order"
+    )
+    resamples: int = Field(default=2000, ge=100)
+    seed: int = Field(default=42, ge=0)

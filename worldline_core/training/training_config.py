@@ -1,0 +1,276 @@
+"""What training is told: noise, loss, loop; and the configuration of each step that trains. No torch in here."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from worldline_core.actions.actions_config import WristProjection
+from worldline_core.config import StrictModel
+from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
+from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
+
+
+class SigmaSampling(StrictModel):
+    """Distribution of the noise level during training.
+
+    ``uniform``: u ~ U(0, 1). ``logit_normal``: u = sigmoid(mean + std n). ``mode``: the "waver" map of Cosmos3 video
+    training, u -> 1 - u - scale (cos^2(pi u / 2) - 1 + u). Then ``shift`` moves mass to high noise:
+    sigma = shift u / (1 + (shift - 1) u).
+    """
+
+    kind: Literal["uniform", "logit_normal", "mode"] = "uniform"
+    mean: float = 0.0
+    std: float = Field(default=1.0, gt=0)
+    mode_scale: float = Field(default=1.29, ge=-1, le=1.75)
+    shift: float = Field(default=1.0, gt=0)
+
+
+class LossWeighting(StrictModel):
+    """How the squared velocity error is weighted.
+
+    ``kind``: "velocity" leaves it as it is (the paper's objective); "sample" multiplies it by sigma^2, which is the
+    squared error of the predicted clean latents (stable for models that predict the sample).
+    ``motion``: extra weight of latent positions that differ from the clip's first frame: the weight is
+    ``1 + motion * min(m / mean(m), motion_cap)`` with m the mean absolute change over channels, renormalised to
+    mean one, so that a small model spends its capacity on what moves. 0 (the default) is the paper's objective.
+    """
+
+    kind: Literal["velocity", "sample"] = "velocity"
+    motion: float = Field(default=0.0, ge=0)
+    motion_cap: float = Field(default=5.0, gt=0)
+
+
+class ShardingConfig(StrictModel):
+    """How a model shares memory among processes, and what it recomputes or compiles. None of it changes what is learnt.
+
+    Attributes:
+        shards: parts of every weight; None: as many as there are processes. With fewer, groups of this many processes
+            hold one copy each, and gradients are summed over the copies: 8 on nodes of 8 GPUs keeps gathering within a
+            node.
+        checkpointing: "block" keeps the input of every transformer block and computes the block again on the way back;
+            "selective" also keeps what attention returned, which costs most to compute again.
+        compile: torch.compile for the projections and the feed-forward half of each block.
+        reduce_every_micro_step: sum gradients over processes after every micro-step, not once a step: with accumulation
+            this saves a whole copy of the gradients on every device, and costs communication.
+    """
+
+    shards: int | None = Field(default=None, ge=1)
+    checkpointing: Literal["none", "block", "selective"] = "none"
+    compile: bool = False
+    reduce_every_micro_step: bool = False
+
+
+class SavingConfig(StrictModel):
+    """When states are saved besides ``save_every_steps``, and which stay.
+
+    Attributes:
+        share: of the run's time that saving may take at most: after a save of 30 s the next begins 10 minutes later at
+            0.05 (and never sooner than ``save_every_seconds``).
+        keep: so many of the latest states stay.
+        best: also keep the state at which this held-out loss was lowest ("loss", "rollout_error").
+    """
+
+    share: float = Field(default=0.05, gt=0, le=1)
+    keep: int = Field(default=1, ge=1)
+    best: str | None = None
+
+
+class OptimizerConfig(StrictModel):
+    """AdamW with linear warm-up, a plateau, and an optional linear decay over the last ``decay_steps``."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = Field(default=1e-6, ge=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    decay_steps: int = Field(default=0, ge=0)
+    clip_norm: float = Field(default=1.0, gt=0)
+
+
+class TrainerConfig(StrictModel):
+    """Length, batch and bookkeeping of a run.
+
+    ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
+    ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
+    it, and the run learns the same on 8 or 64 devices.
+    """
+
+    steps: int = Field(ge=1)
+    batch_size: int = Field(default=8, ge=1)
+    accumulation: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0)
+    optimizer: OptimizerConfig = OptimizerConfig()
+    ema_decay: float = Field(default=0.999, ge=0, lt=1)
+    precision: Literal["fp32", "bf16"] = "bf16"
+    device: str = "cpu"
+    log_every: int = Field(default=20, ge=1)
+    validate_every: int = Field(default=0, ge=0, description="0: only after the last step")
+    validation_batches: int = Field(default=4, ge=0)
+    save_every_seconds: float = Field(default=20.0, ge=0)
+    save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
+    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
+    global_batch: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+    sharding: ShardingConfig = Field(default=ShardingConfig(), exclude_if=lambda value: value == ShardingConfig())
+    saving: SavingConfig = Field(default=SavingConfig(), exclude_if=lambda value: value == SavingConfig())
+
+    @model_validator(mode="after")
+    def _whole_micro_batches(self) -> Self:
+        if self.global_batch is not None and self.global_batch % self.batch_size:
+            raise ValueError(f"global_batch ({self.global_batch}) must be a multiple of batch_size ({self.batch_size})")
+        if self.global_batch is not None and self.accumulation != 1:
+            raise ValueError("accumulation follows from global_batch and the number of processes: give one of the two")
+        return self
+
+
+class RelationalConfig(StrictModel):
+    """Targets and caps of the two terms (paper: 0.03 and 0.005 of the flow-matching loss, caps 0.20 and 0.10).
+
+    ``bins`` and ``grid`` are upper bounds: a clip with fewer latent frames gets one bin per frame, a coarser token grid
+    (of student or teacher, whichever is coarser) is not blown up.
+    """
+
+    intra_ratio: float = Field(default=0.03, ge=0)
+    cross_ratio: float = Field(default=0.005, ge=0)
+    intra_cap: float = Field(default=0.20, ge=0)
+    cross_cap: float = Field(default=0.10, ge=0)
+    ramp_steps: int = Field(default=250, ge=0)
+    ema_decay: float = Field(default=0.99, ge=0, lt=1)
+    bins: int = Field(default=8, ge=2)
+    grid: tuple[int, int] = (8, 8)
+    student_layer: int | None = Field(default=None, ge=1, description="None: the middle block")
+    cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher's relations stay in memory")
+
+
+class StageConfig(StrictModel):
+    """What both stages are told of their clips, their loss and their run.
+
+    ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` reads the recordings' frames
+    and encodes them during training.
+    ``outcomes``: only episodes that ended so (``[success]``); None takes all. No outcome reaches the model either way.
+    """
+
+    trainer: TrainerConfig
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
+    clips: ClipSampling = ClipSampling()
+    splits: tuple[str, ...] = ("train",)
+    validation_splits: tuple[str, ...] = ("validation",)
+    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1, exclude_if=lambda value: value is None)
+    sigma: SigmaSampling = Field(default_factory=SigmaSampling)
+    weighting: LossWeighting = Field(default_factory=LossWeighting)
+
+
+class Stage1Config(StageConfig):
+    """``model`` describes a model that starts from scratch; with the input ``base``, that checkpoint's own is used."""
+
+    kind: Literal["base", "stage1"] = "stage1"
+    model: WorldModelConfig = Field(default_factory=lambda: WorldModelConfig.model_validate({}))
+    clips: ClipSampling = ClipSampling(view_weights={"primary": 1.0})
+    text: TextConfig = TextConfig()
+    text_dropout: float = Field(default=0.1, ge=0, le=1)
+
+
+class Stage2Config(StageConfig):
+    """``start_from``: "stage1" takes a base or Stage I checkpoint, "stage2" goes on with a Stage II checkpoint.
+
+    ``action_multiplier``: learning-rate multiplier of the zero-initialised action branch (66 at full size).
+    ``action_frames``: control frames whose maps a latent frame takes: its own (1, the paper's), or all 4 of its interval,
+    for grippers that close faster than a latent frame. Those that the start does not know begin with weights of zero.
+    ``relational``: null trains without these terms. How wide the maps' Gaussian is, the action tracks say.
+    ``native_size``: the paper's ablation: control vectors, padded to this size, by FiLM in every layer instead of maps.
+    """
+
+    start_from: Literal["stage1", "stage2"] = "stage1"
+    action_multiplier: float = Field(default=66.0, gt=0)
+    action_dropout: float = Field(default=0.0, ge=0, lt=1)
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
+    wrist_projection: WristProjection = "current_camera"
+    relational: RelationalConfig | None = RelationalConfig()
+    native_size: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+
+    @model_validator(mode="after")
+    def _one_frame_of_vectors(self) -> Self:
+        if self.native_size is not None and self.action_frames != 1:
+            raise ValueError("native_size: control vectors are those of one frame; leave action_frames out")
+        return self
+
+
+BLOCKS = 4
+
+
+class SmallTeacherShape(StrictModel):
+    """Size of the encoder. ``patch`` is the side of a tubelet in pixels of ``image_size`` (height, width)."""
+
+    image_size: tuple[int, int] = (64, 96)
+    patch: int = Field(default=16, ge=2)
+    max_groups: int = Field(default=33, ge=2, description="longest clip in latent frames")
+    hidden_size: int = Field(default=128, ge=8)
+    num_layers: int = Field(default=6, ge=BLOCKS)
+    num_heads: int = Field(default=4, ge=1)
+
+
+class TeacherConfig(StrictModel):
+    """Masked-video training. ``hidden``: share of tubelets that are hidden (the first frame stays visible)."""
+
+    shape: SmallTeacherShape = SmallTeacherShape()
+    trainer: TrainerConfig = TrainerConfig(
+        steps=600,
+        batch_size=12,
+        ema_decay=0.99,
+        optimizer=OptimizerConfig(learning_rate=1e-3, decay_steps=200),
+    )
+    splits: tuple[str, ...] = ("train",)
+    max_episodes: int = Field(default=120, ge=2)
+    held_out_episodes: int = Field(default=8, ge=1)
+    clip_frames: int = Field(default=17, ge=5)
+    hidden: float = Field(default=0.75, gt=0, lt=1)
+
+
+class TokenizerConfig(StrictModel):
+    """Everything the shipped tokenizer depends on."""
+
+    image_size: tuple[int, int] = (64, 96)
+    channels: int = Field(default=32, ge=1)
+    motion_weight: float = Field(default=4.0, ge=0)
+    whitening: float = Field(default=0.5, ge=0, le=1)
+    refinement_width: int = Field(default=48, ge=4)
+    refinement_depth: int = Field(default=2, ge=1)
+    splits: tuple[str, ...] = ("train",)
+    held_out_splits: tuple[str, ...] = ("validation", "test")
+    max_episodes: int | None = Field(default=None, ge=1)
+    held_out_episodes: int = Field(default=12, ge=0)
+    clip_frames: int = Field(default=33, ge=5)
+    fit_clips: int = Field(default=600, ge=1)
+    steps: int = Field(default=4000, ge=0)
+    batch_size: int = Field(default=8, ge=1)
+    """Clips per step; each gives its first frame and three groups of four frames."""
+    learning_rate: float = Field(default=2e-3, gt=0)
+    warmup_steps: int = Field(default=100, ge=0)
+    average_decay: float = Field(default=0.998, ge=0, lt=1)
+    reference_dropout: float = Field(default=0.1, ge=0, le=1)
+    disturbance: float = Field(default=0.3, ge=0)
+    """Largest standard deviation of the noise added to the codes of the groups (0 trains on exact codes only)."""
+    seed: int = Field(default=0, ge=0)
+    checkpoint_every: int = Field(default=500, ge=1)
+    bfloat16: bool = True
+
+    @property
+    def trainer(self) -> TrainerConfig:
+        """The training loop of the decoder."""
+        return TrainerConfig(
+            steps=self.steps,
+            batch_size=self.batch_size,
+            seed=self.seed,
+            optimizer=OptimizerConfig(learning_rate=self.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4),
+            ema_decay=self.average_decay,
+            precision="bf16" if self.bfloat16 else "fp32",
+            save_every_steps=self.checkpoint_every,
+        )
+
+    def schedule(self, step: int) -> float:
+        """Factor on the learning rate: a linear warm-up times a half cosine down to 0."""
+        warm = min(1.0, (step + 1) / max(self.warmup_steps, 1))
+        return warm * 0.5 * (1 + math.cos(math.pi * step / self.steps))
