@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import socket
 import threading
 import time
@@ -40,7 +41,12 @@ class Endpoint:
 
     def _answer(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):
-            self.requests.append(connection.recv(65536))
+            request = connection.recv(65536)
+            # The body comes by itself. A connection that is closed with something unread is reset, its answer with it.
+            if length := re.search(rb"(?i)\r\ncontent-length: (\d+)", request):
+                while len(request.partition(b"\r\n\r\n")[2]) < int(length[1]) and (more := connection.recv(65536)):
+                    request += more
+            self.requests.append(request)
             self._behave(connection)
 
     def close(self) -> None:

@@ -88,16 +88,9 @@ def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], t
     assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
-@pytest.mark.parametrize(
-    ("kind", "workers"),
-    [
-        pytest.param("processes", 1, marks=pytest.mark.slow),
-        ("processes", 2),
-        pytest.param("dask", 2, marks=pytest.mark.slow),
-        pytest.param("ray", 2, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("kind", "workers"), [("processes", 1), ("processes", 2), ("dask", 2), ("ray", 2)])
 def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, kind: str, workers: int) -> None:
     # Asked without importing: what Ray reads at its import is set by the mapper.
     if kind in ("dask", "ray") and find_spec(f"prefect_{kind}") is None:

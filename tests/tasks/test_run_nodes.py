@@ -156,6 +156,7 @@ curate_banks:
 """
 
 
+@pytest.mark.slow
 def test_nodes_side_by_side_give_the_artifacts_of_one_process(
     prefect_server: None, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
