@@ -14,7 +14,7 @@ from pathlib import Path
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.pipeline.steps import run_step
-from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
+from worldline_core.rollout.rollout_config import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import read_json

@@ -6,6 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
+from tasks.command_line import add_preset_arguments
 from tasks.temporary_server import prepare_prefect
 
 
@@ -18,12 +19,7 @@ def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentP
         " the preset's own plan on them, from the import of the backbone to the report. Sizes alone change; each change"
         " is printed. Nothing is learnt: what ends with an error here ends with it on many GPUs too.",
     )
-    choice = rehearse.add_mutually_exclusive_group()
-    choice.add_argument("--preset", help="a preset in configs/ (default: cosmos3-nano)")
-    choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
-    rehearse.add_argument(
-        "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
-    )
+    add_preset_arguments(rehearse, "cosmos3-nano")
     rehearse.add_argument(
         "--output", type=Path, default=Path("rehearsal"), help="folder of weights, recordings and artifacts"
     )

@@ -25,14 +25,19 @@ from worldline_core.store.store import Artifact, ArtifactStore
 from worldline_core.untrusted_text import shown, visible, without_credentials
 
 
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments that say which configuration and which store a command works on."""
+def add_preset_arguments(parser: argparse.ArgumentParser, default: str) -> None:
+    """The arguments that say which configuration a command works on."""
     choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("--preset", help="a preset in configs/ (default: demo)")
+    choice.add_argument("--preset", help=f"a preset in configs/ (default: {default})")
     choice.add_argument("--config", type=Path, help="a configuration file of the same form as a preset")
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
     )
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments that say which configuration and which store a command works on."""
+    add_preset_arguments(parser, "demo")
     parser.add_argument(
         "--artifacts", type=Path, default=Path("artifacts"), help="where artifacts live (default: artifacts)"
     )

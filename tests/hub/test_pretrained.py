@@ -77,6 +77,22 @@ def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path,
         assert said in card
 
 
+@pytest.mark.parametrize("absolute", [False, True])
+def test_the_card_reads_nothing_outside_of_the_store(tmp_path: Path, folder: Path, absolute: bool) -> None:
+    outside, trained = tmp_path / "outside", tmp_path / "store" / "train_stage2" / "0"
+    outside.mkdir()
+    (outside / "sources.json").write_text(
+        '[{"label": "private", "kind": "lerobot_v3", "license": "secret", "redistribution": "no", "names": ["private"],'
+        ' "found": 2, "kept": 2, "reasons": {}, "image_size": null, "fps": null, "stride": null, "conventions": {}}]'
+    )
+    trained.parent.mkdir(parents=True)
+    folder.rename(trained)
+    place = str(outside) if absolute else "../outside"
+    write_manifest(trained, {"step": "train_stage2", "inputs": {"episodes": {"path": place, "digest": "1"}}})
+    WorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
+    assert "private" not in (tmp_path / "out" / "README.md").read_text()
+
+
 def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folder: Path) -> None:
     (folder / "pytorch_model.bin").write_bytes(b"\x80\x04cos\nsystem\n")
     (folder / "modeling.py").write_text("raise SystemExit")

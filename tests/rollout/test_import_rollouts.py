@@ -14,7 +14,8 @@ from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.rollout.import_rollouts import ImportRolloutsConfig, import_rollouts
+from worldline_core.rollout.import_rollouts import import_rollouts
+from worldline_core.rollout.rollout_config import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 
 SIZE, N = (32, 48), 9

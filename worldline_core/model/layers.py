@@ -1,8 +1,7 @@
 """Layers of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
-Also what stands at both ends: the sinusoidal time embedding, added to noisy tokens only; the action encoder, which
-turns action maps into token residuals (docs/method.md); and the velocity that follows from what the head emits. Module
-names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+Also what stands at both ends: the sinusoidal time embedding, added to noisy tokens only, and the velocity that follows from
+what the head emits. Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, cast
 
 import torch
 import torch.nn.functional as F
@@ -21,7 +20,9 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import (
     CheckpointPolicy,
     SelectiveCheckpointContext,
+    checkpoint,  # pyright: ignore[reportUnknownVariableType]
     create_selective_checkpoint_contexts,  # pyright: ignore[reportUnknownVariableType]
+    noop_context_fn,
 )
 
 from worldline_core.errors import ConfigError, DataError
@@ -91,7 +92,7 @@ _ATTENTION = (
 )
 
 
-def keep_attention() -> tuple[AbstractContextManager[object], AbstractContextManager[object]]:
+def _keep_attention() -> tuple[AbstractContextManager[object], AbstractContextManager[object]]:
     """Contexts for `torch.utils.checkpoint` that keep what the fused attention kernels return, and nothing else."""
 
     def policy(_context: SelectiveCheckpointContext, operation: object, *_: object, **__: object) -> CheckpointPolicy:
@@ -99,6 +100,14 @@ def keep_attention() -> tuple[AbstractContextManager[object], AbstractContextMan
 
     first, again = create_selective_checkpoint_contexts(policy)
     return first, again
+
+
+def call_layer(layer: nn.Module, checkpointing: Literal["none", "block", "selective"], *arguments: object) -> Tensor:
+    """What ``layer`` returns; in training, what ``checkpointing`` does not keep is computed again on the way back."""
+    if checkpointing == "none" or not torch.is_grad_enabled():
+        return cast("Tensor", layer(*arguments))
+    kept = _keep_attention if checkpointing == "selective" else noop_context_fn
+    return cast("Tensor", checkpoint(layer, *arguments, use_reentrant=False, context_fn=kept))
 
 
 class RMSNorm(nn.Module):
@@ -285,36 +294,6 @@ def check_shapes(config: WorldModelConfig, latents: Tensor, views: Sequence[str]
         wanted = (*latents.shape[:2], config.map_channels, latents.shape[3], *grid)
         if action_maps.shape != wanted:
             raise DataError("Action maps have the wrong shape", expected=wanted, got=tuple(action_maps.shape))
-
-
-class ActionEncoder(nn.Module):
-    """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
-
-    Because the last layer starts at zero, a model that gains this branch computes what it computed before. Maps of
-    several control frames (``map_channels``) pass the convolution one by one and meet in the linear layer.
-    """
-
-    def __init__(self, config: WorldModelConfig) -> None:
-        super().__init__()
-        self.frames, self.patch_size = config.action_frames, config.patch_size
-        self.conv = nn.Conv3d(config.action_channels, config.action_channels, (1, 3, 3), padding=(0, 1, 1))
-        self.proj = nn.Linear(config.map_channels * config.patch_size**2, config.hidden_size)
-        nn.init.zeros_(self.proj.weight)
-        nn.init.zeros_(self.proj.bias)
-
-    def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
-        """Residuals for the video tokens, in order ``(t v h w)``."""
-        flat = rearrange(maps, "b v (k c) t h w -> (b v k) c t h w", k=self.frames)
-        flat = flat + self.conv(flat)
-        patches = rearrange(
-            flat,
-            "(b v k) c t (h p) (w q) -> b (t v h w) (k p q c)",
-            v=maps.shape[1],
-            k=self.frames,
-            p=self.patch_size,
-            q=self.patch_size,
-        )
-        return self.proj(patches)
 
 
 def velocity_of(

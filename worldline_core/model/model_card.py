@@ -55,9 +55,11 @@ def manifest_with_sources(folder: Path) -> dict[str, Any]:
     """A folder's manifest, with ``sources``: licence by source of the recordings that it was trained on, where they are."""
     manifest = read_manifest(folder)
     found = manifest.get("inputs", {}).get("episodes", {}).get("path")
+    store = folder.resolve().parent.parent
     for _ in range(2):  # a filtered set points to the curated one, which has the table
-        episodes = None if found is None else (folder.parents[1] / found).resolve()
-        if episodes is None or not episodes.is_dir():
+        episodes = None if found is None else (store / found).resolve()
+        # A manifest that came with the weights may name any place: only the store that the folder lies in is read.
+        if episodes is None or not episodes.is_relative_to(store) or not episodes.is_dir():
             break
         if table := read_source_table(episodes):
             manifest["sources"] = {source.label: source.license for source in table}

@@ -18,9 +18,9 @@ import torch
 from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint, noop_context_fn  # pyright: ignore[reportUnknownVariableType]
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.action_branch import ActionEncoder, NativeActionFilm, new_action_branch
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
     CachedBlock,
@@ -30,17 +30,15 @@ from worldline_core.model.block_causal_attention import (
     block_bounds,
 )
 from worldline_core.model.contracts import CausalSpec
-from worldline_core.model.film import NativeActionFilm, new_action_branch
 from worldline_core.model.layers import (
-    ActionEncoder,
     GenerationAttention,
     MixtureLayer,
     RMSNorm,
     TextContext,
     TimeEmbedder,
+    call_layer,
     check_shapes,
     is_text_parameter,
-    keep_attention,
     velocity_of,
 )
 from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
@@ -337,14 +335,7 @@ class WorldModel(nn.Module):
             context = None if text is None else text.layers[index]
             if action_maps is not None and isinstance(self.action_encoder, NativeActionFilm):
                 tokens = self.action_encoder(tokens, action_maps, index)
-            if self.checkpointing != "none" and torch.is_grad_enabled():
-                kept = keep_attention if self.checkpointing == "selective" else noop_context_fn
-                tokens = cast(
-                    "Tensor",
-                    checkpoint(layer, tokens, attend, index, context, use_reentrant=False, context_fn=kept),
-                )
-            else:
-                tokens = layer(tokens, attend, index, context)
+            tokens = call_layer(layer, self.checkpointing, tokens, attend, index, context)
             if features_at == index + 1:
                 features = tokens
         return self.norm_moe_gen(tokens), features

@@ -19,8 +19,7 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEv
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.model.world_model_config import ImportBackboneConfig
 from worldline_core.report.context import ReportConfig
-from worldline_core.rollout.import_rollouts import ImportRolloutsConfig
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutConfig
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote

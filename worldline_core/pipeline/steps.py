@@ -249,7 +249,7 @@ _STEPS = (
         1,
         "worldline_core.rollout.import_rollouts",
         "import_rollouts",
-        "rollout.import_rollouts.ImportRolloutsConfig",
+        "rollout.rollout_config.ImportRolloutsConfig",
         ("videos", "episodes"),
         summary="any folder of predicted videos as a set of rollouts, every file accounted for",
     ),

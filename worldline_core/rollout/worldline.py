@@ -12,8 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
-from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
+from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
 from worldline_core.errors import CheckpointError, DataError
+from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.actions_config import WristProjection
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks
 from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic

@@ -12,9 +12,9 @@ from typing import Any
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
+from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
 from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContract
-from worldline_core.model.film import new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
