@@ -1,0 +1,203 @@
+"""The openpi client against a server that is written here from the protocol's description, with its own array code."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+msgpack = pytest.importorskip("msgpack")
+
+from websockets.sync.server import ServerConnection, serve
+
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.policies.array_messages import pack, unpack
+from worldline_core.policies.openpi import OpenpiPolicy, is_healthy
+
+
+def encode(value: Any) -> Any:
+    """Arrays as openpi's protocol describes them, independently of the project's code."""
+    if isinstance(value, dict):
+        return {name: encode(each) for name, each in value.items()}
+    if isinstance(value, np.ndarray):
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes("C"),
+            b"dtype": value.dtype.str,
+            b"shape": list(value.shape),
+        }
+    return value
+
+
+def decode(value: Any) -> Any:
+    if isinstance(value, dict) and value.get(b"__ndarray__"):
+        return np.ndarray(value[b"shape"], np.dtype(value[b"dtype"]), value[b"data"])
+    if isinstance(value, dict):
+        return {name: decode(each) for name, each in value.items()}
+    return value
+
+
+@contextmanager
+def policy_server(
+    answer: Callable[[dict[str, Any]], Any], *, metadata: object = None, key: str | None = None
+) -> Iterator[str]:
+    """An openpi policy server: metadata first, a reply for every observation, errors as a text and code 1011."""
+
+    def handle(connection: ServerConnection) -> None:
+        connection.send(msgpack.packb({"name": "scripted"} if metadata is None else metadata))
+        for message in connection:
+            begin = time.monotonic()
+            try:
+                found = answer(decode(msgpack.unpackb(message)))
+            except RuntimeError as error:
+                connection.send(f"Traceback: RuntimeError: {error}")
+                connection.close(1011, "Internal server error. Traceback included in previous frame.")
+                return
+            if found is None:
+                connection.socket.shutdown(socket.SHUT_RDWR)  # vanished
+                return
+            if isinstance(found, dict):
+                timing = {"infer_ms": 1e3 * (time.monotonic() - begin)}
+                found = msgpack.packb(encode({**found, "server_timing": timing}))
+            connection.send(found)
+
+    def check(connection: ServerConnection, request: Any) -> Any:
+        if request.path == "/healthz":
+            return connection.respond(200, "OK\n")
+        if key is not None and request.headers.get("Authorization") != f"Api-Key {key}":
+            return connection.respond(401, "no\n")
+        return None
+
+    with serve(handle, "127.0.0.1", 0, compression=None, max_size=None, process_request=check) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+    thread.join(5)
+
+
+def test_a_hundred_chunks() -> None:
+    seen: list[dict[str, Any]] = []
+
+    def answer(observation: dict[str, Any]) -> dict[str, Any]:
+        seen.append(observation)
+        return {"actions": observation["state"][None] + np.arange(8, dtype=np.float32)[:, None]}
+
+    with policy_server(answer, key="abc") as url:
+        assert is_healthy(url)
+        with OpenpiPolicy(url, api_key="abc") as policy:
+            assert policy.metadata == {"name": "scripted"}
+            state = np.zeros(14, np.float32)
+            for chunk in range(100):
+                picture = np.full((4, 6, 3), chunk, np.uint8)
+                reply = policy.infer({"state": state, "images": {"head": picture}, "prompt": "lift it"})
+                assert reply["actions"].shape == (8, 14)
+                assert reply["actions"].dtype == np.float64
+                assert reply["server_timing"]["infer_ms"] >= 0
+                state = reply["actions"][-1].astype(np.float32)
+        assert state[0] == 700
+        assert len(seen) == 100
+        assert all((found["images"]["head"] == chunk).all() for chunk, found in enumerate(seen))
+        assert seen[3]["prompt"] == "lift it"
+        with pytest.raises(UnavailableError, match=r"(?s)refuses the connection.*401.*API key"):
+            OpenpiPolicy(url)
+    with pytest.raises(UnavailableError, match=r"(?s)No server answers.*start it"):
+        OpenpiPolicy(url, deadline_s=2)
+    with pytest.raises(UnavailableError, match="No server answers"):
+        is_healthy(url, deadline_s=2)
+
+
+def _fails(_: dict[str, Any]) -> Any:
+    raise RuntimeError("no such camera: cam_high")
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "match"),
+    [
+        (_fails, UnavailableError, r"(?s)reports an error.*no such camera: cam_high"),
+        (lambda _: None, UnavailableError, r"(?s)closed the connection.*connect again"),
+        (lambda _: b"\xc1\xff", DataError, "not understood"),
+        (lambda _: msgpack.packb([1, 2]), DataError, r"(?s)reply is no map.*list"),
+        (lambda _: {}, DataError, r"(?s)actions are no chunk.*NoneType"),
+        (lambda _: {"actions": np.zeros(8)}, DataError, r"(?s)actions are no chunk.*float64 \(8,\)"),
+        (lambda _: {"actions": np.zeros((0, 14))}, DataError, "actions are no chunk"),
+        (lambda _: {"actions": np.array([["a"]])}, DataError, r"(?s)actions are no chunk.*<U1"),
+        (lambda _: {"actions": np.array([[0.0, np.nan]])}, DataError, r"not finite\n.*step 0, column 1"),
+        (lambda _: {"actions": np.zeros((1 << 16, 14))}, DataError, r"(?s)too large.*1,000,000 bytes"),
+    ],
+)
+def test_bad_servers_are_named(answer: Callable[[dict[str, Any]], Any], error: type[Exception], match: str) -> None:
+    given = policy_server(answer)
+    with given as url, OpenpiPolicy(url, max_bytes=1_000_000) as policy, pytest.raises(error, match=match):
+        policy.infer({"state": np.zeros(3)})
+
+
+def test_a_deadline_is_for_the_whole_exchange() -> None:
+    stop = threading.Event()
+
+    def trickle(_: dict[str, Any]) -> Iterator[bytes]:
+        """One reply in fragments that never ends."""
+        while not stop.wait(0.05):
+            yield b"\x00"
+
+    with policy_server(trickle) as url, OpenpiPolicy(url) as policy:
+        begin = time.monotonic()
+        with pytest.raises(UnavailableError, match=r"(?s)did not answer in time.*within 0.3 s"):
+            policy.infer({}, deadline_s=0.3)
+        assert time.monotonic() - begin < 2
+        stop.set()
+        with pytest.raises(UnavailableError, match="closed the connection"):
+            policy.infer({})
+    with policy_server(lambda _: {}, metadata=[1]) as url, pytest.raises(DataError, match="metadata is no map"):
+        OpenpiPolicy(url)
+
+
+@pytest.mark.parametrize("dtype", ["?", "u1", "<i8", ">i4", "<f2", "<f4", "<f8", "S3", "<U5"])
+def test_arrays_come_back_as_they_were(dtype: str) -> None:
+    values = np.arange(12).reshape(3, 4).astype(dtype)
+    given = {"a": values, "t": values.T, "empty": values[:0], "one": values[0, 0], "zero": np.array(values[0, 0])}
+    found = unpack(pack(given), "here")
+    for name, array in given.items():
+        assert np.array_equal(found[name], array), name
+        assert np.asarray(found[name]).dtype == np.asarray(array).dtype, name
+    assert np.array_equal(decode(msgpack.unpackb(pack({"a": values})))["a"], values)
+    found["a"][0, 0] = found["a"][1, 1]  # a copy, not the message's own bytes
+
+
+def _described(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" * 8) -> bytes:
+    return msgpack.packb({"x": {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        _described("|O"), _described("|V8"), _described("<c8"), _described("f4,f4"), _described("O,f4"), _described(3),
+        _described("<M8[s]"), _described("no such"), _described("U0", (1 << 40,), b""), _described(shape=(3,)),
+        _described(shape=(-1, -2)), _described(shape=(1 << 62, 4)), _described(shape=(0, 1 << 63), data=b""),
+        _described(shape=(1,) * 70, data=b"\0" * 4), _described(shape="2"), _described(shape=(2.0,)), _described(data="text"),
+        msgpack.packb({b"__ndarray__": True}), msgpack.packb({b"__npgeneric__": True, b"dtype": "|O", b"data": 1}),
+        msgpack.packb({b"__npgeneric__": True, b"dtype": "u1", b"data": 300}),
+        b"", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x91" * 3000, b"\x93\x01", b"\x01\x02", msgpack.packb(msgpack.ExtType(4, b"x")),
+        msgpack.packb([[]] * 40_000 + [{}] * 30_000), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
+        struct.pack(">BI", 0xC6, 1 << 31),
+    ],
+)  # fmt: skip
+def test_hostile_messages_are_refused(content: bytes) -> None:
+    with pytest.raises(DataError, match="A message is not understood"):
+        unpack(content, "somebody")
+
+
+def test_what_cannot_be_sent_is_named() -> None:
+    for wrong in (np.array([object()]), np.zeros(2, "V4"), np.complex64(1), {1, 2}, math, 1 << 70):
+        with pytest.raises(DataError, match="cannot be sent"):
+            pack({"x": wrong})
+    with pytest.raises(DataError, match=r"(?s)too large.*at most 4 bytes.*got: 10"):
+        unpack(b"0123456789", "somebody", max_bytes=4)

@@ -1,0 +1,1 @@
+"""Policies that run elsewhere: arrays in msgpack messages, and openpi's websocket protocol."""

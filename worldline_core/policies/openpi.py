@@ -1,0 +1,103 @@
+"""A client of openpi's policy servers: observations in, chunks of actions out.
+
+The protocol (openpi, ``serving/websocket_policy_server.py``): on connection the server sends its metadata; every request is one
+observation, every reply a map with ``actions`` of shape (horizon, size). An error arrives as a text, and then the server
+closes with code 1011. There is no reset message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import httpx
+import numpy as np
+
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
+from worldline_core.policies.message_socket import MessageSocket
+
+
+class OpenpiPolicy(MessageSocket):
+    """A connected policy.
+
+    Args:
+        url: ``ws://host:port``.
+        api_key: sent as ``Authorization: Api-Key ...``.
+        deadline_s: for connecting, and for each chunk.
+        max_bytes: of one reply.
+
+    Attributes:
+        metadata: what the server says of its policy.
+
+    Raises:
+        UnavailableError: nobody answers there, or the key is refused.
+        DataError: the metadata are no map.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        api_key: str | None = None,
+        deadline_s: float = 30.0,
+        max_bytes: int = MAX_MESSAGE_BYTES,
+    ) -> None:
+        headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        super().__init__(url, headers=headers, deadline_s=deadline_s, max_bytes=max_bytes)
+        try:
+            self.metadata: Mapping[str, Any] = self._map(self.receive(), "metadata")
+        except BaseException:
+            self.close()
+            raise
+
+    def infer(self, observation: Mapping[str, Any], *, deadline_s: float | None = None) -> dict[str, Any]:
+        """What the policy answers to an observation: ``actions`` as float64 ``(horizon, size)``, and whatever else the
+        server says (``server_timing``).
+
+        Args:
+            observation: texts, numbers and arrays under the names that this policy expects.
+
+        Raises:
+            UnavailableError: the policy failed (with its own error text), is gone, or does not answer in time.
+            DataError: the observation cannot be sent, or the reply has no finite numbers as actions.
+        """
+        reply = self._map(self.request(observation, deadline_s=deadline_s), "reply")
+        actions = reply.get("actions")
+        if (
+            not isinstance(actions, np.ndarray)
+            or actions.ndim != 2
+            or actions.dtype.kind not in "fiu"
+            or not len(actions)
+        ):
+            got = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
+            raise DataError(
+                "The policy's actions are no chunk", where=self.url, expected="numbers (horizon >= 1, size)", got=got
+            )
+        actions = actions.astype(np.float64)
+        if not np.isfinite(actions).all():
+            step, column = np.argwhere(~np.isfinite(actions))[0]
+            raise DataError("An action is not finite", where=f"{self.url}, step {step}, column {column}")
+        return {**reply, "actions": actions}
+
+    def _map(self, found: object, what: str) -> dict[str, Any]:
+        if not isinstance(found, dict):
+            self.close()
+            raise DataError(
+                f"The policy server's {what} is no map", where=self.url, expected="a map", got=type(found).__name__
+            )
+        return found
+
+
+def is_healthy(url: str, *, deadline_s: float = 5.0) -> bool:
+    """Whether the server at a websocket address answers ``GET /healthz`` with status 200.
+
+    Raises: UnavailableError: nobody answers there.
+    """
+    address = httpx.URL(url)
+    address = address.copy_with(scheme={"ws": "http", "wss": "https"}.get(address.scheme, address.scheme))
+    try:
+        answer = httpx.get(address.copy_with(path="/healthz"), timeout=deadline_s, trust_env=False)
+    except httpx.HTTPError as error:
+        raise UnavailableError("No server answers", where=url, got=str(error)) from error
+    return answer.status_code == 200
