@@ -21,13 +21,13 @@ from prefect.task_runners import ProcessPoolTaskRunner
 
 from tasks.command_line import log_to_stderr
 from tasks.shard_mapper import shard_mapper
-from tasks.supervisor import end_with_pool
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
 from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.steps import Step, get_step, run_step
 from worldline_core.progress import running_node
 from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.remote import is_remote
 from worldline_core.store.store import ArtifactStore
 

@@ -16,7 +16,6 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-from tasks.supervisor import end_with_pool
 from tasks.temporary_server import set_up_temporary_server
 from worldline_core.errors import UnavailableError
 from worldline_core.scale.mapping import (
@@ -28,6 +27,7 @@ from worldline_core.scale.mapping import (
     WorkerDiedError,
     do_shard,
 )
+from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.remote import is_transient, process_cache
 from worldline_core.store.store import writing_for_another
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from types import FrameType
+
+from worldline_core.scale.process_end import end_with_parent
 
 GRACE_SECONDS = 3.0
 """How long the work may take to say goodbye, to Prefect's server for example, before it is killed."""
@@ -28,8 +27,9 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
     """Do the work in a process group of its own, and end with its exit status.
 
     Processes of a pool and Prefect's temporary server belong to that group. Ctrl-C in a terminal reaches this process
-    alone; otherwise the server would end first and the flow wait minutes for it. SIGINT ends the whole group within
-    `GRACE_SECONDS`, SIGTERM within `SAVE_SECONDS`, with exit status 130 or 143. Finished work is safe whenever that happens: outputs are written
+    alone; otherwise the server would end first and the flow wait minutes for it. Killed, this process takes the group
+    with it, and torchrun takes this process. SIGINT ends the whole group within `GRACE_SECONDS`, SIGTERM within
+    `SAVE_SECONDS`, with exit status 130 or 143. Finished work is safe whenever that happens: outputs are written
     atomically, training goes on from its last state.
 
     Args:
@@ -44,6 +44,8 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
         end_with_parent(lambda: os.killpg(0, signal.SIGKILL))
         action()
         return
+    if "TORCHELASTIC_RUN_ID" in os.environ:  # in a session of its own, which nothing ends when torchrun is killed
+        end_with_parent(lambda: (_kill_group(child), os._exit(1)))
 
     def stop(number: int, _frame: FrameType | None) -> None:
         raise _StoppedError(number)
@@ -71,28 +73,6 @@ def run_supervised(action: Callable[[], object], *, continues: bool) -> None:
         name = signal.Signals(-code).name
         print(f"error: the work was ended by {name}, perhaps for its memory{again}", file=sys.stderr)
     raise SystemExit(code if code >= 0 else 128 - code)
-
-
-def end_with_parent(end: Callable[[], object]) -> None:
-    """Call `end` soon after the process that started this one has ended: killed, it cannot say so."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1)
-        end()
-
-    threading.Thread(target=watch, name="end with parent", daemon=True).start()
-
-
-@functools.cache
-def end_with_pool() -> None:
-    """Let this process of a pool end with the one that started it, at once where that has ended already."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        end_with_parent(lambda: os._exit(1))
-        if not parent.is_alive():
-            os._exit(1)
 
 
 def _end_group(child: int, seconds: float) -> None:

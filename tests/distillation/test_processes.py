@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -62,18 +61,32 @@ def finish(process: subprocess.Popen[bytes], log: Path, seconds: float = 400) ->
 
 
 def kill_once_there(process: subprocess.Popen[bytes], folder: Path, pattern: str, seconds: float = 300) -> None:
-    """Kill torchrun and its processes at once, as soon as a file that fits the pattern is there."""
+    """Kill torchrun alone, as soon as a file that fits the pattern is there: its processes end with it."""
     until = time.monotonic() + seconds
     while not any(folder.glob(pattern)):
         assert process.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < until
         time.sleep(0.02)
-    # torchrun starts its processes in sessions of their own: killing it alone would let them finish.
-    workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    assert len(workers) == 2
-    for identity in (process.pid, *map(int, workers)):
-        os.kill(identity, signal.SIGKILL)
+    workers = children(process.pid)
+    started = [*workers, *(child for worker in workers for child in children(worker))]
+    assert len(started) == 4  # torchrun starts two commands, in sessions of their own; each works in a child
+    process.kill()
     process.wait()
+    until = time.monotonic() + 15
+    while any(map(is_running, started)):
+        assert time.monotonic() < until, "processes live on without torchrun"
+        time.sleep(0.1)
+
+
+def children(process: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+def is_running(process: int) -> bool:
+    try:
+        return not Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].startswith("Z")
+    except FileNotFoundError:
+        return False
 
 
 @pytest.mark.slow

@@ -236,7 +236,7 @@ def test_nodes_side_by_side_write_each_line_once_and_say_whose_it_is(
 def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:
     code = """
         import multiprocessing, os, time
-        from tasks.supervisor import end_with_pool
+        from worldline_core.scale.process_end import end_with_pool
 
         def work(pid):
             end_with_pool()

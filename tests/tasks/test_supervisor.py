@@ -77,8 +77,58 @@ def test_work_that_is_killed_is_reported(project_root: Path) -> None:
     wait_until_gone(helper)
 
 
+def test_the_work_ends_with_a_torchrun_that_is_killed(project_root: Path, tmp_path: Path) -> None:
+    """torchrun starts its commands in sessions of their own, so that killing it, or its group, reaches none of them."""
+    (tmp_path / "command.py").write_text(WORK % "time.sleep(60)")
+    launcher = (
+        "import os, subprocess, sys\n"
+        "os.environ['TORCHELASTIC_RUN_ID'] = 'none'\n"
+        "command = subprocess.Popen([sys.executable, sys.argv[1]], start_new_session=True)\n"
+        "print(command.pid, flush=True)\n"
+        "command.wait()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", launcher, str(tmp_path / "command.py")], cwd=project_root, stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(project_root)}, text=True,
+    ) as torchrun:  # fmt: skip
+        assert torchrun.stdout is not None
+        started = [int(torchrun.stdout.readline()) for _ in range(2)]
+        torchrun.kill()
+    for process in started:
+        wait_until_gone(process)
+
+
 def test_the_work_ends_with_a_command_that_is_killed(project_root: Path) -> None:
     process, helper = start(project_root, "time.sleep(60)")
     process.kill()
     process.wait()
     wait_until_gone(helper)
+
+
+RECORDING = """
+import os, time
+from pathlib import Path
+from types import SimpleNamespace
+from worldline_core.recorder import record
+
+def record_for_a_minute(task):
+    os.write(1, f"{os.getpid()}\\n".encode())
+    time.sleep(60)
+
+record._record_job = record_for_a_minute
+if __name__ == "__main__":
+    list(record._run_jobs([0, 1], SimpleNamespace(workers=2), Path()))
+"""
+
+
+def test_processes_that_record_end_with_the_one_that_started_them(project_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "recording.py").write_text(RECORDING)
+    with subprocess.Popen(
+        [sys.executable, str(tmp_path / "recording.py")], cwd=project_root, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(project_root)},
+    ) as recording:  # fmt: skip
+        assert recording.stdout is not None
+        worker = int(recording.stdout.readline())
+        recording.kill()
+    wait_until_gone(worker)

@@ -32,6 +32,7 @@ from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion
 from worldline_core.recorder.things import Layout, sample_layout
+from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SEALED_FILE = "sealed_outcomes.parquet"
@@ -178,7 +179,7 @@ def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
                 progress.advance()
         else:
             # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
-            with multiprocessing.get_context("spawn").Pool(config.workers) as pool:
+            with multiprocessing.get_context("spawn").Pool(config.workers, end_with_pool) as pool:
                 for rows in pool.imap(_record_bank, tasks):
                     sealed.append(rows)
                     progress.advance()

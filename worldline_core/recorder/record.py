@@ -28,6 +28,7 @@ from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import EpisodeRecorder
 from worldline_core.recorder.things import TASKS
+from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.store import alone_in, describe_environment
@@ -213,7 +214,7 @@ def _run_jobs(jobs: list[Job], config: RecordConfig, output: Path) -> Iterator[N
         _close_recorders()
         return
     # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
-    with multiprocessing.get_context("spawn").Pool(config.workers) as pool:
+    with multiprocessing.get_context("spawn").Pool(config.workers, end_with_pool) as pool:
         yield from pool.imap_unordered(_record_job, tasks, chunksize=6)
 
 

@@ -7,9 +7,7 @@ process is faster. Slots are reused, because the page faults of fresh memory cos
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-import threading
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -20,6 +18,7 @@ import numpy as np
 import torch
 
 from worldline_core.errors import TrainingError
+from worldline_core.scale.process_end import end_with_pool
 from worldline_core.training.clip_loader import ClipReader, ReadBatch, SkippedClip
 from worldline_core.training.clip_source import ClipBatch
 
@@ -121,15 +120,7 @@ def _start_process(reader: ClipReader, shared: Any, slots: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process, which closes this one
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    threading.Thread(target=_end_with_training, daemon=True).start()
-
-
-def _end_with_training() -> None:
-    """A training process that is killed cannot end its loader processes: they notice and end by themselves."""
-    training = multiprocessing.parent_process()
-    if training is not None:
-        training.join()
-        os._exit(1)
+    end_with_pool()
 
 
 def _read(index: int) -> tuple[ClipBatch, tuple[SkippedClip, ...]]:
