@@ -35,7 +35,8 @@ def training(recordings, monkeypatch) -> Path:
 def test_killed_training_continues_to_the_same_bytes(training, tmp_path, monkeypatch):
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     result = train_segmenter(CONFIG, {"episodes": training}, whole)
-    assert result["videos"] == 4
+    assert result["videos"] == result["kept"] == 4
+    assert result["found"] == result["kept"] + sum(result["left_out"].values())
     save = trainer.TrainingStates.save
 
     def killed(states, facts):

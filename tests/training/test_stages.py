@@ -61,7 +61,10 @@ def teacher(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = TeacherConfig.model_validate(
         {"shape": shape, "trainer": trainer_values(6), "clip_frames": 9, "held_out_episodes": 1}
     )
-    train_teacher(config, {"episodes": world.episodes}, folder)
+    counts = train_teacher(config, {"episodes": world.episodes}, folder)
+    assert counts["found"] == counts["kept"] + sum(counts["left_out"].values()) == 8
+    assert counts["left_out"]["held out to measure on"] == 1
+    assert counts["left_out"]["in other splits"] == 2
     return folder
 
 

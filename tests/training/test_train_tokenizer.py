@@ -59,6 +59,10 @@ def test_a_decoder_is_trained_further_on_the_bases_of_its_start(world: Any, trai
 
 
 def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> None:
-    train_tokenizer(CONFIG.model_copy(update={"steps": 0}), {"episodes": world.episodes}, tmp_path)
+    changes = {"steps": 0, "max_episodes": 2}
+    counts = train_tokenizer(CONFIG.model_copy(update=changes), {"episodes": world.episodes}, tmp_path)
     assert not (tmp_path / "metrics.jsonl").exists()
+    # Every episode is accounted for: the line that ends the step says so.
+    assert (counts["found"], counts["kept"]) == (8, 2)
+    assert counts["left_out"] == {"in other splits": 2, "beyond max_episodes": 4, "shorter than 5 frames": 0}
     assert PatchTokenizer.load(tmp_path).latent_channels == 8

@@ -63,14 +63,15 @@ def teacher_batch(views: Sequence[RecordedView], config: TeacherConfig, seed: in
 
 
 def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Train on ``inputs['episodes']`` (training splits only) and write the frozen teacher.
+    """Train on ``inputs['episodes']`` (training splits only), write the frozen teacher, and count the episodes.
 
     Raises:
         DataError: if there are not enough episodes.
     """
     torch.manual_seed(config.trainer.seed)
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
-    fitting = [i for i in episodes.select(split=config.splits) if episodes.rows[i].video_frames >= config.clip_frames]
+    in_splits = episodes.select(split=config.splits)
+    fitting = [i for i in in_splits if episodes.rows[i].video_frames >= config.clip_frames]
     order = np.random.default_rng(config.trainer.seed).permutation(len(fitting))
     held_out_count = min(config.held_out_episodes, len(fitting) // 4)
     if len(fitting) < 2 or held_out_count < 1:
@@ -119,4 +120,18 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
         },
     )
     parameters = sum(value.numel() for value in teacher.parameters())
-    return {"episodes": len(chosen), "steps": config.trainer.steps, "parameters": parameters, **result.metrics}
+    left_out = {
+        "in other splits": len(episodes) - len(in_splits),
+        f"shorter than {config.clip_frames} frames": len(in_splits) - len(fitting),
+        "held out to measure on": len(held_out),
+        "beyond max_episodes": len(fitting) - len(held_out) - len(chosen),
+    }
+    return {
+        "found": len(episodes),
+        "kept": len(chosen),
+        "left_out": left_out,
+        "episodes": len(chosen),
+        "steps": config.trainer.steps,
+        "parameters": parameters,
+        **result.metrics,
+    }

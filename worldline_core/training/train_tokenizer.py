@@ -217,9 +217,10 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     ``output``; an interrupted call continues where it stopped and ends with the same bytes.
 
     Returns:
-        reconstruction metrics on held-out scenes.
+        reconstruction metrics on held-out scenes; {"found", "kept", "left_out"} count the episodes.
     """
     episodes = EpisodeSet.open(inputs["episodes"])
+    rows = episodes.rows
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
     views = load_views(episodes, chosen, config.image_size, _SHORTEST)
     if "start" in inputs:
@@ -248,4 +249,11 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
         metrics["held_out_episodes"] = len(held_out)
         metrics["held_out"] = reconstruction_metrics(PatchTokenizer.load(output), videos, config.clip_frames)
     write_json_atomic(output / "metrics.json", metrics)
-    return metrics
+    fitting = sum(row.split in config.splits for row in rows)
+    used = len({view.name.rpartition("/")[0] for view in views})
+    left_out = {
+        "in other splits": len(rows) - fitting,
+        "beyond max_episodes": fitting - len(chosen),
+        f"shorter than {_SHORTEST} frames": len(chosen) - used,
+    }
+    return {**metrics, "found": len(rows), "kept": used, "left_out": left_out}

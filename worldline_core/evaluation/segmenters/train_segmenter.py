@@ -89,6 +89,7 @@ def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output:
 
     Inputs: episodes; evaluation (another EpisodeSet to measure on, otherwise the same one).
     Output: model.safetensors, segmenter.json, metrics.jsonl (the loss of every step).
+    Returns counts of episodes, and IoU by split and embodiment.
 
     Raises: DataError when no training episode has exact masks.
     """
@@ -125,7 +126,15 @@ def train_segmenter(config: SegmenterConfig, inputs: Mapping[str, Path], output:
     }
     save_segmenter(output, config.widths, result.average, description)
     losses = [row["loss"] for row in read_json_lines(output / "metrics.jsonl")]
-    return {"videos": len(videos), "steps": config.steps, "final_loss": float(np.mean(losses[-50:])), "iou": metrics}
+    return {
+        "found": len(episodes),
+        "kept": len(videos),
+        "left_out": {"in other splits": len(episodes) - len(rows), "without exact masks": len(rows) - len(videos)},
+        "videos": len(videos),
+        "steps": config.steps,
+        "final_loss": float(np.mean(losses[-50:])),
+        "iou": metrics,
+    }
 
 
 def _load(episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] | None) -> MaskedVideo | None:
