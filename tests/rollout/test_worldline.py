@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from worldline_core import Camera, WorldLine
 from worldline_core.actions.action_tracks import compute_tracks
@@ -17,6 +18,7 @@ from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -107,6 +109,21 @@ def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them
     given = (observed.images, observed.controls, observed.cameras)
     before, after = (simulator.predict(*given, embodiment="ur5e_silver") for simulator in (causal, world))
     assert all(np.abs(before[view].astype(int) - after[view]).max() <= 2 for view in before)
+
+
+def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(observed: Observation, causal: WorldLine) -> None:
+    images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
+    assert causal.causal is not None
+    size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
+    generator = torch.Generator().manual_seed(0)
+    maps = [torch.randn(*size, *causal.contract.grid_size, generator=generator) for _ in range(3)]
+
+    def blocks(*, overlapped: bool) -> list[dict[str, np.ndarray]]:
+        session = causal.session(torch.stack(images)[None], [42])
+        return [clips[0] for clips in session.steps(maps, overlapped=overlapped)]
+
+    for one, other in zip(blocks(overlapped=True), blocks(overlapped=False), strict=True):
+        assert all(np.array_equal(one[view], other[view]) for view in causal.views)
 
 
 def test_tool_poses_drive_it_as_well(observed: Observation, causal: WorldLine) -> None:

@@ -26,6 +26,8 @@ VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "checkpoint.json"
 MAPS_IN = "action_encoder.proj.weight"
 CHECKPOINT_DTYPE = torch.float16
+SINGLE_PRECISION = ("time_embedder.",)
+"""Parameters that are never rounded to half precision: a noise level of 1000 sigma needs its digits (Cosmos3)."""
 
 
 class CheckpointInfo(StrictModel):
@@ -231,8 +233,7 @@ def load_checkpoint[Model: WorldModel](
     if config.towers == "generation":
         tensors = {name: tensor for name, tensor in tensors.items() if not is_text_parameter(name)}
     with torch.device("meta"):  # a description may ask for any size: only weights that are there take memory
-        check_fit({name: tuple(t.shape) for name, t in WorldModel(config).state_dict().items()}, tensors, path)
-    model = model_class(config)
+        model = model_class(config)
     fill(model, tensors, where=path, dtype=dtype)
     return model, info
 
@@ -261,7 +262,10 @@ def read_description(path: Path, form: str, noun: str, *, version: int | None = 
 
 
 def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object, dtype: torch.dtype) -> None:
-    """Load ``tensors`` into ``model`` in ``dtype``, strictly.
+    """Load ``tensors`` into ``model`` in ``dtype``, strictly; each takes the parameter's place as soon as it is cast.
+
+    ``model`` may be on the meta device: then nothing takes memory but the weights themselves, in ``dtype``. Embedders of
+    the noise level stay in float32, as they are computed.
 
     Raises:
         CheckpointError: keys are missing or left over, a shape differs, or values are not finite floating-point numbers.
@@ -274,7 +278,12 @@ def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object
                 got=tensor.dtype, next_step="fetch the checkpoint again, or train it again",
             )  # fmt: skip
     model.to(dtype)
-    model.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()})
+    # Copies: what was read may be a view of the file.
+    cast = {
+        name: tensor.to(torch.float32 if name.startswith(SINGLE_PRECISION) else dtype, copy=True)
+        for name, tensor in tensors.items()
+    }
+    model.load_state_dict(cast, assign=True)
 
 
 def check_fit(own: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor], where: object) -> None:

@@ -149,14 +149,17 @@ class WanDecoder:
             return video.clamp(-1.0, 1.0).to(latents.dtype)
 
 
-def load_tokenizer(folder: Path, device: str = "cpu") -> VideoTokenizer:
+def load_tokenizer(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> VideoTokenizer:
     """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.
+
+    Args:
+        dtype: of a Wan autoencoder, which computes in it; a patch tokenizer stays in float32.
 
     Raises:
         CheckpointError: the folder holds none, or a damaged one.
     """
     if (folder / "config.json").is_file() or (folder / "vae" / "config.json").is_file():
-        return WanTokenizer.load(folder).to(device)
+        return WanTokenizer.load(folder, dtype).to(device)
     return PatchTokenizer.load(folder).to(device)
 
 

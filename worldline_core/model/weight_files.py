@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from worldline_core.errors import CheckpointError
+from worldline_core.store.artifact_files import digest_file
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 INDEX_SUFFIX = ".index.json"
@@ -91,7 +92,7 @@ def read_weights(path: Path, sha256: str | None) -> dict[str, Tensor]:
             )  # fmt: skip
         return _read(path, sha256)
     content = index.read_bytes()
-    _check_digest(index, content, sha256)
+    _check_digest(index, hashlib.sha256(content).hexdigest(), sha256)
     tensors: dict[str, Tensor] = {}
     for shard, names, digest in _indexed(index, content):
         found = _read(shard, digest)
@@ -141,16 +142,16 @@ def _indexed(index: Path, content: bytes) -> Iterator[tuple[Path, set[str], str 
 
 
 def _read(path: Path, sha256: str | None) -> dict[str, Tensor]:
-    content = path.read_bytes()
-    _check_digest(path, content, sha256)
+    """Views of the mapped file: it takes no memory until it is read, and can be dropped from there at any time."""
+    _check_digest(path, digest_file(path), sha256)
     try:
-        return load(content)
+        return load_file(path)
     except SafetensorError as error:
         raise CheckpointError("The weights file is damaged", where=path, got=str(error), next_step=_AGAIN) from error
 
 
-def _check_digest(path: Path, content: bytes, sha256: str | None) -> None:
-    if sha256 is not None and sha256 != (digest := hashlib.sha256(content).hexdigest()):
+def _check_digest(path: Path, digest: str, sha256: str | None) -> None:
+    if sha256 not in (None, digest):
         raise CheckpointError(
             "The weights are not those that are described", where=path, expected=sha256, got=digest, next_step=_AGAIN
         )

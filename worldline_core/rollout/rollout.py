@@ -177,6 +177,7 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
         expect_kind="stage2" if config.sampler == "full_clip" else "causal",
         device=config.device,
         bfloat16=config.bfloat16,
+        weights=config.weights,
         steps=config.steps,
         shift=config.shift,
         clip_frames=config.clip_frames,

@@ -55,6 +55,10 @@ class RolloutConfig(StrictModel):
     text: TextConfig | None = Field(default=None, exclude_if=lambda value: value is None)
     """Text to video: how instructions become ids; by default as the checkpoint says that it was trained."""
     bfloat16: bool = True
+    # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
+    weights: Literal["float32", "bfloat16"] = Field(default="float32", exclude_if=lambda value: value == "float32")
+    """How the model's weights are held, and those of a Wan autoencoder, which then computes in bfloat16 too: half the
+    memory, and no copy in float32 is ever made."""
     device: str = "cpu"
     timed_blocks: int = Field(default=0, ge=0)
     """Blocks of one long block-causal rollout made to measure what each costs; it changes no prediction."""
@@ -63,6 +67,8 @@ class RolloutConfig(StrictModel):
     def _consistent(self) -> Self:
         if len(set(self.seeds)) != len(self.seeds):
             raise ValueError(f"seeds repeat: {self.seeds}")
+        if self.weights == "bfloat16" and not self.bfloat16:
+            raise ValueError("weights: bfloat16 are computed with in bfloat16; set bfloat16, or hold them in float32")
         if self.timed_blocks and self.sampler != "block_causal":
             raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
         if self.shift != 1.0 and self.sampler not in ("full_clip", "text_to_video"):

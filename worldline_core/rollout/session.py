@@ -10,6 +10,8 @@ Axis legend: b clips, v views, a channels of the action maps, t latent frames, n
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Protocol
 
@@ -141,6 +143,43 @@ class Session:
         frames = self._decode(self._sampler.step(maps))
         self._ended = frames if self._sampler.chained else None
         return frames
+
+    def steps(
+        self, maps: Iterable[Float[Tensor, "b v a t h w"]], *, overlapped: bool | None = None
+    ) -> Iterator[Frames]:
+        """As `step`, for controls that are known beforehand: one block is decoded while the next is sampled.
+
+        Args:
+            overlapped: None does so on a GPU, where decoding has a stream of its own; a CPU's cores are busy anyway. A
+                clip that begins at the last picture of the one before has to wait for it.
+        """
+        on_gpu = torch.device(self._device).type == "cuda"
+        if self._sampler.chained or not (on_gpu if overlapped is None else overlapped):
+            yield from map(self.step, maps)
+            return
+        beside = torch.cuda.Stream(self._device) if on_gpu else None
+        waiting: Future[Frames] | None = None
+        with ThreadPoolExecutor(1) as decoding:
+            for given in maps:
+                with torch.no_grad():
+                    latents = self._sampler.step(given)
+                if beside is not None:
+                    beside.wait_stream(torch.cuda.current_stream(self._device))
+                following = decoding.submit(self._decode_beside, latents, beside)
+                if waiting is not None:
+                    yield waiting.result()
+                waiting = following
+            if waiting is not None:
+                yield waiting.result()
+
+    @torch.no_grad()
+    def _decode_beside(self, latents: Tensor, stream: torch.cuda.Stream | None) -> Frames:
+        """Decode in another thread, on a GPU on a stream of its own."""
+        if stream is None:
+            return self._decode(latents)
+        with torch.cuda.stream(stream):
+            latents.record_stream(stream)
+            return self._decode(latents)
 
     @torch.no_grad()
     def _observe(self, images: Tensor) -> Frames:

@@ -37,14 +37,14 @@ class Elapsed:
 
 
 def timed[T](work: Callable[[], T], device: str) -> tuple[T, Elapsed]:
-    """What ``work`` returns, and what it took; on a GPU until its kernels are done."""
+    """What ``work`` returns, and what it took; on a GPU until its kernels are done (those of other streams go on)."""
     on_gpu = torch.device(device).type == "cuda"
     if on_gpu:
-        torch.cuda.synchronize(device)
+        torch.cuda.current_stream(device).synchronize()
     wall, processor = time.perf_counter(), time.process_time()
     result = work()
     if on_gpu:
-        torch.cuda.synchronize(device)
+        torch.cuda.current_stream(device).synchronize()
     return result, Elapsed(time.perf_counter() - wall, time.process_time() - processor)
 
 

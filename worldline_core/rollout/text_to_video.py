@@ -45,9 +45,11 @@ class TextToVideo:
     block_seconds = ()
 
     def __init__(self, config: RolloutConfig, checkpoint: Path, tokenizer: Path, episodes: EpisodeSet) -> None:
-        model, self.info = load_checkpoint(checkpoint, expect_kind=("base", "stage1"), towers="both")
+        model, self.info = load_checkpoint(
+            checkpoint, expect_kind=("base", "stage1"), towers="both", dtype=getattr(torch, config.weights)
+        )
         self.model = model.to(config.device).eval().requires_grad_(False)
-        self.tokenizer = load_tokenizer(tokenizer, config.device)
+        self.tokenizer = load_tokenizer(tokenizer, config.device, getattr(torch, config.weights))
         found, trained = tokenizer_fingerprint(self.tokenizer, tokenizer), self.info.metadata.get("tokenizer")
         if trained not in (None, found):
             raise CheckpointError(

@@ -89,6 +89,7 @@ class WorldLine:
         expect_kind: Literal["stage2", "causal"] | None = None,
         device: str = "cpu",
         bfloat16: bool = True,
+        weights: Literal["float32", "bfloat16"] = "float32",
         steps: int | None = None,
         shift: float = 1.0,
         clip_frames: int | None = None,
@@ -102,6 +103,8 @@ class WorldLine:
             tokenizer: its folder; by default ``tokenizer`` in the checkpoint's folder, else beside it.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder.
+            weights: how the model's weights are held, and those of a Wan autoencoder; in bfloat16 they take half the
+                memory and are cast only once, on reading, so that no copy in float32 ever exists.
             steps: Euler steps; by default those of the causal model, 35 for a Stage II model.
             shift: of a Stage II model's noise levels towards noise (1: even steps, as in the paper).
             clip_frames: of a Stage II model, frames of the longest clip predicted at once (1 + 4 k); longer predictions are
@@ -115,7 +118,7 @@ class WorldLine:
         """
         folder = pretrained_folder(folder)
         kinds: tuple[CheckpointKind, ...] = ("stage2", "causal") if expect_kind is None else (expect_kind,)
-        model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation")
+        model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", dtype=getattr(torch, weights))
         places = [Path(tokenizer)] if tokenizer is not None else [folder / "tokenizer", folder.parent / "tokenizer"]
         place = next((place for place in places if place.is_dir()), None)
         if place is None:
@@ -125,7 +128,7 @@ class WorldLine:
                 expected=f"a folder {' or '.join(map(str, places))}",
                 next_step="give its folder as tokenizer=...",
             )
-        codec = load_tokenizer(place, device)
+        codec = load_tokenizer(place, device, getattr(torch, weights))
         info.contract.require(where=place, tokenizer=tokenizer_fingerprint(codec, place))
         return cls(
             model,
@@ -233,12 +236,16 @@ class WorldLine:
         session = self.session(images, seeds, chosen, stride)
         yield session.observed
         unit = self.unit(frames)
-        for begin in range(0, frames - 1, unit):
+        begins = range(0, frames - 1, unit)
+
+        def controls(begin: int) -> Tensor:
             index = [stride * frame for frame in range(begin, begin + unit + 1, self.tokenizer.temporal_compression)]
             # A Stage II model begins a clip at every step; a causal one goes on with the first.
             start = 0 if self.causal is not None else index[0]
             maps = self.action_maps(tracks, index, start=start, views=chosen, stride=stride)
-            clips = session.step(torch.zeros_like(maps) if without_actions else maps)
+            return torch.zeros_like(maps) if without_actions else maps
+
+        for begin, clips in zip(begins, session.steps(map(controls, begins)), strict=True):
             yield [{view: video[: frames - 1 - begin] for view, video in clip.items()} for clip in clips]
 
     def session(
