@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,45 +28,74 @@ from worldline_core.actions.robot_masks import kinematic_robot_masks
 from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
-from worldline_core.model.lpips import LPIPS, load_lpips
+from worldline_core.model.lpips import LPIPS
 from worldline_core.model.video_tokenizer import VideoTokenizer
 
 
 class PerceptualLoss:
-    """Mean LPIPS of some decoded frames, differentiable in the predicted latents.
+    """Mean LPIPS of some decoded frames, differentiable in the predicted latents of these frames.
+
+    Decoding holds far more than the model itself: gradients are computed at once, for one view after the other, so that
+    never more than one view's activations are there.
 
     Args:
         tokenizer: decodes latents; stays frozen.
-        weights: folder of the LPIPS weights.
-        latent_frames: how many latent frames, the last ones, are compared (decoding is the expensive part).
-
-    Raises:
-        UnavailableError: the folder lacks the weights.
+        network: LPIPS with its weights.
+        latent_frames: how many latent frames, the last ones, are compared.
     """
 
-    def __init__(self, tokenizer: VideoTokenizer, weights: Path, latent_frames: int = 2, device: str = "cpu") -> None:
+    def __init__(self, tokenizer: VideoTokenizer, network: LPIPS, latent_frames: int = 2) -> None:
         self.tokenizer = tokenizer
         self.latent_frames = latent_frames
-        self.network = load_lpips(weights).to(device)
+        self.network = network
         # The metric is declared free of gradients; the loss is the same function with them.
         self._distance = inspect.unwrap(LPIPS.forward)
 
     def __call__(
         self, predicted: Float[Tensor, "b v c t h w"], target: Float[Tensor, "b v c t h w"]
     ) -> Float[Tensor, ""]:
-        """LPIPS between both clips, decoded from their observed frame on and cut to the last latent frames."""
-        video = self._decode(predicted)
+        """LPIPS between the last latent frames of both clips, decoded with the causal context that they need.
+
+        That context is decoded without gradients: they reach the compared latent frames alone.
+        """
+        return cast("Tensor", _ViewByView.apply(predicted, target, self._of_view))
+
+    def _of_view(self, predicted: Float[Tensor, "1 c t h w"], target: Float[Tensor, "1 c t h w"]) -> Float[Tensor, ""]:
         with torch.no_grad():
             reference = self._decode(target)
-        count = self.latent_frames * self.tokenizer.temporal_compression
-        frames, references = (
-            rearrange(clip[:, :, -count:] / 2 + 0.5, "n c t h w -> (n t) c h w").clamp(0, 1)
-            for clip in (video, reference)
-        )
-        return self._distance(self.network, frames, references).mean()
+        return self._distance(self.network, self._decode(predicted), reference).mean()
 
-    def _decode(self, latents: Tensor) -> Tensor:
-        return self.tokenizer.decode(rearrange(latents.float(), "b v c t h w -> (b v) c t h w"))
+    def _decode(self, latents: Float[Tensor, "1 c t h w"]) -> Float[Tensor, "frames 3 height width"]:
+        context = max(1, latents.shape[2] - self.latent_frames)  # the observed frame is never compared
+        decoder = self.tokenizer.decoder()
+        with torch.no_grad():
+            decoder(latents[:, :, :context])
+        video = decoder(latents[:, :, context:])
+        return rearrange(video / 2 + 0.5, "n c t h w -> (n t) c h w").clamp(0, 1)
+
+
+class _ViewByView(torch.autograd.Function):
+    """Mean of a distance over clips and views, its gradient computed together with its value."""
+
+    @staticmethod
+    def forward(ctx: Any, predicted: Tensor, target: Tensor, distance: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        total = predicted.new_zeros((), dtype=torch.float32)
+        gradient = torch.zeros_like(predicted, dtype=torch.float32)
+        pairs = predicted.shape[0] * predicted.shape[1]
+        for clip in range(predicted.shape[0]):
+            for view in range(predicted.shape[1]):
+                leaf = predicted[clip, view][None].detach().float()
+                with torch.set_grad_enabled(ctx.needs_input_grad[0]):
+                    value = distance(leaf.requires_grad_(), target[clip, view][None].float())
+                    if ctx.needs_input_grad[0]:
+                        gradient[clip, view] = torch.autograd.grad(value, leaf)[0][0] / pairs
+                total += value.detach() / pairs
+        ctx.save_for_backward(gradient.to(predicted.dtype))
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return gradients[0] * ctx.saved_tensors[0], None, None
 
 
 HEAD_VIEW = "head"

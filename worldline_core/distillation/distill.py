@@ -32,7 +32,7 @@ from worldline_core.distillation.trajectory_store import (
     TrajectoryStore,
     write_trajectories,
 )
-from worldline_core.errors import CheckpointError
+from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import (
     CHECKPOINT_DTYPE,
     CheckpointInfo,
@@ -42,7 +42,8 @@ from worldline_core.model.checkpoint import (
     save_checkpoint,
 )
 from worldline_core.model.contracts import TrainedClips
-from worldline_core.model.tokenizers import load_tokenizer
+from worldline_core.model.lpips import load_lpips
+from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling
@@ -184,7 +185,7 @@ class DistillationRun:
         scores = self.stage2 if settings.real_score == "stage2" else self.folder(STEPS[0])
         real, fake = (self._model(scores, settings.trainer)[0] for _ in range(2))
         objective = DistributionMatchingObjective(student.train(), real, fake.train(), self.config, self.perceptual)
-        other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate)
+        other = ParameterGroup("fake", _named_parameters(fake, "fake."), settings.fake_score_rate, averaged=False)
         return self._train(
             STEPS[2], settings.trainer, objective, self._load_trajectories(STEPS[2]), info, (other, fake)
         )
@@ -317,7 +318,14 @@ def _perceptual(config: DistillConfig, tokenizer: Path, device: str) -> Perceptu
         if wanted:
             logger.warning("The perceptual auxiliary is %s; it is left out of the loss.", LPIPS_OFF)
         return None
-    return PerceptualLoss(load_tokenizer(tokenizer, device), config.lpips_weights, device=device)
+    dtype = torch.bfloat16 if config.perceptual.bfloat16 else torch.float32
+    codec, network = load_tokenizer(tokenizer, device, dtype), load_lpips(config.lpips_weights).to(device)
+    if config.perceptual.bfloat16 and not isinstance(codec, WanTokenizer):
+        raise ConfigError(
+            "Only the Wan autoencoder decodes in bfloat16", where="distill.perceptual.bfloat16", expected="false",
+            got=f"true, with a {type(codec).__name__}",
+        )  # fmt: skip
+    return PerceptualLoss(codec, network, config.perceptual.latent_frames)
 
 
 def _named_parameters(model: WorldModel, prefix: str = "") -> dict[str, torch.nn.Parameter]:

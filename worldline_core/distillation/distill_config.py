@@ -17,6 +17,17 @@ CYCLE = 6
 """Iterations of one cycle of distribution matching: five updates of the fake score, then one of the student."""
 
 
+class PerceptualConfig(StrictModel):
+    """How frames are decoded for the perceptual term.
+
+    ``latent_frames``: how many latent frames, the last ones, are compared. ``bfloat16``: decode with weights in bfloat16
+    (the Wan autoencoder alone), for half the memory.
+    """
+
+    latent_frames: int = Field(default=2, ge=1)
+    bfloat16: bool = False
+
+
 class AuxiliaryWeights(StrictModel):
     """Weights of the auxiliaries; the defaults are the paper's. A weight of 0 turns its term off."""
 
@@ -133,6 +144,10 @@ class DistillConfig(StrictModel):
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
     distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    perceptual: PerceptualConfig = Field(
+        default=PerceptualConfig(), exclude_if=lambda value: value == PerceptualConfig()
+    )
     lpips_weights: Path | None = Field(default=None, description="folder of the LPIPS weights; None: that term is off")
 
     @model_validator(mode="after")

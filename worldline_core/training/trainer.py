@@ -37,11 +37,12 @@ from worldline_core.training.training_state import (
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters that share a learning-rate multiplier."""
+    """Parameters that share a learning-rate multiplier; ``averaged``: whether their moving average is wanted."""
 
     name: str
     parameters: Mapping[str, nn.Parameter]
     multiplier: float = 1.0
+    averaged: bool = True
 
 
 class NamedBatch(Protocol):
@@ -182,7 +183,8 @@ def train[BatchT: NamedBatch](
         weight_decay=settings.weight_decay,
         fused=True,
     )
-    average = ExponentialAverage(parameters, config.ema_decay)
+    wanted = [f"{group.name}/{name}" for group in groups if group.averaged for name in group.parameters]
+    average = ExponentialAverage({name: parameters[name] for name in wanted}, config.ema_decay)
     states = TrainingStates(output, config.saving, parameters, average, optimizer)
     plan = batch_plan(config, output)
     run = _Run(config, objective, load, optimizer, parameters, models, plan, states, title, output)
@@ -258,7 +260,7 @@ def train[BatchT: NamedBatch](
                     where=f"{title}, after step {done} of {config.steps}",
                     next_step=f"the same command continues from the state in {states.folder}",
                 )
-    names = [name for group in groups for name in group.parameters]
+    names = [name for group in groups if group.averaged for name in group.parameters]
     return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
 
 

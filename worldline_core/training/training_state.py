@@ -297,7 +297,8 @@ class TrainingStates:
         tensors: dict[str, Tensor] = {"random_state": torch.get_rng_state()}
         for name, parameter in self.parameters.items():
             tensors[f"weight/{name}"] = parameter.detach()
-            tensors[f"average/{name}"] = self.average.average[name]
+            if name in self.average.average:
+                tensors[f"average/{name}"] = self.average.average[name]
             for key, value in self.optimizer.state.get(parameter, {}).items():
                 tensors[f"{key}/{name}"] = value
         return tensors
