@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.errors import ConfigError
+from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, requested
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.untrusted_text import carries_credentials
 
@@ -92,8 +94,37 @@ class VideoEvaluationConfig(StrictModel):
     comparisons: tuple[tuple[str, str], ...] | None = Field(
         default=None, description="pairs of methods whose differences are reported; none: every pair"
     )
+    # Left out of dumps at their defaults: evaluations made before they existed keep their key in the store.
+    metrics: tuple[str, ...] = Field(
+        default=(), exclude_if=lambda value: not value, description="further metrics: " + ", ".join(ON_REQUEST)
+    )
+    changed_controls: dict[str, dict[Literal["shuffled", "mirrored", "delayed"], str]] = Field(
+        default={}, exclude_if=lambda value: not value,
+        description="of a method, the methods that are the same model under changed controls",
+    )  # fmt: skip
+    fvd_weights: Path | None = Field(
+        default=None, exclude_if=lambda value: value is None, description="local TorchScript file of I3D; none: no FVD"
+    )
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
+
+    @field_validator("metrics")
+    @classmethod
+    def _known(cls, metrics: tuple[str, ...]) -> tuple[str, ...]:
+        try:
+            requested(metrics)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return metrics
+
+    @model_validator(mode="after")
+    def _pairs_are_compared(self) -> Self:
+        compared = any(METRICS[name].needs == "changed_controls" for name in self.metrics)
+        if compared != bool(self.changed_controls):
+            raise ValueError(
+                "changed_controls go with a metric that compares them: action_following, counterfactual_direction"
+            )
+        return self
 
 
 class PolicyEvaluationConfig(StrictModel):

@@ -36,7 +36,7 @@ PATCH_FRACTION = 0.15  # half side of the patch, of the frame height: the grippe
 MIN_CONTRAST = 8.0  # standard deviation of a patch [grey levels]; flatter ones fit everywhere and say nothing
 SEARCH_FRACTION = 0.25  # search radius, of the frame height
 MIN_CORRELATION = 0.4
-_WINDOW = 11
+SSIM_WINDOW = 11
 _WINDOW_SIGMA = 1.5
 _K1, _K2 = 0.01, 0.03
 
@@ -58,15 +58,22 @@ def ssim(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) ->
 
     Raises: DataError when the shapes differ or a frame is smaller than the window.
     """
+    return reduce(ssim_map(predicted, true), "n c h w -> n", "mean")
+
+
+def ssim_map(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 y x"]:
+    """Structural similarity at each position of the window, y = h - 10, x = w - 10; as :func:`ssim`."""
     _check(predicted, true)
     channels = predicted.shape[1]
-    if min(predicted.shape[-2:]) < _WINDOW:
-        raise DataError("Frame smaller than the SSIM window", expected=f">= {_WINDOW}", got=str(tuple(predicted.shape)))
-    offsets = torch.arange(_WINDOW, dtype=predicted.dtype, device=predicted.device) - _WINDOW // 2
+    if min(predicted.shape[-2:]) < SSIM_WINDOW:
+        raise DataError(
+            "Frame smaller than the SSIM window", expected=f">= {SSIM_WINDOW}", got=str(tuple(predicted.shape))
+        )
+    offsets = torch.arange(SSIM_WINDOW, dtype=predicted.dtype, device=predicted.device) - SSIM_WINDOW // 2
     gaussian = torch.exp(-offsets.square() / (2 * _WINDOW_SIGMA**2))
     gaussian = gaussian / gaussian.sum()
-    rows = gaussian.view(1, 1, _WINDOW, 1).expand(channels, 1, _WINDOW, 1)
-    columns = gaussian.view(1, 1, 1, _WINDOW).expand(channels, 1, 1, _WINDOW)
+    rows = gaussian.view(1, 1, SSIM_WINDOW, 1).expand(channels, 1, SSIM_WINDOW, 1)
+    columns = gaussian.view(1, 1, 1, SSIM_WINDOW).expand(channels, 1, 1, SSIM_WINDOW)
     # Variances are differences of squares: taken around mid-grey they keep their digits in single precision.
     p, t = predicted - 0.5, true - 0.5
     moments = torch.cat([p, t, p.square(), t.square(), p * t], dim=1)
@@ -77,10 +84,9 @@ def ssim(predicted: Float[Tensor, "n 3 h w"], true: Float[Tensor, "n 3 h w"]) ->
     covariance = product - mean_p * mean_t
     mean_p, mean_t = mean_p + 0.5, mean_t + 0.5
     c1, c2 = _K1**2, _K2**2
-    index = ((2 * mean_p * mean_t + c1) * (2 * covariance + c2)) / (
+    return ((2 * mean_p * mean_t + c1) * (2 * covariance + c2)) / (
         (mean_p.square() + mean_t.square() + c1) * (variance_p + variance_t + c2)
     )
-    return reduce(index, "n c h w -> n", "mean")
 
 
 def frames_to_unit(frames: Tensor) -> Float[Tensor, "n 3 h w"]:

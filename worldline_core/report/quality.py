@@ -7,24 +7,15 @@ from typing import Any
 
 from markupsafe import Markup
 
+from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST
 from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
 from worldline_core.pages.page import Table, interval, words
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.video_scores import IOU_METRICS, SPLIT_LABELS, VideoScores
 
 TITLE = "Video quality"
-METRICS: dict[str, tuple[str, int]] = {
-    "robot_iou_exact": ("Robot IoU, exact\u00a0↑", 3),
-    "robot_iou": ("Robot IoU, segmenter\u00a0↑", 3),
-    "object_iou_exact": ("Object IoU, exact\u00a0↑", 3),
-    "ssim": ("SSIM\u00a0↑", 3),
-    "psnr": ("PSNR, dB\u00a0↑", 2),
-    "lpips": ("LPIPS\u00a0↓", 3),
-    "end_effector_error_px": ("Tool error, px\u00a0↓", 2),
-}
-"""Heading and digits of each metric that the tables show."""
+ALWAYS = tuple(name for name in METRICS if name not in ON_REQUEST)
 SUBGROUP_METRICS = ("robot_iou_exact", "robot_iou", "ssim", "psnr")
-LOWER_IS_BETTER = frozenset({"lpips", "end_effector_error_px"})
 
 
 def quality_section(context: ReportContext) -> Section:
@@ -44,6 +35,7 @@ def quality_section(context: ReportContext) -> Section:
         lead,
         instruments=instruments(scores),
         unavailable=sorted(scores.unavailable.items()),
+        asked=[METRICS[name] for name in ON_REQUEST if scores.measured(name)],
         groups=[group_parts(context, scores, group) for group in scores.groups],
     )
 
@@ -77,7 +69,13 @@ def group_parts(context: ReportContext, scores: VideoScores, group: str) -> dict
     return {
         "title": SPLIT_LABELS.get(group, group).capitalize(),
         "tables": [
-            found for found in (metric_table(scores, group, "head"), *second_segmenters(scores, group)) if found
+            found
+            for found in (
+                metric_table(scores, group, "head"),
+                on_request_table(scores, group),
+                *second_segmenters(scores, group),
+            )
+            if found
         ],
         "charts": [*difference_charts(context, scores, group), *(chart for chart in drift if chart)],
         "wrists": [found for found in wrists if found],
@@ -90,23 +88,24 @@ def metric_table(
     scores: VideoScores,
     group: str,
     view: str,
-    metrics: Sequence[str] = tuple(METRICS),
+    metrics: Sequence[str] = ALWAYS,
     suffix: str = "",
     title: str = "",
 ) -> Table | None:
-    """Methods in rows, metrics of one view in columns; the best of each column stands out."""
+    """Methods in rows, metrics of one view in columns (``name`` or ``name[variant]``); the best of each column stands out."""
     methods = scores.methods(group)
     names = {metric: f"{metric}{suffix}@{view}" for metric in metrics}
     shown = [m for m in metrics if any(scores.value(group, method.name, names[m]) for method in methods)]
     if not shown:
         return None
     best: dict[str, str] = {}
+    entries = {metric: METRICS[metric.partition("[")[0]] for metric in shown}
     for metric in shown:
         values = {m.name: found["mean"] for m in methods if (found := scores.value(group, m.name, names[metric]))}
-        best[metric] = (min if metric in LOWER_IS_BETTER else max)(values, key=lambda name: values[name])
+        best[metric] = (min if entries[metric].lower_is_better else max)(values, key=lambda name: values[name])
     rows = []
     for method in methods:
-        cells = [interval(scores.value(group, method.name, names[metric]), METRICS[metric][1]) for metric in shown]
+        cells = [interval(scores.value(group, method.name, names[metric]), entries[metric].digits) for metric in shown]
         rows.append([
             method.long_label,
             *[Markup("<strong>{}</strong>").format(cell) if cell and best[metric] == method.name else cell
@@ -116,8 +115,23 @@ def metric_table(
     caption = (
         f"{title or words(view).capitalize() + ' view'}; trajectories: {max(counts)}. Best of each column in bold."
     )
-    headings = ["Method", *[METRICS[metric][0] for metric in shown]]
-    return Table(headings, rows, range(1, len(headings)), caption)
+    variants = {metric: metric.partition("[")[2].rstrip("]") for metric in shown}
+    headings = [
+        f"{entries[metric].heading}, {variants[metric]}" if variants[metric] else entries[metric].heading
+        for metric in shown
+    ]
+    return Table(headings=["Method", *headings], rows=rows, numeric=range(1, len(headings) + 1), caption=caption)
+
+
+def on_request_table(scores: VideoScores, group: str) -> Table | None:
+    """The metrics that were asked for by name."""
+    found = {name.partition("@")[0] for method in scores.methods(group) for name in scores.names(group, method.name)}
+    order = [*METRICS]
+    asked = sorted(
+        (name for name in found if name.partition("[")[0] in ON_REQUEST),
+        key=lambda name: (order.index(name.partition("[")[0]), name),
+    )
+    return metric_table(scores, group, "head", asked, title="Paths of the tools, scene and controls, head view")
 
 
 def second_segmenters(scores: VideoScores, group: str) -> list[Table | None]:
@@ -178,7 +192,7 @@ def subgroup_table(scores: VideoScores, group: str) -> Table | None:
     for subgroup in scores.subgroups(group):
         for method in scores.methods(subgroup):
             cells = [scores.value(subgroup, method.name, f"{metric}@head") for metric in SUBGROUP_METRICS]
-            shown = [interval(c, METRICS[m][1]) for m, c in zip(SUBGROUP_METRICS, cells, strict=True)]
+            shown = [interval(c, METRICS[m].digits) for m, c in zip(SUBGROUP_METRICS, cells, strict=True)]
             rows.append([subgroup.split("/", 1)[1], method.long_label, *shown])
-    headings = ["Embodiment or outcome", "Method", *[METRICS[metric][0] for metric in SUBGROUP_METRICS]]
+    headings = ["Embodiment or outcome", "Method", *[METRICS[metric].heading for metric in SUBGROUP_METRICS]]
     return Table(headings, rows, range(2, 6)) if rows else None

@@ -130,6 +130,15 @@ class VideoScores:
         """Methods scored in a group, in the report's order."""
         return in_order({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})})
 
+    def names(self, group: str, method: str) -> set[str]:
+        """Names of what was measured of a method: ``psnr``, ``psnr@head``, ..."""
+        return {name for s in self.summaries for name in s.get("metrics", {}).get(group, {}).get(method, {})}
+
+    def measured(self, metric: str) -> bool:
+        """Whether a metric, or a variant of it, was measured of any method."""
+        names = {name for group in self.groups for m in self.methods(group) for name in self.names(group, m.name)}
+        return any(name.partition("@")[0].partition("[")[0] == metric for name in names)
+
     def value(self, group: str, method: str, metric: str) -> JsonObject | None:
         """`{"mean", "low", "high", "count"}` of a metric (`psnr`, `psnr@head`, ...), or None."""
         for summary in self.summaries:

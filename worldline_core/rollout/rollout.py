@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
+from worldline_core.actions.changed_controls import changed_tracks
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import write_quarantine
@@ -206,9 +207,12 @@ def _predicted(
     batch: Sequence[Prediction],
 ) -> Iterator[Frames]:
     """Frames of a batch, piece by piece."""
+    controls = [tracks.tracks(item.controls_of) for item in batch]
+    if config.actions == "mirrored" or config.actions == "delayed":
+        controls = [changed_tracks(control, config.actions) for control in controls]
     yield from world.stream(
         _observed(world, episodes, batch),
-        [tracks.tracks(item.controls_of) for item in batch],
+        controls,
         max(item.frames for item in batch),
         [item.seed for item in batch],
         views=batch[0].views,

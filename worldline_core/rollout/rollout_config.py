@@ -12,8 +12,9 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.model.world_model_config import TextConfig
 
-Controls = Literal["true", "zero", "shuffled"]
-"""Whose controls drive a prediction: the episode's own, none, or those of another episode."""
+Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
+"""What drives a prediction: the episode's own controls, none, those of another episode, or its own changed in a known way
+(`actions.changed_controls`)."""
 
 
 class RolloutConfig(StrictModel):

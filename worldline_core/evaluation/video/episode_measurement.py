@@ -17,6 +17,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
+from worldline_core.evaluation.metric_registry import Metric
 from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
 from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, VideoFrames, stride_of, tool_points
 from worldline_core.evaluation.segmenters.coloured_things import (
@@ -27,6 +28,8 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     thing_share,
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
+from worldline_core.evaluation.video.scene_consistency import SceneFrames
+from worldline_core.evaluation.video.tool_paths import ToolFinder
 from worldline_core.model.lpips import LPIPS
 from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -45,6 +48,8 @@ class _Piece:
     frames: np.ndarray
     points: np.ndarray
     masks: Mapping[str, np.ndarray]
+    first: tuple[np.ndarray, np.ndarray]
+    """The video's first frame, and its mask by the first segmenter."""
     exact: np.ndarray | None
     moved: tuple[np.ndarray, np.ndarray] | None
     """Exact masks of what the task moves, and where they have moved (n,)."""
@@ -60,6 +65,10 @@ class _Video:
         self._thing = thing
         self._own: OwnColour | None = None
         self._begun = False
+        self.first = np.zeros(0, dtype=np.uint8)
+        self.first_mask = np.zeros(0, dtype=bool)
+        self.finder = ToolFinder()
+        self.places: list[np.ndarray] = []
 
     def masks(self, frames: np.ndarray, points: np.ndarray) -> dict[str, np.ndarray]:
         """Robot masks of the next frames, by the suffix of a segmenter's metrics."""
@@ -86,6 +95,7 @@ class EpisodeMeasurement:
     Args:
         segmenters: by the suffix of their metrics.
         lpips: None where it is not available.
+        metrics: further ones that are asked for.
     """
 
     def __init__(
@@ -96,9 +106,12 @@ class EpisodeMeasurement:
         views: Sequence[str],
         segmenters: Mapping[str, Segmenter],
         lpips: LPIPS | None,
+        metrics: Mapping[str, Metric],
     ) -> None:
         self.episodes, self.tracks, self.segmenters, self.lpips = episodes, tracks, segmenters, lpips
         self.row, self.episode_id = row, row.episode_id
+        self.metrics = metrics
+        self.finds_tools = any(metric.needs in ("tool_paths", "changed_controls") for metric in metrics.values())
         self.position = episodes.position(row.episode_id)
         self.views = [view for view in views if view in row.views]
         self.thing = next(iter(named_things(row.instruction)), None)
@@ -111,19 +124,22 @@ class EpisodeMeasurement:
         """
         strides = {method: stride_of(rollout, self.row) for method, rollout in rollouts.items()}
         found: dict[tuple[str, int, str], FrameValues] = {}
+        tools: dict[tuple[str, int, str], np.ndarray] = {}
         accuracy: FrameValues | None = None
         longest = 0
         for stride in sorted(set(strides.values())):
             group = {method: rollout for method, rollout in rollouts.items() if strides[method] == stride}
             for view in self.views:
-                values, own = self._pass(group, view, stride)
+                values, own, places = self._pass(group, view, stride)
                 found |= values
+                tools |= places
                 if view == HEAD and accuracy is None:
                     accuracy = own
         contents: dict[str, dict[str, Any]] = {}
         for method, rollout in rollouts.items():
             measured = [
                 {"view": view, "seed": seed, "frames": found[method, seed, view]}
+                | self._of_paths(tools.get((method, seed, view)), strides[method])
                 for seed in rollout.seeds(self.episode_id)
                 for view in self.views
                 if (method, seed, view) in found
@@ -134,10 +150,22 @@ class EpisodeMeasurement:
         own = {"view": HEAD, "seed": 0, "frames": accuracy or {}}
         return contents | {TRUE_METHOD: {"num_frames": longest, "measured": [own]}}
 
+    def _of_paths(self, found: np.ndarray | None, stride: int) -> dict[str, Any]:
+        """Values of a whole video, and where its tools were found: (n, arms, 2), hundredths of the frame's height."""
+        if found is None:
+            return {}
+        points = tool_points(self.tracks, self.episode_id, len(found), stride)
+        scale = 100.0 / self.tracks.tracks(self.episode_id).image_size[0]
+        true, found = scale * points, scale * found
+        values = {
+            name: metric.load()(true, found) for name, metric in self.metrics.items() if metric.needs == "tool_paths"
+        }
+        return {"video": values, "tools": [[[finite_mean([x]) for x in place] for place in frame] for frame in found]}
+
     def _pass(
         self, rollouts: Mapping[str, RolloutSet], view: str, stride: int
-    ) -> tuple[dict[tuple[str, int, str], FrameValues], FrameValues]:
-        """Values of one view's predictions by (method, seed, view), and of the recording's own masks."""
+    ) -> tuple[dict[tuple[str, int, str], FrameValues], FrameValues, dict[tuple[str, int, str], np.ndarray]]:
+        """Values of one view's predictions by (method, seed, view), of the recording's own masks, and where tools are."""
         segmenters = self.segmenters if view == HEAD else {}
         recording = VideoFrames(self.episodes.clip(self.position, view), stride)
         videos: dict[tuple[str, int, str], _Video] = {}
@@ -158,7 +186,7 @@ class EpisodeMeasurement:
                 videos[method, seed, view] = _Video(predicted.pieces(PIECE_FRAMES), segmenters, self.thing)
         true = _Video(recording.pieces(PIECE_FRAMES), segmenters, self.thing)
         if not videos:
-            return {}, {}
+            return {}, {}, {}
         known = self._known(stride, longest) if view == HEAD else None
         for begin in range(0, longest, PIECE_FRAMES):
             frames = next(true.pieces)[: longest - begin]
@@ -174,8 +202,9 @@ class EpisodeMeasurement:
                     where = f"method {method}, episode {self.episode_id}, view {view}"
                     self._full_frame(video, predicted, frames[: len(predicted)], where)
                     if piece is not None:
-                        _robot(video, predicted, piece)
-        return {key: dict(video.values) for key, video in videos.items()}, dict(true.values)
+                        self._robot(video, predicted, piece)
+        places = {key: np.concatenate(video.places) for key, video in videos.items() if video.places}
+        return {key: dict(video.values) for key, video in videos.items()}, dict(true.values), places
 
     def _full_frame(self, video: _Video, predicted: np.ndarray, true: np.ndarray, where: str) -> None:
         if predicted.shape != true.shape:
@@ -190,6 +219,30 @@ class EpisodeMeasurement:
         video.add(psnr=psnr(p, t).tolist(), ssim=ssim(p, t).tolist())
         if self.lpips is not None:
             video.add(lpips=self.lpips(p, t).tolist())
+
+    def _robot(self, video: _Video, predicted: np.ndarray, true: _Piece) -> None:
+        """Metrics of predicted head frames, as many of the recorded ones as they are."""
+        part = slice(0, len(predicted))
+        points = true.points[part]
+        errors = end_effector_error(true.frames[part], predicted, points)
+        video.add(end_effector_error_px=[finite_mean(row) for row in errors])
+        found = video.masks(predicted, points)
+        for suffix, masks in found.items():
+            video.add(**{f"robot_iou{suffix}": _or_none(frame_iou(true.masks[suffix][part], masks))})
+            if true.exact is not None:
+                video.add(**{f"robot_iou_exact{suffix}": _or_none(frame_iou(true.exact[part], masks))})
+        video.add_object(predicted, None if true.moved is None else (true.moved[0][part], true.moved[1][part]))
+        robots = true.masks[""][part]
+        if self.finds_tools:
+            video.places.append(video.finder.find(robots, found[""], points))
+        if not video.first.size:
+            video.first = predicted[0]
+        scene = SceneFrames(
+            true.frames[part], predicted, true.first[0], video.first, robots | found[""] | true.first[1]
+        )
+        for name, metric in self.metrics.items():
+            if metric.needs == "frames":
+                video.add(**{name: metric.load()(scene)})
 
     def _known(self, stride: int, count: int) -> _Known:
         """What is known of the first ``count`` frames of the recorded head view, every ``stride``-th.
@@ -230,20 +283,10 @@ class _Known:
             stays = frame_iou(now, self.thing[:1].repeat(len(now), 0))
             moved = now, (stays < MOVED_IOU) & now.any(axis=(1, 2))
         exact = None if self.exact is None else self.exact[part]
-        return _Piece(frames, points, video.masks(frames, points), exact, moved)
-
-
-def _robot(video: _Video, predicted: np.ndarray, true: _Piece) -> None:
-    """Robot metrics of predicted head frames, as many of the recorded ones as they are."""
-    part = slice(0, len(predicted))
-    points = true.points[part]
-    errors = end_effector_error(true.frames[part], predicted, points)
-    video.add(end_effector_error_px=[finite_mean(row) for row in errors])
-    for suffix, masks in video.masks(predicted, points).items():
-        video.add(**{f"robot_iou{suffix}": _or_none(frame_iou(true.masks[suffix][part], masks))})
-        if true.exact is not None:
-            video.add(**{f"robot_iou_exact{suffix}": _or_none(frame_iou(true.exact[part], masks))})
-    video.add_object(predicted, None if true.moved is None else (true.moved[0][part], true.moved[1][part]))
+        masks = video.masks(frames, points)
+        if not video.first.size:
+            video.first, video.first_mask = frames[0], masks[""][0]
+        return _Piece(frames, points, masks, (video.first, video.first_mask), exact, moved)
 
 
 def finite_mean(values: Sequence[float | None] | np.ndarray) -> float | None:

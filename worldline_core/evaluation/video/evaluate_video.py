@@ -5,20 +5,22 @@ independently of each other. ``robot_iou_exact`` compares the predicted video's 
 How good the segmenter itself is shows in the rows of the method ``true``: its masks of true frames against exact ones.
 ``object_iou_exact`` is of what the task moves, in the frames in which it has moved, where the recording has its exact
 pixels: the colour that the instruction names masks it in the predicted video.
-Means over trajectories of every frame show drift along a rollout.
+Means over trajectories of every frame show drift along a rollout. `metric_registry` has every metric, those on request too.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
@@ -26,7 +28,15 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
-from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, rows_of
+from worldline_core.evaluation.metric_registry import METRICS, requested
+from worldline_core.evaluation.recordings import (
+    HEAD,
+    TRUE_METHOD,
+    VideoFrames,
+    open_rollouts,
+    rows_of,
+    stride_of,
+)
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
     Score,
@@ -37,9 +47,12 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
+from worldline_core.evaluation.video.controlled_pairs import Measured, check_changed_controls, controlled_values
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
-from worldline_core.model.lpips import LPIPS, load_lpips
+from worldline_core.evaluation.video.fvd import LEAST_FRAMES, Features, FrechetDistances, distances, open_i3d
+from worldline_core.model.lpips import load_lpips
 from worldline_core.progress import Progress
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
 
 logger = logging.getLogger(__name__)
@@ -62,22 +75,27 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
         f"[{name}]" if place else "": open_segmenter(name, learned=inputs.get("segmenter"), sam3=config.sam3_weights)
         for place, name in enumerate(config.segmenters)
     }
-    lpips, unavailable = _open_lpips(config.lpips_weights)
+    metrics = requested(config.metrics)
+    check_changed_controls(config, list(rollouts))
+    unavailable: dict[str, str] = {}
+    lpips = _open(load_lpips, config.lpips_weights, "lpips", unavailable)
+    i3d = _open(open_i3d, config.fvd_weights, "fvd", unavailable) if "fvd" in metrics else None
     parts = output / "run" / "parts"
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
 
-    def measure(row: EpisodeRow) -> list[tuple[str, EpisodeRow, dict[str, Any]]]:
+    def measure(row: EpisodeRow) -> list[Measured]:
         name = row.episode_id
         files = {method: part_file(parts, method, name) for method in rollouts if name in predicted[method]}
         files[TRUE_METHOD] = part_file(parts, TRUE_METHOD, name)
         made: dict[str, dict[str, Any]] = {}
         if not all(path.is_file() for path in files.values()):
             of_episode = {method: rollouts[method] for method in files if method != TRUE_METHOD}
-            made = EpisodeMeasurement(episodes, tracks, row, config.views, segmenters, lpips).measure(of_episode)
+            episode = EpisodeMeasurement(episodes, tracks, row, config.views, segmenters, lpips, metrics)
+            made = episode.measure(of_episode)
         return [(method, row, kept_part(path, partial(made.__getitem__, method))) for method, path in files.items()]
 
     rows = rows_of(episodes, set().union(*predicted.values()))
-    records: list[tuple[str, EpisodeRow, dict[str, Any]]] = []
+    records: list[Measured] = []
     with (
         _workers(on_gpu="sam3" in config.segmenters) as pool,
         Progress("evaluate_video", len(rows), "episode") as progress,
@@ -85,7 +103,9 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
         for found in pool.map(measure, rows):
             records += found
             progress.advance()
-    return _write(config, records, segmenters, unavailable, output)
+    pairs = list(controlled_values(config, records, tracks, rollouts))
+    fvd = None if i3d is None else _fvd(config, episodes, rows, rollouts, i3d, parts)
+    return _write(config, records, pairs, fvd, segmenters, unavailable, output)
 
 
 @contextmanager
@@ -102,36 +122,75 @@ def _workers(*, on_gpu: bool) -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _open_lpips(folder: Path | None) -> tuple[LPIPS | None, dict[str, str]]:
-    """LPIPS where it is available, and otherwise the reason why it is not, by metric."""
+def _open[W](open_weights: Callable[[Path | None], W], path: Path | None, metric: str, why: dict[str, str]) -> W | None:
+    """A metric's weights where they are available; otherwise `why` gets the reason why they are not."""
     try:
-        return load_lpips(folder), {}
+        return open_weights(path)
     except UnavailableError as error:
         logger.warning("%s", error)
-        return None, {"lpips": f"{error.what}: {error.got}" if error.got else error.what}
+        why[metric] = f"{error.what}: {error.got}" if error.got else error.what
+        return None
+
+
+def _fvd(
+    config: VideoEvaluationConfig,
+    episodes: EpisodeSet,
+    rows: Sequence[EpisodeRow],
+    rollouts: Mapping[str, RolloutSet],
+    i3d: Features,
+    parts: Path,
+) -> FrechetDistances:
+    """FVD of every method's head views (of the smallest seed), by split."""
+    features: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {method: {} for method in rollouts}
+    groups: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        groups[row.split].append(row.episode_id)
+        for method, rollout in rollouts.items():
+            if row.episode_id not in rollout.episode_ids or HEAD not in rollout.views(row.episode_id):
+                continue
+            predicted, stride = VideoFrames(rollout.clip(row.episode_id, HEAD)), stride_of(rollout, row)
+            if (count := len(predicted)) < LEAST_FRAMES:
+                continue
+            true = VideoFrames(episodes.clip(episodes.position(row.episode_id), HEAD), stride)
+            own, other = (
+                np.array(kept_part(path, lambda video=video: i3d(video[list(range(count))]).tolist()))
+                for path, video in (
+                    (part_file(parts, "fvd", TRUE_METHOD, row.episode_id, stride, count), true),
+                    (part_file(parts, "fvd", method, row.episode_id), predicted),
+                )
+            )
+            features[method][row.episode_id] = own, other
+    comparisons = list(combinations(sorted(rollouts), 2)) if config.comparisons is None else config.comparisons
+    return distances(features, groups, comparisons, config.seed)
 
 
 def _write(
     config: VideoEvaluationConfig,
-    records: Sequence[tuple[str, EpisodeRow, dict[str, Any]]],
+    records: Sequence[Measured],
+    pairs: Sequence[tuple[str, EpisodeRow, int, str, float]],
+    fvd: FrechetDistances | None,
     segmenters: Mapping[str, Segmenter],
     unavailable: Mapping[str, str],
     output: Path,
 ) -> dict[str, Any]:
-    scores: list[Score] = []
+    def score(method: str, row: EpisodeRow, view: str, seed: int, metric: str, value: float) -> Score:
+        return Score(
+            method, row.episode_id, row.embodiment, row.split, view, seed, metric, value,
+            row.scene, row.task_family, row.outcome,
+        )  # fmt: skip
+
+    scores = [score(method, row, HEAD, seed, metric, value) for method, row, seed, metric, value in pairs]
     by_frame: list[tuple[str, str, str, str, list[float | None]]] = []
     for method, row, content in records:
         for item in content["measured"]:
-            for metric, frames in item["frames"].items():
-                by_frame.append((method, row.split, item["view"], metric, frames))
-                value = finite_mean(frames)
-                if value is not None:  # otherwise empty in every frame: the video is left out
-                    scores.append(
-                        Score(
-                            method, row.episode_id, row.embodiment, row.split, item["view"], item["seed"], metric, value,
-                            row.scene, row.task_family, row.outcome,
-                        )
-                    )  # fmt: skip
+            by_frame += [(method, row.split, item["view"], name, frames) for name, frames in item["frames"].items()]
+            values = {name: finite_mean(frames) for name, frames in item["frames"].items()} | item.get("video", {})
+            # What is empty in every frame is left out.
+            scores += [
+                score(method, row, item["view"], item["seed"], name, value)
+                for name, value in values.items()
+                if value is not None
+            ]
     write_scores(output, scores)
     write_by_frame(output / BY_FRAME_FILE, by_frame)
     options = {"comparisons": config.comparisons, "resamples": config.resamples, "seed": config.seed, "by_view": True}
@@ -153,10 +212,15 @@ def _write(
             {"name": s.name, "description": s.description, "suffix": suffix, "accuracy_on_true_frames": accuracy}
             for suffix, s in segmenters.items()
         ],
-        "units": {"psnr": "dB", "end_effector_error_px": "px"},
+        "units": {metric.name: metric.unit for metric in METRICS.values() if metric.unit},
         "num_episodes": len(found),
         "interval": "95 % bootstrap over trajectories",
     }
+    if fvd is not None:
+        for group, methods in fvd[0].items():
+            for method, interval in methods.items():
+                summary["metrics"][group][method]["fvd@head"] = interval
+            summary["differences"].setdefault(group, []).extend(fvd[1].get(group, []))
     write_json_atomic(output / SUMMARY_FILE, summary)
     return {
         "found": len(found),
