@@ -197,10 +197,15 @@ def _task(arguments: argparse.Namespace) -> None:
 def _record(arguments: argparse.Namespace) -> None:
     from worldline_core.config import load_config, read_yaml
     from worldline_core.recorder.banks import RecordBanksConfig, record_banks
+    from worldline_core.recorder.policies import RecordPoliciesConfig, record_policies
     from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
 
     path, overrides, output = arguments.config, arguments.overrides, arguments.output
-    if {"banks", "grid"} & set(read_yaml(path)):
+    keys = set(read_yaml(path))
+    if "policies" in keys:
+        config = load_config(RecordPoliciesConfig, path=path, overrides=overrides)
+        print(record_with_manifest("record_policies", record_policies, config, output))
+    elif {"banks", "grid"} & keys:
         config = load_config(RecordBanksConfig, path=path, overrides=overrides)
         print(record_with_manifest("record_banks", record_banks, config, output))
     else:

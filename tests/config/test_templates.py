@@ -18,6 +18,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
 from worldline_core.pipeline.steps import get_step
 from worldline_core.recorder.banks import RecordBanksConfig
+from worldline_core.recorder.policies import RecordPoliciesConfig
 from worldline_core.recorder.record import RecordConfig, plan_jobs
 
 TEMPLATES = sorted([*(CONFIG_ROOT / "sources").glob("*.yaml"), *(CONFIG_ROOT / "filters").glob("*.yaml")])
@@ -37,15 +38,22 @@ def test_a_preset_is_a_plan_whose_rollouts_are_evaluated(preset: str, project_ro
     nodes = {node.name: node for node in plan(config, project_root)}
     assert config.rollouts
     for name, run in config.rollouts.items():
-        evaluations = ["evaluate_planning"] if run.episodes == "banks" else ["evaluate_video", "evaluate_policy"]
+        asked = {"evaluate_video": config.evaluate_video, "evaluate_policy": config.evaluate_policy}
+        evaluations = (
+            ["evaluate_planning"] if run.episodes == "banks" else [k for k, v in asked.items() if v is not None]
+        )
+        assert evaluations
         for evaluation in evaluations:
             assert f"rollout.{name}" in nodes[evaluation].inputs.values()
 
 
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
 def test_a_recording_loads_as_it_is(path: Path) -> None:
-    if "groups" in read_yaml(path):
+    sections = read_yaml(path)
+    if "groups" in sections:
         assert plan_jobs(load_config(RecordConfig, path=path))
+    elif "policies" in sections:
+        assert load_config(RecordPoliciesConfig, path=path).starts.specs()
     else:
         assert load_config(RecordBanksConfig, path=path).specs()
 

@@ -69,7 +69,9 @@ def _tracks(episode_id: str, points: np.ndarray) -> SimpleNamespace:
     )  # fmt: skip
 
 
-def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) -> SmallWorld:
+def _write(
+    root: Path, cases: dict[str, bool], *, split: str, bank: str | None, sources: dict[str, str] | None = None
+) -> SmallWorld:
     episodes, tracks = root / "episodes", root / "tracks"
     methods = {"good": root / "good", "copy": root / "copy"}
     writers = {name: RolloutSetWriter(path, name, FPS) for name, path in methods.items()}
@@ -79,7 +81,7 @@ def _write(root: Path, cases: dict[str, bool], *, split: str, bank: str | None) 
             frames, masks, points = make_film(success, seed=0 if bank else number)
             state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
             episode = Episode(
-                episode_id=episode_id, source="test", embodiment="box_arm", scene=f"scene_{number % 2}",
+                episode_id=episode_id, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm", scene=f"scene_{number % 2}",
                 task_family="lift", instruction="lift the red cube",
                 outcome="unknown" if bank else ("success" if success else "failure"), split=split, fps=FPS,
                 state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
@@ -105,6 +107,14 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     """Two successes and two failures of the test split."""
     cases = {"ep-0": True, "ep-1": False, "ep-2": True, "ep-3": False}
     return _write(tmp_path_factory.mktemp("recordings"), cases, split="test", bank=None)
+
+
+@pytest.fixture(scope="session")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+    """Three policies, which succeed in three, two and none of three attempts."""
+    cases = {f"{name}-{start}": start < wins for name, wins in (("a", 3), ("b", 2), ("c", 0)) for start in range(3)}
+    root = tmp_path_factory.mktemp("policies")
+    return _write(root, cases, split="test", bank=None, sources={name: f"policy_{name[0]}" for name in cases})
 
 
 @pytest.fixture(scope="session")

@@ -138,8 +138,19 @@ class PolicyEvaluationConfig(StrictModel):
     splits: tuple[str, ...] = ("test", "ood_test")
     balanced: bool = True
     max_per_group: int | None = Field(default=None, ge=1, description="of each outcome, in each split and family")
+    compare_policies: bool = Field(
+        default=False,
+        description="a source of the episodes is a policy: compare their recorded and predicted success rates",
+        exclude_if=lambda value: not value,
+    )
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
+
+    @model_validator(mode="after")
+    def _all_attempts(self) -> PolicyEvaluationConfig:
+        if self.compare_policies and (self.balanced or self.max_per_group is not None):
+            raise ValueError("compare_policies needs every attempt: set balanced: false and max_per_group: null")
+        return self
 
 
 class PlanningConfig(StrictModel):

@@ -33,6 +33,9 @@ class Series:
     markers: bool = False
     faint: bool = False
     """A raw curve behind its smoothed one: thin, pale, without an entry in the legend."""
+    scatter: bool = False
+    """Points alone, without a line; ``names`` say what each is."""
+    names: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -151,10 +154,14 @@ def _line(item: Series, x_axis: Axis, y_axis: Axis) -> dict[str, object]:
     if item.low is not None and item.high is not None and len(usable) > 1:
         band = " ".join(points(item.low) + points(item.high)[::-1])
     dots = [
-        (x_axis.at(item.x[i]), y_axis.at(item.y[i]), f"{item.label}: {tick_label(item.x[i])}, {item.y[i]:.4g}")
-        for i in (usable if item.markers or len(usable) == 1 else ())
+        (
+            x_axis.at(item.x[i]),
+            y_axis.at(item.y[i]),
+            f"{', '.join([item.label, *item.names[i : i + 1]])}: {tick_label(item.x[i])}, {item.y[i]:.4g}",
+        )
+        for i in (usable if item.markers or item.scatter or len(usable) == 1 else ())
     ]
-    line = " ".join(points(item.y)) if len(usable) > 1 else ""
+    line = " ".join(points(item.y)) if len(usable) > 1 and not item.scatter else ""
     return {"style": item, "line": line, "band": band, "dots": dots}
 
 

@@ -73,7 +73,7 @@ class PipelineConfig(StrictModel):
     train_stage2: Stage2Config
     distill: DistillConfig
     rollouts: dict[str, RolloutRun]
-    evaluate_video: VideoEvaluationConfig
+    evaluate_video: VideoEvaluationConfig | None = Field(default=None, description="none: predictions are judged only")
     evaluate_policy: PolicyEvaluationConfig | None = Field(
         default=None, description="none: predictions are not judged, where recordings say no outcome"
     )
@@ -129,9 +129,10 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
     named |= {
         "train_stage1.text.path": None if config.train_stage1 is None else config.train_stage1.text.path,
         "distill.lpips_weights": config.distill.lpips_weights,
-        "evaluate_video.lpips_weights": config.evaluate_video.lpips_weights,
-        "evaluate_video.sam3_weights": config.evaluate_video.sam3_weights,
     }
+    if config.evaluate_video is not None:
+        named["evaluate_video.lpips_weights"] = config.evaluate_video.lpips_weights
+        named["evaluate_video.sam3_weights"] = config.evaluate_video.sam3_weights
     if config.evaluate_policy is not None:
         named["evaluate_policy.sam3_weights"] = config.evaluate_policy.sam3_weights
         named["evaluate_policy.vlm.weights"] = config.evaluate_policy.vlm.weights

@@ -122,8 +122,9 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
     scores: dict[str, str | Path] = {}
     if recordings:
         shared: dict[str, str | Path] = {"episodes": "filter", "tracks": "render_actions", **segmenter}
-        yield Node("evaluate_video", "evaluate_video", config.evaluate_video, {**shared, **recordings})
-        scores["evaluate_video"] = "evaluate_video"
+        if config.evaluate_video is not None:
+            yield Node("evaluate_video", "evaluate_video", config.evaluate_video, {**shared, **recordings})
+            scores["evaluate_video"] = "evaluate_video"
         if config.evaluate_policy is not None:
             yield Node("evaluate_policy", "evaluate_policy", config.evaluate_policy, {**shared, **recordings})
             scores["evaluate_policy"] = "evaluate_policy"

@@ -6,7 +6,6 @@ among candidates cannot read it from the index.
 
 from __future__ import annotations
 
-import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +26,12 @@ from worldline_core.recorder.record import (
     Family,
     check_recorded,
     open_recorder,
+    run_in_processes,
 )
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion
 from worldline_core.recorder.things import Layout, sample_layout
-from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SEALED_FILE = "sealed_outcomes.parquet"
@@ -173,16 +172,9 @@ def record_banks(config: RecordBanksConfig, output: Path) -> dict[str, Any]:
     tasks = [(spec, config, output, finished) for spec in specs]
     with Progress("record banks", len(specs), "bank") as progress:
         sealed: list[list[dict[str, str]]] = []
-        if config.workers == 1:
-            for task in tasks:
-                sealed.append(_record_bank(task))
-                progress.advance()
-        else:
-            # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
-            with multiprocessing.get_context("spawn").Pool(config.workers, end_with_pool) as pool:
-                for rows in pool.imap(_record_bank, tasks):
-                    sealed.append(rows)
-                    progress.advance()
+        for rows in run_in_processes(_record_bank, tasks, config.workers):
+            sealed.append(rows)
+            progress.advance()
     if not finished:
         EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf).close()
     rows = sorted((row for bank in sealed for row in bank), key=lambda row: row["episode_id"])

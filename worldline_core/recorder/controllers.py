@@ -38,8 +38,11 @@ _CARRY = {"good": 0.52, "beside": 0.12, "high": 0.07, "open": 0.06, "relax": 0.0
 _PRESS = {"good": 0.54, "short": 0.16, "beside": 0.16, "other": 0.14}
 
 
-def _draw(plans: dict[str, float], random: np.random.Generator) -> str:
+def _draw(plans: dict[str, float], random: np.random.Generator, mistakes: float | None) -> str:
     shares = np.array(list(plans.values()))
+    if mistakes is not None:
+        good = np.array([plan == "good" for plan in plans])
+        shares = np.where(good, 1.0 - mistakes, mistakes * shares / shares[~good].sum())
     return str(random.choice(list(plans), p=shares / shares.sum()))
 
 
@@ -82,8 +85,8 @@ def _grasp(
     return points, xy, height, yaw, closed
 
 
-def _lift(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Waypoint]:
-    plan, pace = _draw(_LIFT, random), random.uniform(0.96, 1.03)
+def _lift(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: float | None) -> list[Waypoint]:
+    plan, pace = _draw(_LIFT, random, mistakes), random.uniform(0.96, 1.03)
     times = pace * np.array([0.8, 1.2, 1.85, 2.75, 3.4])
     points, xy, height, yaw, closed = _grasp(robot, layout, random, plan, times)
     rise = random.uniform(0.02, 0.035) if plan == "low" else random.uniform(0.13, 0.18)
@@ -96,10 +99,10 @@ def _lift(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Way
     return points
 
 
-def _place(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Waypoint]:
+def _place(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: float | None) -> list[Waypoint]:
     if layout.goal is None:
         raise DataError("The layout does not fit the task", where=layout.family, expected="a pad")
-    plan, pace = _draw(_PLACE, random), random.uniform(0.97, 1.02)
+    plan, pace = _draw(_PLACE, random, mistakes), random.uniform(0.97, 1.02)
     times = pace * np.array([0.65, 0.95, 1.5, 1.85, 2.4, 2.65, 3.1, 3.45])
     points, xy, height, yaw, closed = _grasp(robot, layout, random, plan, times)
     goal = layout.goal.xy + random.normal(0, 0.006, 2)
@@ -134,8 +137,8 @@ def _elsewhere(robot: Robot, layout: Layout, random: np.random.Generator) -> np.
     return far[0] if far else spots[int(np.argmax(distances))]
 
 
-def _close(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Waypoint]:
-    plan, pace = _draw(_CLOSE, random), random.uniform(0.96, 1.03)
+def _close(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: float | None) -> list[Waypoint]:
+    plan, pace = _draw(_CLOSE, random, mistakes), random.uniform(0.96, 1.03)
     times = pace * np.array([0.8, 1.2, 2.7, 3.1])
     xy, yaw, opening = layout.target.xy, random.normal(0, 0.08), random.uniform(0.0, 0.1)
     y = xy[1] + random.normal(0, 0.01)
@@ -155,8 +158,8 @@ def _close(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Wa
     ]
 
 
-def _press(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Waypoint]:
-    plan, pace = _draw(_PRESS, random), random.uniform(0.96, 1.03)
+def _press(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: float | None) -> list[Waypoint]:
+    plan, pace = _draw(_PRESS, random, mistakes), random.uniform(0.96, 1.03)
     times = pace * np.array([1.1, 2.4, 2.7, 3.4])
     goal = layout.target.xy + random.normal(0, 0.006, 2)
     others = [thing for thing in layout.others if thing.kind == "button"]
@@ -175,9 +178,9 @@ def _press(robot: Robot, layout: Layout, random: np.random.Generator) -> list[Wa
     ]
 
 
-def _carry(robot: Robot, layout: Layout, random: np.random.Generator) -> list[list[Waypoint]]:
+def _carry(robot: Robot, layout: Layout, random: np.random.Generator, mistakes: float | None) -> list[list[Waypoint]]:
     """Both arms take the tray by its handles and raise it; what goes wrong goes wrong with one of them, or both."""
-    plan, pace = _draw(_CARRY, random), random.uniform(0.96, 1.03)
+    plan, pace = _draw(_CARRY, random, mistakes), random.uniform(0.96, 1.03)
     times = pace * np.array([0.85, 1.25, 1.85, 2.65, 3.25])
     # A hand that misses lets the other try alone; both relax, and both, or one of them, let go.
     wrong = {0, 1} if plan in ("high", "relax", "low") or random.uniform() < 0.4 else {int(random.integers(2))}
@@ -226,13 +229,19 @@ def _idle(robot: Robot, layout: Layout, arm: int, random: np.random.Generator, d
     return points
 
 
-def plan_waypoints(robot: Robot, layout: Layout, random: np.random.Generator, duration: float) -> list[list[Waypoint]]:
-    """Waypoints per arm for ``duration`` seconds."""
+def plan_waypoints(
+    robot: Robot, layout: Layout, random: np.random.Generator, duration: float, *, mistakes: float | None = None
+) -> list[list[Waypoint]]:
+    """Waypoints per arm for ``duration`` seconds.
+
+    Args:
+        mistakes: the share of plans that go wrong; by default each task's own.
+    """
     if layout.family == "carry":
-        plans = _carry(robot, layout, random)
+        plans = _carry(robot, layout, random, mistakes)
     else:
         plans = [
-            _TASKS[layout.family](robot, layout, random)
+            _TASKS[layout.family](robot, layout, random, mistakes)
             if arm == layout.arm
             else _idle(robot, layout, arm, random, duration)
             for arm in range(len(robot.arms))

@@ -10,7 +10,7 @@ import importlib.metadata
 import json
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -206,16 +206,14 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
 
 
-def _run_jobs(jobs: list[Job], config: RecordConfig, output: Path) -> Iterator[None]:
-    """Record in ``config.workers`` processes; yields whenever an episode is done."""
-    tasks = [(job, config, output) for job in jobs]
-    if config.workers == 1 or len(tasks) <= 1:
-        yield from map(_record_job, tasks)
-        _close_recorders()
+def run_in_processes[T, R](work: Callable[[T], R], tasks: Sequence[T], workers: int, chunk: int = 1) -> Iterator[R]:
+    """What `work` returns for each task, in their order; the processes end with this one."""
+    if workers == 1 or len(tasks) <= 1:
+        yield from map(work, tasks)
         return
     # A fresh interpreter per worker: OpenGL contexts do not survive a fork.
-    with multiprocessing.get_context("spawn").Pool(config.workers, end_with_pool) as pool:
-        yield from pool.imap_unordered(_record_job, tasks, chunksize=6)
+    with multiprocessing.get_context("spawn").Pool(workers, end_with_pool) as pool:
+        yield from pool.imap(work, tasks, chunksize=chunk)
 
 
 def record(config: RecordConfig, output: Path) -> dict[str, Any]:
@@ -234,8 +232,9 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
         missing = [job for job in jobs if not writer.has(job.episode_id)]
         done = len(jobs) - len(missing)
         with Progress("record", len(jobs), "episode", done=done) as progress:
-            for _ in _run_jobs(missing, config, output):
+            for _ in run_in_processes(_record_job, [(job, config, output) for job in missing], config.workers, chunk=6):
                 progress.advance()
+        _close_recorders()
         writer.close()
     table: dict[str, dict[str, dict[str, int]]] = {}
     rows = EpisodeSet.open(output).rows
@@ -278,7 +277,7 @@ def record_with_manifest[C: StrictModel](
     """``run(config, output)``, which continues a killed recording; the manifest is written last.
 
     Args:
-        step: ``record_episodes`` or ``record_banks``.
+        step: ``record_episodes``, ``record_banks`` or ``record_policies``.
         config: has a ``seed``.
 
     Raises:

@@ -20,7 +20,7 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import BODIES, CENTRE, Robot
 from worldline_core.recorder.controllers import plan_waypoints
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, plan_actions
+from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoint, plan_actions
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
 from worldline_core.recorder.scene_model import FRAME_RATE, SUBSTEPS, SceneModel
@@ -160,10 +160,13 @@ class EpisodeRecorder:
     def move(self, layout: Layout, random: np.random.Generator, num_frames: int) -> Motion | None:
         """Plan and execute; None when the plan leaves what the arms can reach."""
         plans = plan_waypoints(self.scene.robot, layout, random, (num_frames - 1) / FRAME_RATE)
+        action = self.follow(plans, num_frames)
+        return None if action is None else self.replay(layout, action)
+
+    def follow(self, plans: list[list[Waypoint]], num_frames: int) -> np.ndarray | None:
+        """Actions (N, J) that lead every arm along its waypoints; None when these leave what the arms can reach."""
         action, worst = plan_actions(self.scene, self._solver, plans, num_frames)
-        if worst > REACH_TOLERANCE_M:
-            return None
-        return self.replay(layout, action)
+        return None if worst > REACH_TOLERANCE_M else action
 
     def replay(self, layout: Layout, action: np.ndarray) -> Motion:
         """Execute recorded actions (N, J) from the layout's initial state."""

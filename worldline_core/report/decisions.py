@@ -41,7 +41,54 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
     shown = [m for m in methods if m.kind in (TRUE_METHOD, "stage2", "causal")]
     confusions = [(m.long_label, rows) for m in shown if (rows := confusion(results[m.name]))]
     short = sorted((summary.get("shorter_than_recording") or {}).items())
-    return {"chart": chart, "confusions": confusions, "short": short, "groups": group_table(results)}
+    ranking = policy_ranking(summary["policies"]) if summary.get("policies") else None
+    groups = group_table(results)
+    return {"chart": chart, "confusions": confusions, "short": short, "groups": groups, "ranking": ranking}
+
+
+def policy_ranking(policies: JsonObject) -> dict[str, object]:
+    """Recorded against predicted success rates of policies: the figure, how they agree, and every policy's rates."""
+    methods = in_order(policies)
+    rates = {m.name: policies[m.name][ALL]["policies"] for m in methods}
+    shown = [m for m in methods if m.kind in (TRUE_METHOD, "stage2", "causal", "other")]
+    points = [
+        Series(
+            m.long_label, [p["recorded"] for p in rates[m.name].values()],
+            [p["predicted"] for p in rates[m.name].values()], colour=m.colour, scatter=True, names=list(rates[m.name]),
+        )
+        for m in shown
+    ]  # fmt: skip
+    chart = line_chart(
+        [*points, Series("equal", [0.0, 1.0], [0.0, 1.0], colour="c5", dashed=True)],
+        title="Success rate of every policy", x_label="as recorded", y_label="as predicted", y_range=(0.0, 1.02),
+        x_ticks=[0.0, 0.25, 0.5, 0.75, 1.0],
+    )  # fmt: skip
+
+    def told(found: JsonObject) -> str | None:
+        if found["value"] is None:
+            return None
+        bounds = found["over_starts_and_policies"]
+        return number(found["value"]) + ("" if bounds is None else f" ({number(bounds[0])} to {number(bounds[1])})")
+
+    names = ("pearson", "spearman", "mmrv", "rate_error")
+    rows = [
+        [m.long_label, words(task), *[told(found[name]) for name in names]]
+        for m in methods
+        for task, found in policies[m.name].items()
+    ]
+    agreement = Table(
+        ["Videos of", "Task", "Pearson r", "Spearman rho", "MMRV", "Error of rates"], rows, range(2, 6),
+        "Agreement over policies, 95 % interval over starts and policies", dense=True,
+    )  # fmt: skip
+    recorded = rates[methods[0].name]
+    listed = [
+        [name, recorded[name]["attempts"], share(recorded[name]["recorded"])]
+        + [share(rates[m.name][name]["predicted"]) if name in rates[m.name] else None for m in methods]
+        for name in sorted(recorded, key=lambda name: -recorded[name]["recorded"])
+    ]
+    headings = ["Policy", "Attempts", "Recorded", *[m.long_label for m in methods]]
+    table = Table(headings, listed, range(1, len(headings)), "Success rates by policy", dense=True)
+    return {"chart": chart, "agreement": agreement, "table": table}
 
 
 def confusion(groups: JsonObject) -> list[tuple[str, list[tuple[int, float]]]]:

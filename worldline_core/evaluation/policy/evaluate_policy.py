@@ -22,6 +22,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
+from worldline_core.evaluation.policy.agreement import policy_agreement
 from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
@@ -64,7 +65,8 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     """Judge every method's videos and compare with the recorded outcomes.
 
     Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
-    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json.
+    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json (with
+    ``compare_policies`` also how success rates of policies agree: ``agreement.py``).
     """
     episodes = EpisodeSet.open(inputs["episodes"])
     rollouts = open_rollouts(inputs)
@@ -134,7 +136,21 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             got=f"{len(rows)} predicted episodes: {left_out}",
             next_step="predict recordings with known outcomes, or leave the judgement out: evaluate_policy: null",
         )
-    return counts | _write(config, decisions, dict(too_short), judge.name, output)
+    policies: dict[str, Any] = {}
+    if config.compare_policies:
+        attempts = {row.episode_id: {"policy": row.source, "start": row.bank or row.episode_id} for row in chosen}
+        labelled = [
+            {"task": _verb(decision["instruction"]), **attempts[decision["episode_id"]], **decision}
+            for decision in decisions
+        ]
+        policies["policies"] = policy_agreement(labelled, resamples=config.resamples, seed=config.seed)
+    return counts | _write(
+        config, decisions, policies | {"shorter_than_recording": dict(too_short)}, judge.name, output
+    )
+
+
+def _verb(instruction: str) -> str:
+    return instruction.split(maxsplit=1)[0].lower() if instruction.strip() else "none"
 
 
 def choose_trajectories(
@@ -171,7 +187,7 @@ def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
 
 
 def _write(
-    config: PolicyEvaluationConfig, rows: list[dict[str, Any]], too_short: dict[str, int], judge: str, output: Path
+    config: PolicyEvaluationConfig, rows: list[dict[str, Any]], facts: dict[str, Any], judge: str, output: Path
 ) -> dict[str, Any]:
     rows = sorted(rows, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
     write_table(output / DECISIONS_FILE, rows, _COLUMNS)
@@ -186,7 +202,7 @@ def _write(
         ],
     )  # fmt: skip
     summary = summarise_decisions(rows, resamples=config.resamples, seed=config.seed)
-    summary |= {"judge": judge, "shorter_than_recording": too_short, "interval": "95 % bootstrap over trajectories"}
+    summary |= {"judge": judge, "interval": "95 % bootstrap over trajectories", **facts}
     write_json_atomic(output / SUMMARY_FILE, summary)
     overall = {method: values[_ALL]["accuracy"]["mean"] for method, values in summary["methods"].items()}
     return {"trajectories": summary["trajectories"], "judge": judge, "accuracy": overall}

@@ -1,0 +1,104 @@
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from worldline_core.config import load_config
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.clip import read_clip
+from worldline_core.recorder.banks import BankGrid
+from worldline_core.recorder.controllers import plan_waypoints
+from worldline_core.recorder.policies import RecordPoliciesConfig, ScriptedPolicy, attempt, draw_start, record_policies
+from worldline_core.recorder.record import open_recorder
+from worldline_core.recorder.things import sample_layout
+
+POLICIES = {
+    "expert": ScriptedPolicy(),
+    "blind": ScriptedPolicy(bias_m=(0.0, 0.12)),
+    "late": ScriptedPolicy(delay_frames=6),
+}
+GRID = BankGrid(embodiments=("ur5e_silver",), families=("press",), scenes=("scene_12",), count=1)
+CONFIG = RecordPoliciesConfig(policies=POLICIES, starts=GRID, seed=3, num_frames=33, workers=1)
+
+
+@pytest.fixture(scope="module")
+def recorder():
+    with_body = open_recorder("ur5e_silver")
+    yield with_body
+    with_body.close()
+
+
+def test_every_policy_tries_the_same_start(recorder):
+    (start,) = GRID.specs()
+    layout, motions = draw_start(recorder, start, CONFIG)
+    again, same = draw_start(recorder, start, CONFIG)
+    assert layout.target == again.target
+    assert list(motions) == list(POLICIES)
+    for name, motion in motions.items():
+        np.testing.assert_array_equal(motion.action, same[name].action)
+        np.testing.assert_allclose(motion.state[0], motions["expert"].state[0], atol=1e-6)
+    assert motions["expert"].outcome == "success"
+    assert motions["blind"].outcome == "failure"
+
+
+def test_a_late_policy_does_the_same_later_and_a_late_gripper_alone(recorder):
+    layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(2))
+    on_time, late, gripper = (
+        attempt(recorder, layout, policy, np.random.default_rng(9), 33).action
+        for policy in (
+            ScriptedPolicy(),
+            ScriptedPolicy(delay_frames=5),
+            ScriptedPolicy(gripper_delay_frames=-3),
+        )
+    )
+    np.testing.assert_array_equal(late[5:], on_time[:-5])
+    np.testing.assert_array_equal(late[:5], np.repeat(on_time[:1], 5, axis=0))
+    moves = np.array([name.endswith("/gripper") for name in recorder.scene.state_names])
+    np.testing.assert_array_equal(gripper[:, ~moves], on_time[:, ~moves])
+    np.testing.assert_array_equal(gripper[:-3, moves], on_time[3:, moves])
+
+
+def test_mistakes_set_the_share_of_wrong_plans(recorder):
+    layout = sample_layout(recorder.scene.robot, "press", np.random.default_rng(0))
+
+    def aims(mistakes):
+        plans = [
+            plan_waypoints(recorder.scene.robot, layout, np.random.default_rng(n), 4.0, mistakes=mistakes)[layout.arm]
+            for n in range(60)
+        ]
+        # A right plan goes down onto the button within some millimetres.
+        down = [plan[2].position for plan in plans]
+        return np.mean([np.hypot(x - layout.target.x, y - layout.target.y) < 0.03 and z < 0.05 for x, y, z in down])
+
+    assert aims(0.0) == 1.0
+    assert aims(1.0) == 0.0
+    assert 0.3 < aims(0.5) < 0.7
+
+
+def test_a_recorded_comparison_of_policies(tmp_path):
+    counts = record_policies(CONFIG, tmp_path)
+    assert counts["policies"]["expert"] == {"press": {"attempts": 1, "successes": 1}}
+    assert json.loads((tmp_path / "recording.json").read_text()) == counts
+    episodes = EpisodeSet.open(tmp_path)
+    by_start = defaultdict(dict)
+    for position, row in enumerate(episodes.rows):
+        by_start[row.bank][row.source] = next(iter(read_clip(episodes.clip(position, "head")))).rgb
+    ((start, firsts),) = by_start.items()
+    assert start == GRID.specs()[0].name
+    assert set(firsts) == set(POLICIES)
+    # One start, one first picture; what differs is the encoder's noise.
+    assert max(np.abs(picture.astype(int) - firsts["expert"]).mean() for picture in firsts.values()) < 1.0
+    assert record_policies(CONFIG, tmp_path) == counts
+
+
+def test_the_shipped_comparison_is_large_enough():
+    config = load_config(
+        RecordPoliciesConfig, path=Path(__file__).resolve().parents[2] / "configs/recording/small_world_policies.yaml"
+    )
+    families = [start.family for start in config.starts.specs()]
+    assert len(config.policies) >= 8
+    assert min(families.count(family) for family in set(families)) >= 40
