@@ -27,6 +27,7 @@ LIMIT_TOLERANCE_RAD = 0.02
 """Joint positions may pass their limits by this much."""
 
 Bound = Annotated[float, Field(allow_inf_nan=True)]
+Speed = Annotated[float, Field(gt=0)]
 Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
 
 
@@ -45,6 +46,9 @@ class Gripper(StrictModel):
     closed: float = 0.0
     open: float = 1.0
     finger_joints: tuple[FingerJoint, ...] = ()
+    travel_s: float = Field(
+        default=0.4, gt=0, description="shortest time from open to closed; a Panda hand's by default"
+    )
 
     @model_validator(mode="after")
     def _range(self) -> Gripper:
@@ -79,6 +83,9 @@ class Arm(StrictModel):
     name: str
     joints: tuple[str, ...] = Field(min_length=1)
     limits: tuple[Limits, ...]
+    max_speeds: tuple[Speed, ...] | None = Field(
+        None, description="of each joint, rad/s or m/s; where not known, pi rad/s and 1 m/s"
+    )
     end_effector_link: str
     T_link_tool: RigidOffset = RigidOffset()
     gripper: Gripper = Gripper()
@@ -91,6 +98,8 @@ class Arm(StrictModel):
     def _limits(self) -> Arm:
         if len(self.limits) != len(self.joints):
             raise ValueError(f"{len(self.limits)} limits for {len(self.joints)} joints")
+        if self.max_speeds is not None and len(self.max_speeds) != len(self.joints):
+            raise ValueError(f"{len(self.max_speeds)} max_speeds for {len(self.joints)} joints")
         for joint, (low, high) in zip(self.joints, self.limits, strict=True):
             if not low < high:
                 raise ValueError(f"a lower limit is not below its upper limit: {joint}, {low} to {high}")

@@ -42,6 +42,10 @@ def read_tree(embodiment: Embodiment) -> TreeBody:
 class ArmKinematics:
     """Kinematics of all arms of an embodiment.
 
+    Attributes:
+        tree, chain: of the description; links, joints: their names.
+        revolute: names of the joints that turn (the others slide).
+
     Raises:
         UnavailableError: the kinematic description is not there.
         DataError: the kinematic description cannot be read.
@@ -85,7 +89,7 @@ class ArmKinematics:
                 expected="joint_units: rad",
                 got=f"slides {', '.join(slides)}",
             )
-        self._revolute = {name for name, kind in kinds.items() if kind == "revolute"}
+        self.revolute = {name for name, kind in kinds.items() if kind == "revolute"}
 
     def _joint_positions(self, state: np.ndarray | Tensor, posture: Mapping[str, np.ndarray | float] | None) -> Tensor:
         """Positions [rad or m] of the chain's joints (n, joints): state, posture, fingers; anything else at zero.
@@ -111,7 +115,7 @@ class ArmKinematics:
             for finger in arm.gripper.finger_joints:
                 columns[finger.name] = finger.closed + opening[:, index].clamp(0, 1) * (finger.open - finger.closed)
         if embodiment.joint_units == "deg":
-            columns.update({n: c * (math.pi / 180) for n, c in columns.items() if n in self._revolute})
+            columns.update({n: c * (math.pi / 180) for n, c in columns.items() if n in self.revolute})
         zero = torch.zeros_like(values[:, 0])
         return torch.stack([columns.get(name, zero) for name in self.joints], dim=-1)
 

@@ -144,10 +144,21 @@ class CacheWindow:
             return None
         if layer not in self._rotated:
             keys, values = (
-                torch.cat(parts, dim=-2) for parts in zip(*(block.layers[layer] for block in self.blocks), strict=True)
+                _joined(parts) for parts in zip(*(block.layers[layer] for block in self.blocks), strict=True)
             )
             self._rotated[layer] = (rotate(keys, by), values)
         return self._rotated[layer]
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    """Keys or values one after the other; those of a history that all clips share have a batch of one."""
+    batch = max(len(part) for part in parts)
+    return torch.cat([part.expand(batch, -1, -1, -1) for part in parts], dim=-2)
+
+
+def _of_clips(values: Tensor, clips: Sequence[int]) -> Tensor:
+    """Those of some clips; what all clips share (a batch of one) stays shared."""
+    return values if len(values) == 1 or list(clips) == list(range(len(values))) else values[list(clips)]
 
 
 class KVCache:
@@ -200,10 +211,24 @@ class KVCache:
         stop, start = window_bounds(len(blocks), self.sink_blocks, self.recent_blocks)
         self.window = CacheWindow(blocks[:stop] + blocks[start:])
 
-    def copy(self) -> KVCache:
-        """A cache with the same window that can go on separately (tensors are shared; they are never changed)."""
-        other = KVCache(self.sink_blocks, self.recent_blocks, self.fps)
-        other.reference, other.window = self.reference, self.window
+    def select(self, clips: Sequence[int]) -> KVCache:
+        """The window of these clips, to go on separately. Tensors are never changed, so what can be shared is: a cache of
+        one clip serves any number of branches without a copy.
+        """
+        other = KVCache(self.sink_blocks, self.recent_blocks, None if self.fps is None else _of_clips(self.fps, clips))
+        other.reference = None if self.reference is None else _of_clips(self.reference, clips)
+        other.window = CacheWindow(
+            [
+                CachedBlock(
+                    block.frames,
+                    {
+                        layer: (_of_clips(keys, clips), _of_clips(values, clips))
+                        for layer, (keys, values) in block.layers.items()
+                    },
+                )
+                for block in self.window.blocks
+            ]
+        )
         return other
 
 
@@ -229,5 +254,5 @@ class CachedAttention:
         queries, keys = rotate(queries, self.by), rotate(keys, self.by)
         window = self.window.read(layer, self.window_by)
         if window is not None:
-            keys, values = torch.cat((window[0], keys), dim=-2), torch.cat((window[1], values), dim=-2)
+            keys, values = _joined((window[0], keys)), _joined((window[1], values))
         return grouped_attention(queries, keys, values)

@@ -148,6 +148,12 @@ class WanDecoder:
                 video = unpatchify(video, patch_size=vae.config["patch_size"])
             return video.clamp(-1.0, 1.0).to(latents.dtype)
 
+    def copy(self) -> WanDecoder:
+        """A decoder in the same state that goes on separately; tensors of the cache are replaced, never changed."""
+        other = WanDecoder(self._tokenizer)
+        other._cache, other._begun = list(self._cache), self._begun
+        return other
+
 
 def load_tokenizer(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> VideoTokenizer:
     """Load whatever tokenizer ``folder`` holds: a patch tokenizer, or a diffusers Wan autoencoder.

@@ -8,6 +8,7 @@ Axis legend: b batch, c channel, t frame, h w pixels; ``_l`` marks the latent gr
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -48,6 +49,10 @@ class VideoDecoder(Protocol):
         """Frames of the next latents, the first of them those of frame 0."""
         ...
 
+    def copy(self) -> VideoDecoder:
+        """A decoder in the same state that goes on separately."""
+        ...
+
 
 class GroupDecoder:
     """A `VideoDecoder` for tokenizers whose later latent frames are decoded each by itself, beside latent frame 0."""
@@ -62,6 +67,10 @@ class GroupDecoder:
             self._first = latents[:, :, :1]
             return self._decode(latents, self._reference)
         return self._decode(torch.cat((self._first, latents), dim=2), self._reference)[:, :, 1:]
+
+    def copy(self) -> GroupDecoder:
+        """A decoder in the same state that goes on separately."""
+        return copy(self)
 
 
 def check_video(tokenizer: VideoTokenizer, video: Tensor) -> None:

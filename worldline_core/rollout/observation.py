@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,23 @@ class Camera:
 
     K: np.ndarray
     T_base_camera: np.ndarray | None = None
+
+
+def ordered_views(trained: Sequence[str], given: Iterable[str]) -> tuple[str, ...]:
+    """Given views in the order of the model's.
+
+    Raises:
+        DataError: one is none of the model's, or the model's first one is missing.
+    """
+    names = set(given)
+    if not names <= set(trained) or trained[0] not in names:
+        raise DataError(
+            "The images are not those of the model's views",
+            expected=f"{trained[0]}" + (f", and any of {tuple(trained[1:])}" if len(trained) > 1 else " alone"),
+            got=sorted(names),
+            next_step="leave out the views that the model was not trained on",
+        )
+    return tuple(view for view in trained if view in names)
 
 
 def given_tracks(
@@ -67,41 +84,81 @@ def given_tracks(
             got=frames,
             next_step=f"give {1 + max(1, (frames - 1) // unit) * unit} rows",
         )
+    height, width = image_size(images, cameras)
+    kinematics = None if controls is None or embodiment is None else ArmKinematics(load_embodiment(embodiment))
+    return project_controls(
+        cameras,
+        (height, width),
+        kinematics,
+        controls=driven if controls is not None else driven.reshape(frames, -1),
+        tool_poses=None if controls is not None else driven,
+        gripper=gripper,
+        fps=fps,
+    )
+
+
+def image_size(images: Mapping[str, np.ndarray], cameras: Mapping[str, Camera]) -> tuple[int, int]:
+    """(H, W) of first images that have a camera each.
+
+    Raises:
+        DataError: a camera is missing, or the images differ in size.
+    """
     if set(cameras) != set(images):
         raise DataError("The cameras are not those of the images", expected=list(images), got=list(cameras))
     shapes = {view: image.shape for view, image in images.items()}
-    height, width = next(iter(shapes.values()))[:2]
+    height, width = next(iter(shapes.values()), (0, 0))[:2]
     if any(shape != (height, width, 3) for shape in shapes.values()):
         raise DataError("First images are RGB and of one size", expected="(H, W, 3) in every view", got=shapes)
-    kinematics = None if controls is None or embodiment is None else ArmKinematics(load_embodiment(embodiment))
+    return height, width
+
+
+def project_controls(
+    cameras: Mapping[str, Camera],
+    size: tuple[int, int],
+    kinematics: ArmKinematics | None,
+    *,
+    controls: np.ndarray,
+    fps: float,
+    tool_poses: np.ndarray | None = None,
+    gripper: np.ndarray | None = None,
+) -> EpisodeTracks:
+    """Action tracks of controls ``(frames, state size)``; the first row belongs to the moment of the cameras' poses.
+
+    Args:
+        size: (H, W) of the images that the cameras took.
+        kinematics: without, the robot is where ``tool_poses`` and ``gripper`` say.
+
+    Raises:
+        DataError, CalibrationError: as :func:`given_tracks`.
+    """
+    frames = len(controls)
     arms = () if kinematics is None else kinematics.embodiment.arms
     known = {arm.camera_view for arm in arms if arm.wrist_camera}
     poses, follow = _poses(cameras, known, frames)
-    joints = driven if controls is not None else driven.reshape(frames, -1)
     episode = Episode(
         episode_id="prediction",
         source="prediction",
-        embodiment=str(embodiment),
+        embodiment="" if kinematics is None else kinematics.embodiment.name,
         scene="",
         task_family="unknown",
         instruction="",
         outcome="unknown",
         split="test",
         fps=fps,
-        state=joints,
-        action=joints,
+        state=controls,
+        action=controls,
         timestamps=np.arange(frames) / fps,
         cameras={
-            view: CameraTrack(view, np.asarray(cameras[view].K, np.float64), pose, width, height)
+            view: CameraTrack(view, np.asarray(cameras[view].K, np.float64), pose, size[1], size[0])
             for view, pose in poses.items()
         },
-        T_base_ee=None if controls is not None else driven,
+        T_base_ee=tool_poses,
         gripper=gripper,
     )
     tracks, _ = compute_tracks(
         episode,
         kinematics,
-        controls="action" if controls is not None else "state",  # given tool poses stand for themselves
+        controls="action" if kinematics is not None else "state",  # given tool poses stand for themselves
         without_mount="first_frame_mount" if follow else "recorded",
     )
     return tracks

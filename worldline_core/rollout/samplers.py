@@ -66,12 +66,15 @@ class Noise:
         """``(batch, *shape)``, one slice per seed."""
         return torch.stack([torch.randn(tuple(shape), generator=g) for g in self._generators]).to(device)
 
-    def copy(self) -> Noise:
-        """A source that will draw the same noise as this one from here on."""
+    def __len__(self) -> int:
+        return len(self._generators)
+
+    def select(self, clips: Sequence[int]) -> Noise:
+        """A source that will draw what this one would draw for these clips from here on."""
         other = Noise([])
-        for generator in self._generators:
+        for clip in clips:
             twin = torch.Generator()
-            twin.set_state(generator.get_state())
+            twin.set_state(self._generators[clip].get_state())
             other._generators.append(twin)
         return other
 
@@ -167,7 +170,7 @@ class BlockCausalSimulator:
         Raises:
             DataError: the rollout was not started, or the controls are not those of one block.
         """
-        if self._unwritten is None:
+        if self._unwritten is None and self.cache.reference is None:
             raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
         if action_maps is not None and action_maps.shape[3] != self.spec.block_size:
             raise DataError(
@@ -187,18 +190,33 @@ class BlockCausalSimulator:
         self._unwritten = (latents, action_maps)
         return latents
 
-    def fork(self) -> BlockCausalSimulator:
-        """A simulator in the same state that goes on separately: to try several controls from one moment."""
+    def fork(self, clips: Sequence[int] | None = None, seeds: Sequence[int] | None = None) -> BlockCausalSimulator:
+        """A simulator in the same state that goes on separately: to try several controls from one moment.
+
+        Args:
+            clips: to go on with, by default all. One that is named several times is branched: its last block is written
+                to the cache once, for all branches.
+            seeds: of the noise from here on, one for each of ``clips``; by default every branch draws what its clip would.
+        """
+        clips = range(len(self.noise)) if clips is None else clips
+        if len(set(clips)) < len(clips):
+            self._write()
+        noise = self.noise.select(clips) if seeds is None else Noise(seeds)
         other = BlockCausalSimulator(
-            self.model, self.spec, noise=self.noise.copy(), views=self.views, fps=self.fps, bfloat16=self.bfloat16
+            self.model, self.spec, noise=noise, views=self.views, fps=self.fps, bfloat16=self.bfloat16
         )
-        other.cache = self.cache.copy()
-        other._unwritten = self._unwritten
+        other.cache = self.cache.select(clips)
+        if self._unwritten is not None:
+            latents, maps = self._unwritten
+            other._unwritten = latents[list(clips)], None if maps is None else maps[list(clips)]
         return other
 
+    @torch.no_grad()
     def _write(self) -> None:
+        """Write the last block to the cache, unless it is there."""
         if self._unwritten is None:
             return
         latents, action_maps = self._unwritten
         with torch.autocast(latents.device.type, torch.bfloat16, enabled=self.bfloat16):
             self.model.write_block(latents, self.cache, action_maps=action_maps, views=self.views)
+        self._unwritten = None

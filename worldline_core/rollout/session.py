@@ -10,10 +10,11 @@ Axis legend: b clips, v views, a channels of the action maps, t latent frames, n
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
 from functools import partial
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 import torch
@@ -44,6 +45,10 @@ class UnitSampler(Protocol):
         """Latents of the next ``n = t - 1`` latent frames, under controls that begin with the last known frame's."""
         ...
 
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> Self:
+        """A sampler of these clips in the state that they are in; ``seeds``: of their noise from here on."""
+        ...
+
 
 class BlockSampler:
     """The causal model, a block a step; ``seconds``: wall seconds of each block so far."""
@@ -67,6 +72,11 @@ class BlockSampler:
         latents, elapsed = timed(partial(self._simulator.step, maps[:, :, :, 1:]), self._device)
         self.seconds.append(elapsed.wall)
         return latents
+
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> BlockSampler:
+        other = BlockSampler(self._simulator.fork(clips, seeds), self._device)
+        other._first = None if self._first is None else self._first[list(clips)]
+        return other
 
 
 class ClipSampler:
@@ -96,6 +106,13 @@ class ClipSampler:
 
     def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
         return self._sample(self._first, maps)[:, :, :, 1:]
+
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> ClipSampler:
+        other = copy(self)
+        noise: Noise = self._sample.keywords["noise"]
+        other._sample = partial(self._sample, noise=noise.select(clips) if seeds is None else Noise(seeds))
+        other._first = self._first[list(clips)]
+        return other
 
 
 class Session:
@@ -180,6 +197,20 @@ class Session:
         with torch.cuda.stream(stream):
             latents.record_stream(stream)
             return self._decode(latents)
+
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Session:
+        """These clips in the state that they are in, to go on separately. One that is named several times is branched,
+        and what a causal model keeps of its history is shared.
+
+        Args:
+            seeds: of the noise from here on, one for each of ``clips``; by default it goes on as it would.
+        """
+        other = copy(self)
+        other._sampler = self._sampler.select(clips, seeds)
+        other._decoders = [self._decoders[clip].copy() for clip in clips]
+        other._ended = None if self._ended is None else [self._ended[clip] for clip in clips]
+        other.observed = [self.observed[clip] for clip in clips]
+        return other
 
     @torch.no_grad()
     def _observe(self, images: Tensor) -> Frames:

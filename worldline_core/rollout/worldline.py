@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -13,16 +14,19 @@ from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
 from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
-from worldline_core.errors import CheckpointError, DataError
+from worldline_core.errors import CheckpointError
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.observation import Camera, given_tracks
+from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
+from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
 from worldline_core.rollout.session import BlockSampler, ClipSampler, Frames, Session
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Simulation, Starts, Stepping
 
 
 class WorldLine:
@@ -131,17 +135,9 @@ class WorldLine:
         codec = load_tokenizer(place, device, getattr(torch, weights))
         info.contract.require(where=place, tokenizer=tokenizer_fingerprint(codec, place))
         return cls(
-            model,
-            info,
-            codec,
-            device=device,
-            bfloat16=bfloat16,
-            steps=steps,
-            shift=shift,
-            clip_frames=clip_frames,
-            sink_blocks=sink_blocks,
-            recent_blocks=recent_blocks,
-        )
+            model, info, codec, device=device, bfloat16=bfloat16, steps=steps, shift=shift, clip_frames=clip_frames,
+            sink_blocks=sink_blocks, recent_blocks=recent_blocks,
+        )  # fmt: skip
 
     def predict(
         self,
@@ -183,21 +179,48 @@ class WorldLine:
         pieces = [clips[0] for clips in self.stream(first[None], [tracks], tracks.num_frames, [seed], views=views)]
         return {view: np.concatenate([piece[view] for piece in pieces]) for view in views}
 
+    def start(
+        self,
+        images: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]],
+        cameras: Mapping[str, Camera] | Sequence[Mapping[str, Camera]],
+        *,
+        embodiment: str | Path | ArmKinematics,
+        state: np.ndarray,
+        seed: int | Sequence[int] = 42,
+        limits: bool = True,
+        response: Response | None = None,
+    ) -> Simulation:
+        """A simulation that a policy drives from these images on, step by step.
+
+        Args:
+            images, cameras: as of :meth:`predict`, of one start or a list of starts that share robot, views and image size.
+            embodiment: name or YAML file of the robot, or its kinematics.
+            state: ``(state size)`` or ``(starts, state size)``, the controls that belong to the images.
+            seed: of the noise, one for all starts or each.
+            limits: hold commands within the embodiment's limits before they are drawn. Without, and with commands within
+                them, the bytes are those of :meth:`predict` (of a Stage II model: with ``clip_frames``, 33 if not given).
+            response: fitted response of the robot, from which its state follows.
+
+        Raises:
+            DataError, CalibrationError, ConfigError: as :meth:`predict`.
+        """
+        starts = Starts(images, cameras, embodiment, state, seed)
+        views = self.chosen_views(starts.images[0])
+        frames = self.unit(USUAL_CLIP_FRAMES)
+        # Rows of the tracks of a step: the start, the last known frame, the new ones.
+        index = range(1, frames + 2, self.tokenizer.temporal_compression)
+        maps = partial(self.action_maps, frames=index, start=int(self.causal is None), views=views)
+        session = self.session(starts.pictures(views, self.image_size), starts.seeds, views)
+        stepping = Stepping(self.contract, views, self.image_size, frames, maps)
+        return Simulation(session, starts, stepping, limits=limits, response=response)
+
     def chosen_views(self, given: Iterable[str]) -> tuple[str, ...]:
         """Given views in the model's order.
 
         Raises:
             DataError: one is none of the model's, or the model's first one is missing.
         """
-        names = set(given)
-        if not names <= set(self.views) or self.views[0] not in names:
-            raise DataError(
-                "The images are not those of the model's views",
-                expected=f"{self.views[0]}" + (f", and any of {self.views[1:]}" if self.views[1:] else " alone"),
-                got=sorted(names),
-                next_step="leave out the views that the model was not trained on",
-            )
-        return tuple(view for view in self.views if view in names)
+        return ordered_views(self.views, given)
 
     def stream(
         self,

@@ -1,0 +1,270 @@
+"""A simulator that a policy drives: pictures and the robot's state now, controls of the next frames in, what follows out.
+
+``WorldLine.start`` begins one. Each :meth:`Simulation.step` takes the controls of the next unit (a block of a causal model, a
+clip of a Stage II model, which is chained), decided after the pictures of the last one were seen. The past is never computed
+again: of it stay the cache of the model, the last controls, and where the wrist cameras are mounted.
+
+Equal seeds and controls give equal bytes on a CPU, and the noise of a clip does not depend on who shares its batch. In bfloat16
+neither do the bytes; in float32 sums of another batch size are rounded otherwise, by one grey level at most.
+
+Axis legend: b clips, n frames of a step, j columns of the embodiment's state, a arms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import Embodiment, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.model.contracts import ActionContract
+from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.rollout.observation import Camera, image_size, project_controls
+from worldline_core.rollout.robot import CommandedRobot, Response
+from worldline_core.rollout.session import Frames, Session
+
+USUAL_CLIP_FRAMES = 33
+"""Of a Stage II model that is stepped, where ``clip_frames`` does not say how long its clips are: as in the paper."""
+
+
+class Starts:
+    """What is seen and known where simulations of one robot begin, checked.
+
+    Args:
+        images, cameras: by view, of one start or of each; a wrist camera has its pose at the start, or a known mount.
+        state: ``(j)`` or ``(b, j)``, the controls that belong to the images.
+
+    Raises:
+        DataError: the starts do not fit together, a shape is wrong, a view or a camera is missing, or a number is not finite.
+        ConfigError: there is no such embodiment.
+    """
+
+    def __init__(
+        self,
+        images: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]],
+        cameras: Mapping[str, Camera] | Sequence[Mapping[str, Camera]],
+        embodiment: str | Path | ArmKinematics,
+        state: np.ndarray,
+        seeds: int | Sequence[int],
+    ) -> None:
+        self.images = [images] if isinstance(images, Mapping) else list(images)
+        count = len(self.images)
+        self.cameras = [cameras] * count if isinstance(cameras, Mapping) else list(cameras)
+        self.seeds = [seeds] * count if isinstance(seeds, int) else list(seeds)
+        known = isinstance(embodiment, ArmKinematics)
+        self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
+        rows = np.asarray(state, dtype=np.float64)
+        self.state = np.repeat(rows[None], count, axis=0) if rows.ndim == 1 else rows
+        given = {"images": count, "cameras": len(self.cameras), "seeds": len(self.seeds), "state": len(self.state)}
+        if count == 0 or len(set(given.values())) > 1:
+            raise DataError(
+                "The starts of a simulation do not fit together", expected="one of each per clip", got=given
+            )
+        self.kinematics.embodiment.check_state(self.state, "the state at the start")
+        sizes = {image_size(*pair) for pair in zip(self.images, self.cameras, strict=True)}
+        if len(sizes) > 1 or len({frozenset(start) for start in self.images}) > 1:
+            raise DataError(
+                "Clips of one batch show the same views at one size",
+                expected="the same views and (H, W)",
+                got={"sizes": sorted(sizes), "views": [sorted(start) for start in self.images]},
+            )
+        self.image_size = sizes.pop()
+        for start in self.cameras:
+            moving = [v for v, c in start.items() if c.T_base_camera is not None and c.T_base_camera.ndim == 3]
+            if moving:
+                raise DataError(
+                    "Of a camera only the pose at the start is known",
+                    where=", ".join(moving),
+                    expected="T_base_camera (4, 4), or None for a mount that the embodiment's file knows",
+                    got="a pose per frame",
+                )
+
+    def pictures(self, views: Sequence[str], size: tuple[int, int]) -> Float[Tensor, "b v 3 h w"]:
+        """First images at the model's size."""
+        return torch.stack(
+            [torch.stack([frames_to_video(start[view][None], size)[:, 0] for view in views]) for start in self.images]
+        )
+
+    def project(self, clip: int, controls: np.ndarray, fps: float) -> EpisodeTracks:
+        """Tracks of controls ``(rows, j)`` whose first row is that of the start."""
+        return project_controls(self.cameras[clip], self.image_size, self.kinematics, controls=controls, fps=fps)
+
+    def select(self, clips: Sequence[int]) -> Starts:
+        """Those of some clips."""
+        other = copy(self)
+        for name in ("images", "cameras", "seeds"):
+            setattr(other, name, [getattr(self, name)[clip] for clip in clips])
+        other.state = self.state[list(clips)]
+        return other
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How a model is stepped.
+
+    Attributes:
+        frames: that a step predicts.
+        maps: of the tracks of each clip, at the latent frames of a step; of ``1 + index`` frames, the first is the start's.
+    """
+
+    contract: ActionContract
+    views: tuple[str, ...]
+    image_size: tuple[int, int]
+    frames: int
+    maps: Callable[[Sequence[EpisodeTracks]], Tensor]
+
+
+class Simulation:
+    """A batch of running predictions of one robot, stepped by controls (made by ``WorldLine.start``).
+
+    Attributes:
+        views, fps, image_size: of the pictures, (H, W).
+        frames_per_step: controls that a step takes, and pictures that it gives.
+        num_frames: pictures so far, the observed one with them.
+        pictures: last picture of every view, of each clip; at the start the observed one, as the tokenizer shows it.
+        commands, states: ``(b, n, j)`` of the last step's frames: what was executed (commands within the limits), and where
+            the robot then is (:mod:`worldline_core.rollout.robot`). At the start those of the observed frame.
+    """
+
+    def __init__(
+        self, session: Session, starts: Starts, stepping: Stepping, *, limits: bool, response: Response | None
+    ) -> None:
+        self._session = session
+        self._starts = starts
+        self._stepping = stepping
+        self.fps = stepping.contract.fps
+        self._robot = CommandedRobot(starts.kinematics, self.fps, starts.state, limits=limits, response=response)
+        self.views, self.image_size, self.frames_per_step = stepping.views, stepping.image_size, stepping.frames
+        self.num_frames = 1
+        self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in session.observed]
+        self.commands = self.states = starts.state[:, None]
+        self._drawn = starts.state
+        self._tracks = [self._project(clip, starts.state[clip][None]) for clip in range(len(self))]
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return len(self._starts.state)
+
+    @property
+    def embodiment(self) -> Embodiment:
+        return self._starts.kinematics.embodiment
+
+    @property
+    def state(self) -> np.ndarray:
+        """``(b, j)``: where the robot is at the last picture, in the embodiment's layout and units."""
+        return self.states[:, -1]
+
+    @property
+    def tracks(self) -> list[EpisodeTracks]:
+        """Of each clip, what was drawn into the maps of the last step's frames: for overlays."""
+        return [tracks.clip(range(2, tracks.num_frames), start=0) for tracks in self._tracks]
+
+    @property
+    def tool_poses(self) -> np.ndarray:
+        """``(b, a, 4, 4)`` float32, tools to base at the last picture, as they were drawn."""
+        return np.stack([tracks.T_base_tool[-1] for tracks in self._tracks])
+
+    def step(self, controls: np.ndarray) -> Frames:
+        """Predict the next ``frames_per_step`` frames.
+
+        Args:
+            controls: ``(b, n, j)`` commands in the embodiment's layout and units, one row a frame at ``fps``; ``(n, j)`` of a
+                single clip.
+
+        Returns:
+            Of every clip, ``uint8 (n, H, W, 3)`` by view. After an error the simulation is as it was before the call.
+
+        Raises:
+            DataError: the shape is another one, or a command is not finite.
+        """
+        commands = self._checked(controls)
+        robot, executed, states = self._robot.follow(commands)
+        drawn = executed if self._stepping.contract.controls == "action" else states
+        tracks = [self._project(clip, rows) for clip, rows in enumerate(drawn)]
+        frames = self._session.step(self._stepping.maps(tracks))
+        self._robot, self.commands, self.states, self._tracks, self._drawn = (
+            robot,
+            executed,
+            states,
+            tracks,
+            drawn[:, -1],
+        )
+        self.num_frames += self.frames_per_step
+        self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
+        return frames
+
+    def fork(self, n: int, seeds: Sequence[int] | None = None) -> Simulation:
+        """``n`` branches of every clip (those of a clip follow each other), to be driven separately from here on; this
+        simulation stays as it is. The history of a causal model is shared, not copied.
+
+        Args:
+            seeds: of the noise of each branch from here on. By default all branches of a clip go on with its noise, so they
+                differ by their controls alone, and each equals a simulation that was driven so from its start.
+
+        Raises:
+            DataError: no branch, or another number of seeds.
+        """
+        return self.select([clip for clip in range(len(self)) for _ in range(n)], seeds)
+
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Simulation:
+        """A simulation of these clips in the state that they are in; this one stays as it is.
+
+        Args:
+            seeds: as of :meth:`fork`, one for each of ``clips``.
+
+        Raises:
+            DataError: there is no such clip, none is named, or the number of seeds is another one.
+        """
+        index = [int(clip) for clip in clips]
+        if not index or min(index) < 0 or max(index) >= len(self):
+            raise DataError("No such clips in the simulation", expected=f"some of 0..{len(self) - 1}", got=index[:8])
+        if seeds is not None and len(seeds) != len(index):
+            raise DataError("One seed for each clip is needed", expected=len(index), got=len(seeds))
+        other = copy(self)
+        other._session = self._session.select(index, seeds)
+        other._starts, other._robot = self._starts.select(index), self._robot.select(index)
+        other.pictures = [self.pictures[clip] for clip in index]
+        other.commands, other.states, other._drawn = (x[index] for x in (self.commands, self.states, self._drawn))
+        other._tracks = [self._tracks[clip] for clip in index]
+        return other
+
+    def copy(self) -> Simulation:
+        """A snapshot: a simulation in the same state, to go back to. It shares the history's tensors, so one a step costs
+        little more memory than the steps themselves.
+        """
+        return self.select(range(len(self)))
+
+    def _project(self, clip: int, rows: np.ndarray) -> EpisodeTracks:
+        """Tracks of the start, of the last frame that is known, and of ``rows``."""
+        known = (self._starts.state[clip], self._drawn[clip])
+        return self._starts.project(clip, np.stack((*known, *rows)), self.fps)
+
+    def _checked(self, controls: np.ndarray) -> np.ndarray:
+        commands = np.asarray(controls, dtype=np.float64)
+        commands = commands[None] if commands.ndim == 2 and len(self) == 1 else commands
+        wanted = (len(self), self.frames_per_step, self.embodiment.state_size)
+        if commands.shape != wanted:
+            raise DataError(
+                "Controls of a step have another shape",
+                where=f"frames {self.num_frames} to {self.num_frames + self.frames_per_step - 1}",
+                expected=f"{wanted}: clips, frames, {', '.join(self.embodiment.state_names)}",
+                got=np.shape(controls),
+            )
+        if not np.isfinite(commands).all():
+            clip, row, column = np.argwhere(~np.isfinite(commands))[0]
+            raise DataError(
+                "A command is not finite",
+                where=f"clip {clip}, row {row}, {self.embodiment.state_names[column]}",
+                expected="finite numbers",
+                got=float(commands[clip, row, column]),
+            )
+        return commands
