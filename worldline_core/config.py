@@ -327,6 +327,11 @@ class StrictModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
 
+    def weights_read(self) -> Mapping[str, Path | None]:
+        """Files and folders of weights that a step with this configuration reads and that are no input of it: their content counts
+        in its key."""
+        return {}
+
 
 def what_is_made(config: Any) -> Any:
     """JSON values of a configuration without its sections ``sharding`` and ``saving``: how work is shared out among

@@ -15,6 +15,8 @@ import pytest
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.pipeline.steps import get_step
+from worldline_core.store import verification
 from worldline_core.store.artifact_files import digest_folder, digest_value
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import ArtifactStore, alone_in
@@ -92,6 +94,66 @@ def test_key_depends_on_everything_that_matters(tmp_path: Path, change: str) -> 
     }[change]
     assert base != other
     assert base == store.key("count", 1, CountConfig(), {"a": "x"})
+
+
+class JudgedConfig(CountConfig):
+    weights: Path | None = None
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return {"judge": self.weights}
+
+
+def test_weights_count_with_their_content_and_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    digest = verification.digest_file
+    monkeypatch.setattr(verification, "digest_file", lambda path: read.append(path.name) or digest(path))
+    store, blobs, folder = ArtifactStore(tmp_path / "store"), tmp_path / "blobs", tmp_path / "weights"
+    config = JudgedConfig(weights=folder)
+    absent = store.key("judge", 1, config, {})
+    # As the hub's cache lays them out: links to files, and notes that change with every download.
+    for path in (blobs, folder / ".cache"):
+        path.mkdir(parents=True)
+    (blobs / "1f").write_bytes(b"one")
+    (folder / "model.safetensors").symlink_to(blobs / "1f")
+    (folder / "config.json").write_text("{}")
+    first = store.key("judge", 1, config, {})
+    (folder / ".cache" / "note").write_text("now")
+    assert store.key("judge", 1, config, {}) == first != absent
+    assert ArtifactStore(store.root).key("judge", 1, config, {}) == first
+    assert sorted(read) == ["config.json", "model.safetensors"]
+    (blobs / "1f").write_bytes(b"two")
+    assert store.key("judge", 1, config, {}) not in (first, absent)
+    (folder / "model.safetensors").rename(folder / "other.safetensors")
+    (blobs / "1f").write_bytes(b"one")
+    assert store.key("judge", 1, config, {}) not in (first, absent)
+    file = JudgedConfig(weights=blobs / "1f")
+    alone = store.key("judge", 1, file, {})
+    (blobs / "1f").write_bytes(b"three")
+    assert store.key("judge", 1, file, {}) != alone
+    # Without weights the key is what it was when configurations had none.
+    made = {"upto": 5, "seed": 7, "weights": None}
+    plain = digest_value({"step": "judge", "version": 1, "config": made, "inputs": {}})[:16]
+    assert store.key("judge", 1, JudgedConfig(), {}) == plain
+
+
+def test_evaluations_and_distillation_name_the_weights_that_they_read(tmp_path: Path) -> None:
+    named = {"sam3_weights": "sam3", "vlm": {"weights": "qwen"}}
+
+    def read(step: str, values: dict[str, Any]) -> dict[str, Path]:
+        config = get_step(step).load_config().model_validate(values)
+        return {name: path for name, path in config.weights_read().items() if path is not None}
+
+    sam3, vlm = {"sam3": Path("sam3")}, {"vlm": Path("qwen")}
+    for step, judge in (("evaluate_policy", "judge"), ("evaluate_planning", "selector")):
+        assert read(step, named) == read(step, {**named, judge: "openai"}) == {}
+        assert read(step, {**named, "segmenter": "sam3"}) == sam3
+        assert read(step, {**named, "segmenter": "sam3", judge: "qwen3_vl"}) == vlm
+    assert read("evaluate_video", {"sam3_weights": "sam3"}) == {}
+    both = {"sam3_weights": "sam3", "lpips_weights": "alex", "segmenters": ["learned", "sam3"]}
+    assert read("evaluate_video", both) == sam3 | {"lpips": Path("alex")}
+    assert read("evaluate_video", {"fvd_weights": "i3d.pt"}) == {}
+    assert read("evaluate_video", {"fvd_weights": "i3d.pt", "metrics": ["fvd"]}) == {"fvd": Path("i3d.pt")}
+    assert read("distill", {"lpips_weights": "alex", "clips": {"lengths": [17]}}) == {"lpips": Path("alex")}
 
 
 def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, Self
 
@@ -172,6 +173,9 @@ class DistillConfig(StrictModel):
         if len(substeps) != steps:
             raise ValueError(f"trajectories.substeps {substeps}: one number per interval of sigmas is needed, {steps}")
         return self
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return {"lpips": self.lpips_weights}
 
     @property
     def spec(self) -> CausalSpec:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, Self
 
@@ -126,6 +127,13 @@ class VideoEvaluationConfig(StrictModel):
             )
         return self
 
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return {
+            "sam3": self.sam3_weights if "sam3" in self.segmenters else None,
+            "lpips": self.lpips_weights,
+            "fvd": self.fvd_weights if "fvd" in self.metrics else None,
+        }
+
 
 class PolicyEvaluationConfig(StrictModel):
     """Who judges, and what."""
@@ -152,6 +160,9 @@ class PolicyEvaluationConfig(StrictModel):
             raise ValueError("compare_policies needs every attempt: set balanced: false and max_per_group: null")
         return self
 
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return _judge_weights(self.judge, self)
+
 
 class PlanningConfig(StrictModel):
     """Who selects, and among how many."""
@@ -167,3 +178,13 @@ class PlanningConfig(StrictModel):
     )
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return _judge_weights(self.selector, self)
+
+
+def _judge_weights(judge: str, config: PolicyEvaluationConfig | PlanningConfig) -> dict[str, Path | None]:
+    return {
+        "sam3": config.sam3_weights if judge == "measured" and config.segmenter == "sam3" else None,
+        "vlm": config.vlm.weights if judge == "qwen3_vl" else None,
+    }

@@ -1,8 +1,8 @@
 """Where artifacts live, and the one place that makes a step cached and resumable.
 
 ``artifacts/<step>/<key>/`` holds a finished artifact; its ``manifest.json`` is written last. The key is a digest of
-the step's name and version, its config, and the digests of its inputs: nothing else decides whether work is done
-again. Unfinished work lives in ``<key>.partial/`` and is continued by the next call.
+the step's name and version, its config, and the digests of its inputs and of weights that the config names: nothing
+else decides whether work is done again. Unfinished work lives in ``<key>.partial/`` and is continued by the next call.
 
 One process at a time works on an artifact; the lock ends with its process. Of several processes that torchrun started
 on one step the first owns the artifact and the others help. It announces itself in a small file beside the lock, so
@@ -42,7 +42,7 @@ from worldline_core.store.artifact_files import (
 )
 from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic
 from worldline_core.store.remote import is_remote, remote_digest
-from worldline_core.store.verification import VerifyMode, verify_inputs
+from worldline_core.store.verification import VerifyMode, verify_inputs, weights_digests
 
 logger = logging.getLogger(__name__)
 
@@ -176,6 +176,8 @@ class ArtifactStore:
         """Content key of a step. ``inputs`` maps an input's name to the digest of its content."""
         made = what_is_made(config.model_dump(mode="json"))
         identity = {"step": step, "version": version, "config": made, "inputs": dict(inputs)}
+        if weights := weights_digests(config.weights_read(), self.root / ".weights.json"):
+            identity |= {"weights": weights}
         return digest_value(identity)[:KEY_LENGTH]
 
     def find(self, step: str, key: str) -> Artifact | None:
@@ -320,10 +322,8 @@ def describe_environment() -> dict[str, Any]:
     """Versions, device and commit: what a result depends on besides its config and inputs."""
     versions = {}
     for package in _VERSIONED_PACKAGES:
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),

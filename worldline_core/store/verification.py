@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 from worldline_core.errors import ArtifactError
 from worldline_core.store.artifact_files import (
@@ -24,9 +24,11 @@ from worldline_core.store.artifact_files import (
     how_to_rebuild,
     is_artifact,
     is_stored,
+    read_json,
     read_manifest,
     read_table,
 )
+from worldline_core.store.atomic import write_json_atomic
 from worldline_core.store.remote import AnyPath, is_remote
 
 logger = logging.getLogger(__name__)
@@ -176,6 +178,32 @@ def _verify_input(name: str, folder: Path, mode: VerifyMode) -> None:
             got="; ".join(map(str, damage[:5])) + more,
             next_step=how_to_rebuild(folder),
         )
+
+
+def weights_digests(places: Mapping[str, Path | None], remembered: Path) -> dict[str, str]:
+    """Digest of the file, or of the files of the folder, of each place that is there. A file of the same size and time of change is not read again:
+    weights have gigabytes. Folders of the Hugging Face hub's cache consist of links; hidden files are its notes.
+
+    Args:
+        remembered: JSON file that keeps what was read.
+    """
+    known, digests = dict[str, Any](), dict[str, str]()
+    for name, place in places.items():
+        if place is None or not place.exists():
+            continue
+        known = known or read_json(remembered)
+        files: dict[str, dict[str, str]] = {}
+        for path in sorted(path for path in [place, *place.rglob("*")] if path.is_file()):
+            relative, facts = path.relative_to(place), path.stat()
+            if any(part.startswith(".") for part in relative.parts):
+                continue
+            key = f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
+            if key not in known:
+                known[key] = digest_file(path)
+                write_json_atomic(remembered, known)
+            files[relative.as_posix()] = {"sha256": known[key]}
+        digests[name] = digest_listed(files)
+    return digests
 
 
 def check_artifacts(folders: Sequence[Path], *, set_damaged_aside: bool = False) -> list[CheckedArtifact]:
