@@ -55,18 +55,19 @@ def track(name: str, shift: float, count: int = N, views: Sequence[str] = VIEWS)
 
 
 def write_recordings(
-    root: Path, episodes: Sequence[tuple[str, str, int, Sequence[str], Sequence[str]]]
+    root: Path, episodes: Sequence[tuple[str, str, int, Sequence[str], Sequence[str]]], joints_of: int = 14
 ) -> dict[str, Path]:
     """An EpisodeSet and its tracks.
 
     Args:
         episodes: (id, split, frames, views with a video, views with a camera).
+        joints_of: numbers of a state.
     """
     K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     tracks = []
     with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
         for seed, (name, split, count, views, calibrated) in enumerate(episodes):
-            joints = np.linspace(np.zeros(14), np.full(14, seed), count, dtype=np.float32)
+            joints = np.linspace(np.zeros(joints_of), np.full(joints_of, seed), count, dtype=np.float32)
             episode = Episode(
                 episode_id=name, source="synthetic", embodiment=NAMES.get(name, "ur5e_pair"), scene="s",
                 task_family="lift", instruction="lift the red cube", outcome="success" if seed % 2 else "failure",

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
-import functools
 import json
 import os
-import ssl
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, cast
 from urllib.parse import quote, urlsplit
 
 import cv2
-import httpx
 import numpy as np
 import torch
 from einops import rearrange
@@ -32,6 +27,7 @@ from worldline_core.evaluation.vlm import (
     Video,
     VisionLanguageModel,
 )
+from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
 from worldline_core.untrusted_text import HIDDEN, cut
 
 MAX_ANSWER_BYTES = 1 << 20
@@ -112,12 +108,11 @@ class OpenAICompatibleModel:
             if attempt:
                 time.sleep(self.backoff_s * 2 ** (attempt - 1))
             try:
-                status, answer = _exchange(self.url, headers, body, self.config.timeout_s)
-            except (httpx.ConnectError, httpx.UnsupportedProtocol, httpx.ProxyError) as error:
-                reason, there = f"{type(error).__name__}: {error}", False
-                continue
-            except (httpx.HTTPError, httpx.InvalidURL, TimeoutError, OSError) as error:
-                reason, there = f"{type(error).__name__}: {error}", True
+                status, answer = exchange(
+                    self.url, body, headers=headers, timeout_s=self.config.timeout_s, max_bytes=MAX_ANSWER_BYTES
+                )
+            except (Unreachable, NoAnswer) as error:
+                reason, there = str(error), isinstance(error, NoAnswer)
                 continue
             if status == 200:
                 return answer
@@ -170,40 +165,6 @@ def _key(variable: str) -> str:
             expected="letters, digits and signs of ASCII on one line", got=f"{len(key)} characters, some others among them",
         )  # fmt: skip
     return key
-
-
-@functools.cache
-def _trusted() -> ssl.SSLContext:
-    """The certificates of this machine."""
-    return ssl.create_default_context()
-
-
-def _exchange(url: str, headers: dict[str, str], body: bytes, timeout_s: float) -> tuple[int, bytes]:
-    """Status and body, of which little more than allowed is read; redirects are not followed: another address would be
-    sent the key, and the pictures, that this one was trusted with.
-
-    Raises: TimeoutError when the whole answer takes longer; httpx.HTTPError; OSError.
-    """
-
-    async def exchange() -> tuple[int, bytes]:
-        answer = bytearray()
-        async with (
-            asyncio.timeout(timeout_s),
-            httpx.AsyncClient(timeout=timeout_s, verify=_trusted()) as client,
-            client.stream("POST", url, headers=headers, content=body) as response,
-        ):
-            async for piece in response.aiter_raw():
-                answer += piece
-                if len(answer) > MAX_ANSWER_BYTES:
-                    break
-        return response.status_code, bytes(answer)
-
-    try:
-        # In a thread: the caller's may have an event loop of its own (a notebook).
-        with ThreadPoolExecutor(1, "request") as thread:
-            return thread.submit(asyncio.run, exchange()).result()
-    except TimeoutError:
-        raise TimeoutError(f"no whole answer within {timeout_s:g} s") from None
 
 
 def _content(part: Part) -> list[dict[str, Any]]:

@@ -18,11 +18,13 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.changed_controls import changed_tracks
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.data.episodes.episode_index import write_quarantine
+from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.video_tokenizer import frames_to_video, video_to_frames
 from worldline_core.progress import Progress
+from worldline_core.rollout.ge_sim import GeSim
+from worldline_core.rollout.ge_sim_client import RefusedPredictionError
 from worldline_core.rollout.predictions import Prediction, batches, choose_episodes, plan_predictions
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSetWriter
@@ -70,7 +72,9 @@ class FirstFrameCopy:
             yield [{view: np.repeat(still, count, axis=0) for view, still in clip.items()} for clip in clips]
 
 
-World = WorldLine | TextToVideo | FirstFrameCopy
+World = WorldLine | TextToVideo | FirstFrameCopy | GeSim
+WITHOUT_MODEL = ("copy_first_frame", "ge_sim")
+"""Samplers that read no checkpoint."""
 
 
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -92,7 +96,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         CheckpointError: the checkpoint is of the wrong kind for the sampler, or was trained on other action maps.
         DataError: no episode matches, or none can be predicted.
     """
-    needed = {"episodes", "tracks", "tokenizer"} | ({"checkpoint"} if config.sampler != "copy_first_frame" else set())
+    needed = {"episodes", "tracks", "tokenizer"} | (set() if config.sampler in WITHOUT_MODEL else {"checkpoint"})
     if not needed <= inputs.keys():
         raise ConfigError("The rollout lacks inputs", expected=sorted(needed), got=sorted(inputs))
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
@@ -102,11 +106,14 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     world: World
     if config.sampler == "copy_first_frame":
         world = FirstFrameCopy(episodes)
+    elif config.server is not None:
+        world = GeSim(config.server, episodes)
+        config = config.model_copy(update={"views": world.views, "batch_size": 1})
     elif config.sampler == "text_to_video":
         world = TextToVideo(config, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
     else:
         world = _load(config, inputs, rates)
-    if isinstance(world, WorldLine) and world.info.config.native_size is not None:
+    if isinstance(world, GeSim) or (isinstance(world, WorldLine) and world.info.config.native_size is not None):
         tracks.episodes = episodes
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
     planned, left_out = plan_predictions(config, episodes, tracks, chosen, world, fps)
@@ -116,6 +123,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         write_quarantine(output, left_out)
     writer = RolloutSetWriter(output, config.method, fps / config.stride, crf=config.crf)
     speed, first = SpeedLog(output / "run"), True
+    refused: dict[str, QuarantineRow] = {}
     with Progress(f"rollout {config.method}", len(planned), "clip") as progress:
         for batch in batches(planned, config.batch_size):
             if all(writer.has(item.episode_id, item.seed, item.views) for item in batch):
@@ -124,11 +132,27 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
                         writer.register(item.episode_id, item.seed, view, item.frames, world.image_size)
             else:
                 pieces = _predicted(config, world, episodes, tracks, batch)
-                seconds = _write(batch, pieces, writer, world.image_size, config.device)
+                try:
+                    seconds = _write(batch, pieces, writer, world.image_size, config.device)
+                except RefusedPredictionError as error:
+                    refused |= {item.episode_id: _refused(episodes, item, error) for item in batch}
+                    progress.advance(len(batch))
+                    continue
                 frames = sum(item.frames for item in batch)
                 speed.add(BatchTime(len(batch), frames, seconds, tuple(world.block_seconds), first))
                 first = False
             progress.advance(len(batch))
+    if isinstance(world, GeSim):
+        world.close()
+    if refused:
+        left_out += refused.values()
+        write_quarantine(output, left_out)
+        planned = [item for item in planned if item.episode_id not in refused]
+    if not planned:
+        raise DataError(
+            "No episode could be predicted", where=episodes.root, expected="at least one",
+            got=f"{len(refused)} refused; the first: {next(iter(refused.values())).detail}",
+        )  # fmt: skip
     writer.close()
     facts: dict[str, Any] = {
         "steps": world.steps,
@@ -151,11 +175,15 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         "episodes": len({item.position for item in planned}),
         "predictions": len(planned),
         "frames": sum(item.frames for item in planned),
-        "checkpoint_kind": None if isinstance(world, FirstFrameCopy) else world.info.kind,
+        "checkpoint_kind": world.info.kind if isinstance(world, WorldLine | TextToVideo) else None,
         "steps": world.steps,
         "recent_blocks": None if world.causal is None else world.causal.recent_blocks,
         **_account(world, planned),
     }
+
+
+def _refused(episodes: EpisodeSet, item: Prediction, error: RefusedPredictionError) -> QuarantineRow:
+    return QuarantineRow(item.episode_id, episodes.rows[item.position].source, error.reason, str(error))
 
 
 def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:

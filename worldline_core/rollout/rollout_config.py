@@ -17,12 +17,28 @@ Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
 (`actions.changed_controls`)."""
 
 
+class GeSimConfig(StrictModel):
+    """A simulator behind HTTP in the protocol of GE-Sim 2.0.
+
+    Attributes:
+        url: where it listens, such as http://127.0.0.1:9000.
+        image_size: (H, W) of the pictures that it takes and gives.
+        timeout_s: for each whole answer.
+        tool_offset_m: from the end link of an arm to the tool, along its z.
+    """
+
+    url: str = Field(pattern=r"^https?://[^/\s@]+/?$")
+    image_size: tuple[int, int] = (384, 512)
+    timeout_s: float = Field(default=300.0, gt=0)
+    tool_offset_m: float = 0.15
+
+
 class RolloutConfig(StrictModel):
     """Which episodes are predicted, and how."""
 
     method: str = Field(default="worldline", min_length=1)
     """Name the predictions carry in scores and reports."""
-    sampler: Literal["full_clip", "block_causal", "text_to_video", "copy_first_frame"] = "block_causal"
+    sampler: Literal["full_clip", "block_causal", "text_to_video", "copy_first_frame", "ge_sim"] = "block_causal"
     steps: int | None = Field(default=None, ge=1)
     """Euler steps; by default 35 for a whole clip, and per block those the causal model was trained with."""
     # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
@@ -55,6 +71,8 @@ class RolloutConfig(StrictModel):
     crf: int = Field(default=8, ge=0, le=51)
     text: TextConfig | None = Field(default=None, exclude_if=lambda value: value is None)
     """Text to video: how instructions become ids; by default as the checkpoint says that it was trained."""
+    server: GeSimConfig | None = Field(default=None, exclude_if=lambda value: value is None)
+    """GE-Sim: where it is."""
     bfloat16: bool = True
     # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
     weights: Literal["float32", "bfloat16"] = Field(default="float32", exclude_if=lambda value: value == "float32")
@@ -78,6 +96,13 @@ class RolloutConfig(StrictModel):
             raise ValueError(f"actions: text_to_video takes none, so {self.actions} ones have no meaning")
         if self.sampler != "text_to_video" and self.text is not None:
             raise ValueError(f"text needs the sampler text_to_video, not {self.sampler}")
+        if (self.sampler == "ge_sim") != (self.server is not None):
+            raise ValueError(f"server: the sampler ge_sim needs one, and no other; the sampler is {self.sampler}")
+        if self.server is not None and (self.actions, self.views, len(self.seeds)) != ("true", "all_present", 1):
+            raise ValueError(
+                "the sampler ge_sim predicts three views under the recorded actions, and its protocol knows no seeds: leave "
+                "views and actions out, and name one seed"
+            )
         if self.clip_frames is not None and (self.sampler != "full_clip" or (self.clip_frames - 1) % TEMPORAL_FACTOR):
             raise ValueError(
                 f"clip_frames needs the sampler full_clip and 1 + a multiple of {TEMPORAL_FACTOR} frames, not "
