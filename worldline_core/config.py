@@ -209,10 +209,11 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
 def _take_away(values: dict[str, Any], given: Mapping[str, Any], keys: Sequence[str]) -> None:
     """Remove a key that is null now, where it was given; anything else is a mistake that validation names."""
     for key in keys[:-1]:
-        values, given = values[key], given.get(key) or {}
-        if not isinstance(given, Mapping):
-            return
-    if values[keys[-1]] is None and keys[-1] in given:
+        inner, given = values.get(key), given.get(key) or {}
+        if not isinstance(given, Mapping) or not isinstance(inner, dict):
+            return  # a later override has taken away what this one was in
+        values = inner
+    if keys[-1] in given and values.get(keys[-1], ...) is None:
         del values[keys[-1]]
 
 

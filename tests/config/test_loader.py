@@ -97,6 +97,13 @@ def test_override_forms(tmp_path: Path) -> None:
         apply_overrides({}, ["a=[1"])
 
 
+def test_a_section_that_is_taken_away_takes_earlier_changes_of_it_along() -> None:
+    from worldline_core.pipeline.pipeline_config import PipelineConfig
+
+    overrides = ["train_stage1.trainer.steps=2", "train_stage1=null"]
+    assert load_config(PipelineConfig, preset="smoke", overrides=overrides).train_stage1 is None
+
+
 def test_unknown_preset_lists_those_there_are() -> None:
     assert "tiny" in preset_names()
     with pytest.raises(ConfigError, match="did you mean 'tiny'"):
