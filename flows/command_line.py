@@ -10,6 +10,7 @@ from pathlib import Path
 
 from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
+from flows.plan_command import add_plan_command
 from flows.rehearsal import add_rehearse_command
 from tasks.temporary_server import prepare_prefect
 from worldline_core.pipeline.steps import STEPS
@@ -85,6 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     verify.add_argument("--json", action="store_true", help="print JSON")
     verify.set_defaults(run=_verify)
+    add_plan_command(commands)
     add_exchange_commands(commands)
     add_rehearse_command(commands)
     add_embodiment_commands(commands)

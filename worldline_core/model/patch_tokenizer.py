@@ -238,11 +238,11 @@ class PatchTokenizer(nn.Module):
         )
 
     @classmethod
-    def load(cls, folder: Path) -> PatchTokenizer:
-        """Read a tokenizer written by :meth:`save`, strictly.
+    def outline(cls, folder: Path) -> PatchTokenizer:
+        """A tokenizer as ``folder`` describes it, without its weights.
 
         Raises:
-            CheckpointError: the folder is incomplete, damaged, or of another kind.
+            CheckpointError: the description is damaged, or of another kind.
         """
         path = folder / DESCRIPTION
         content = read_description(path, FORMAT, "tokenizer", version=VERSION)
@@ -252,10 +252,19 @@ class PatchTokenizer(nn.Module):
             tokenizer = cls(PatchTokenizerConfig.model_validate(content.get("config")))
         except ValidationError as error:
             raise CheckpointError("The tokenizer's config is not valid", where=path, got=str(error)) from error
-        weights = folder / WEIGHTS
-        fill(tokenizer, read_weights(weights, content["weights_sha256"]), where=weights, dtype=torch.float32)
         tokenizer.weights_sha256 = content["weights_sha256"]
         return tokenizer.eval().requires_grad_(False)
+
+    @classmethod
+    def load(cls, folder: Path) -> PatchTokenizer:
+        """Read a tokenizer written by :meth:`save`, strictly.
+
+        Raises:
+            CheckpointError: the folder is incomplete, damaged, or of another kind.
+        """
+        tokenizer, weights = cls.outline(folder), folder / WEIGHTS
+        fill(tokenizer, read_weights(weights, tokenizer.weights_sha256), where=weights, dtype=torch.float32)
+        return tokenizer
 
 
 def fit_patch_tokenizer(

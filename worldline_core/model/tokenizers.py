@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer, check_latents, check_video
 
 if TYPE_CHECKING:
@@ -103,14 +103,7 @@ class WanTokenizer(nn.Module):
                 expected="a diffusers folder with config.json and *.safetensors",
                 next_step="download Wan-AI/Wan2.2-TI2V-5B-Diffusers (subfolder vae) and give its folder",
             )
-        try:
-            name = json.loads((root / "config.json").read_text(encoding="utf-8")).get("_class_name")
-        except (json.JSONDecodeError, UnicodeDecodeError, AttributeError) as error:
-            raise CheckpointError(
-                "The autoencoder's config is not a JSON object", where=root, got=str(error)
-            ) from error
-        if name != AutoencoderKLWan.__name__:
-            raise CheckpointError("Not a Wan autoencoder", where=root, expected=AutoencoderKLWan.__name__, got=name)
+        _wan_shape(root)
         try:
             vae = AutoencoderKLWan.from_pretrained(
                 str(root), local_files_only=True, use_safetensors=True, torch_dtype=dtype, low_cpu_mem_usage=False
@@ -153,6 +146,43 @@ class WanDecoder:
         other = WanDecoder(self._tokenizer)
         other._cache, other._begun = list(self._cache), self._begun
         return other
+
+
+WAN22_SHAPE = {
+    "base_dim": 160, "decoder_base_dim": 256, "z_dim": 48, "dim_mult": [1, 2, 4, 4], "num_res_blocks": 2,
+    "temperal_downsample": [False, True, True], "is_residual": True, "in_channels": 12, "out_channels": 12,
+    "patch_size": 2, "scale_factor_temporal": 4, "scale_factor_spatial": 16,
+}  # fmt: skip
+"""The published autoencoder (Wan-AI/Wan2.2-TI2V-5B-Diffusers, vae/config.json)."""
+
+
+def _wan_shape(root: Path) -> dict[str, Any]:
+    """What an autoencoder's ``config.json`` says.
+
+    Raises:
+        CheckpointError: it is damaged, or of another autoencoder.
+    """
+    try:
+        shape = json.loads((root / "config.json").read_text(encoding="utf-8"))
+        name = shape.get("_class_name")
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError) as error:
+        raise CheckpointError("The autoencoder's config is not a JSON object", where=root, got=str(error)) from error
+    if name != "AutoencoderKLWan":
+        raise CheckpointError("Not a Wan autoencoder", where=root, expected="AutoencoderKLWan", got=name)
+    return shape
+
+
+def tokenizer_outline(folder: Path | None) -> WanTokenizer | PatchTokenizer:
+    """A tokenizer of the right shape without trained weights, to count with: of the folder, else the published Wan 2.2."""
+    if folder is not None and (folder / DESCRIPTION).is_file():
+        return PatchTokenizer.outline(folder)
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+
+    places = [] if folder is None else [folder / "vae", folder]
+    root = next((place for place in places if (place / "config.json").is_file()), None)
+    shape = WAN22_SHAPE if root is None else _wan_shape(root)
+    vae: Any = AutoencoderKLWan.from_config({"latents_mean": WAN22_MEAN, "latents_std": WAN22_STD, **shape})
+    return WanTokenizer(vae.eval().requires_grad_(False), where=root)
 
 
 def load_tokenizer(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> VideoTokenizer:

@@ -20,6 +20,7 @@ from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherRelations
 from worldline_core.training.stage import Stage
+from worldline_core.training.stage_cost import require_stage_fits
 from worldline_core.training.trainer import ParameterGroup
 from worldline_core.training.training_config import OptimizerConfig, Stage2Config
 from worldline_core.training.video_teacher import load_teacher
@@ -35,6 +36,13 @@ def stage2_groups(model: WorldModel, action_multiplier: float) -> list[Parameter
     ]
 
 
+def _film(config: Stage2Config) -> dict[str, Any]:
+    """What differs in the model where the robot's own control vectors take the place of maps."""
+    if config.native_size is None:
+        return {}
+    return {"action_conditioning": "native_film", "action_channels": config.native_size}
+
+
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for relations.
 
@@ -48,6 +56,10 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
     parent = Path(inputs["stage1"])
     native = config.native_size is not None
+    begun = read_checkpoint_info(parent).config
+    controls = {"action_frames": config.action_frames or begun.action_frames, **_film(config)}
+    shape = begun.model_copy(update={"towers": "generation", **controls})
+    require_stage_fits("stage II", config, shape, inputs, maps=True, relational=config.relational)
     tracks = ActionTracks.open(Path(inputs["tracks"]), EpisodeSet.open(Path(inputs["episodes"])) if native else None)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
@@ -59,8 +71,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
             weights=processes()[0] == 0,
         )
         if config.native_size is not None and model.config.native_size != config.native_size:
-            film = {"action_conditioning": "native_film", "action_channels": config.native_size}
-            model.config = model.config.model_copy(update=film)
+            model.config = model.config.model_copy(update=_film(config))
             model.action_encoder = new_action_branch(model.config)
         return model, info
 

@@ -8,8 +8,9 @@ four blocks, concatenated.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import torch
 from einops import rearrange
@@ -22,6 +23,9 @@ from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.checkpoint import fill, read_description
 from worldline_core.model.weight_files import read_weights
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape
+
+if TYPE_CHECKING:
+    from transformers import VJEPA2Model
 
 DESCRIPTION, WEIGHTS = "teacher.json", "teacher.safetensors"
 FORMAT = "worldline.small_video_teacher"
@@ -158,10 +162,18 @@ class VJepa2Teacher:
                 expected="a transformers folder of facebook/vjepa2-vitg-fpc64-384 with model*.safetensors",
                 next_step="download it, use the small teacher, or set relational to null",
             )
-        model = VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=dtype or torch.float32)
-        self.model = model.eval().requires_grad_(False)
+        self._hold(VJEPA2Model.from_pretrained(folder, local_files_only=True, dtype=dtype or torch.float32))
         self.model.to(torch.device(device))  # pyright: ignore[reportArgumentType]
-        self.device = device
+
+    @classmethod
+    def of(cls, model: VJEPA2Model) -> Self:
+        """With a model that is here already."""
+        teacher = cls.__new__(cls)
+        teacher._hold(model)
+        return teacher
+
+    def _hold(self, model: VJEPA2Model) -> None:
+        self.model = model.eval().requires_grad_(False)
         self.crop: int = self.model.config.crop_size
         self.side = self.crop // int(self.model.config.patch_size)  # pyright: ignore[reportArgumentType]
         self.tubelet: int = self.model.config.tubelet_size
@@ -192,6 +204,25 @@ class VJepa2Teacher:
         features = concatenated(self._outputs, self.side, self.side)
         self._outputs.clear()
         return features
+
+
+VJEPA2_GIANT = {"hidden_size": 1408, "num_hidden_layers": 40, "num_attention_heads": 22, "mlp_ratio": 48 / 11}
+"""The published encoder at full size (facebook/vjepa2-vitg-fpc64-384, config.json), with a crop of 384."""
+
+
+def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], Tensor]]:
+    """A teacher of the right shape without trained weights, to count with, and its features: of the folder, else V-JEPA 2."""
+    if folder is not None and (folder / DESCRIPTION).is_file():
+        description = read_description(folder / DESCRIPTION, FORMAT, "small teacher")
+        small = SmallVideoTeacher(SmallTeacherShape.model_validate(description.get("shape")))
+        return small.eval().requires_grad_(False), small.features
+    from transformers import VJEPA2Config, VJEPA2Model
+
+    shape: dict[str, Any] = VJEPA2_GIANT | {"crop_size": 384}
+    if folder is not None and (folder / "config.json").is_file():
+        shape = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    model = VJEPA2Model(VJEPA2Config(**shape))
+    return model, VJepa2Teacher.of(model).features
 
 
 def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
