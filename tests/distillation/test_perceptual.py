@@ -105,6 +105,22 @@ def test_the_end_of_a_clip_is_compared_as_the_whole_decoded_clip_shows_it(weight
         torch.testing.assert_close(PerceptualLoss(tokenizer, network)(predicted, target), expected.detach())
 
 
+def test_decoding_in_bfloat16_costs_little_accuracy(weights: Path) -> None:
+    torch.manual_seed(0)
+    vae, network = small_wan_autoencoder().requires_grad_(False), load_lpips(weights)
+    predicted, target = torch.randn(2, 1, 1, 48, 3, 4, 4).unbind(0)
+    found: list[torch.Tensor] = []
+    for dtype in (torch.float32, torch.bfloat16):
+        leaf = predicted.clone().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16):
+            value = PerceptualLoss(WanTokenizer(vae.to(dtype)), network, latent_frames=1)(leaf, target)
+        value.backward()
+        assert leaf.grad is not None
+        found += [value.detach(), leaf.grad[:, :, :, -1].flatten()]
+    torch.testing.assert_close(found[2], found[0], rtol=0.05, atol=0)
+    assert torch.nn.functional.cosine_similarity(found[1], found[3], dim=0) > 0.95
+
+
 def test_only_the_wan_autoencoder_decodes_in_bfloat16(weights: Path, project_root: Path) -> None:
     config = DistillConfig.model_validate({"lpips_weights": weights, "perceptual": {"bfloat16": True}})
     tokenizer = project_root / "artifacts" / "shipped" / "models" / "tokenizer"

@@ -249,6 +249,18 @@ def test_latents_are_decoded_as_they_arrive(fitted: PatchTokenizer, wan_folder: 
             torch.testing.assert_close(found, whole, rtol=0, atol=1e-6 if exact else 1e-4)
 
 
+@torch.no_grad()
+def test_a_wan_autoencoder_works_in_bfloat16(wan_folder: Path) -> None:
+    half, single = load_tokenizer(wan_folder, dtype=torch.bfloat16), load_tokenizer(wan_folder)
+    video = scenes(count=1, frames=9)
+    latents = single.encode(video)
+    assert torch.nn.functional.cosine_similarity(half.encode(video).flatten(), latents.flatten(), dim=0) > 0.999
+    decode, expected = half.decoder(), single.decode(latents)
+    found = torch.cat([decode(latents[:, :, :1]), decode(latents[:, :, 1:])], dim=2)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expected, rtol=0, atol=0.05)
+
+
 def test_the_fingerprint_of_a_pipeline_is_its_autoencoders(wan_folder: Path, tmp_path: Path) -> None:
     """A backbone of 30 GB beside it is neither read nor part of the name."""
     shutil.copytree(wan_folder / "vae", tmp_path / "vae")

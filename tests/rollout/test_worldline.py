@@ -111,6 +111,18 @@ def test_controls_of_whole_intervals_drive_a_model_that_has_not_learnt_from_them
     assert all(np.abs(before[view].astype(int) - after[view]).max() <= 2 for view in before)
 
 
+def test_weights_in_bfloat16_predict_nearly_the_same(observed: Observation, causal: WorldLine, models: Path) -> None:
+    half = WorldLine.from_pretrained(models / "causal", weights="bfloat16")
+    assert half.model.proj_in.weight.dtype == torch.bfloat16
+    images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
+    assert causal.causal is not None
+    size = (1, len(causal.views), causal.info.config.map_channels, 1 + causal.causal.block_size)
+    maps = torch.randn(*size, *causal.contract.grid_size, generator=torch.Generator().manual_seed(0))
+    (expected,), (found,) = (line.session(torch.stack(images)[None], [42]).step(maps) for line in (causal, half))
+    for view, frames in expected.items():
+        assert np.abs(found[view].astype(int) - frames).mean() < 1
+
+
 def test_decoding_one_block_while_the_next_is_sampled_changes_nothing(observed: Observation, causal: WorldLine) -> None:
     images = [frames_to_video(observed.images[view][None], causal.image_size)[:, 0] for view in causal.views]
     assert causal.causal is not None
