@@ -95,7 +95,7 @@ class PrefectMapper:
         )
         token = _round.set(_Round(waiting, hand_out, take, limit))
         try:
-            with limited_threads(1):
+            with limited_threads(1), shared_server():
                 flow()
         finally:
             _round.reset(token)
@@ -233,6 +233,22 @@ def _missing(extra: str, error: ImportError) -> UnavailableError:
         got=str(error),
         next_step=f"uv sync --extra {extra} (or pip install 'worldline[{extra}]'), or runner.kind=processes",
     )
+
+
+@contextmanager
+def shared_server() -> Iterator[None]:
+    """Processes that are started within speak to the server of this one, a temporary one too: each would start its own, which
+    knows none of the runs that it is told of."""
+    from prefect.client.orchestration import get_client
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    if PREFECT_API_URL.value():
+        yield
+        return
+    with get_client(sync_client=True) as client:
+        url = str(client.api_url)
+    with temporary_settings({PREFECT_API_URL: url}):
+        yield
 
 
 @contextmanager

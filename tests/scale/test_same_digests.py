@@ -88,6 +88,35 @@ def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], t
     assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 
 
+CURATION = """
+import json, sys
+from pathlib import Path
+from tasks.shard_mapper import shard_mapper
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.scale.mapping import RunnerConfig
+
+if __name__ == "__main__":
+    runner = RunnerConfig(kind="processes", workers=2, episodes_per_shard=3)
+    curate(CurateConfig.model_validate(json.loads(sys.argv[1])), {}, Path(sys.argv[2]), shard_mapper(runner))
+"""
+
+
+@pytest.mark.slow
+def test_processes_share_the_temporary_server(recordings: Path, tmp_path: Path, project_root: Path) -> None:
+    (tmp_path / "curation.py").write_text(CURATION)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    environment |= {"PREFECT_HOME": str(tmp_path), "PYTHONPATH": str(project_root)}
+    ended = subprocess.run(
+        [sys.executable, "curation.py", config(recordings).model_dump_json(), "set"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    assert len(read_account(tmp_path / "set")) == COUNT + 1
+    assert ended.stderr.count("Starting temporary server") == 1
+    assert "failed to process" not in ended.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 @pytest.mark.parametrize(("kind", "workers"), [("processes", 1), ("processes", 2), ("dask", 2), ("ray", 2)])
