@@ -12,6 +12,7 @@ from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
 from flows.plan_command import add_plan_command
 from flows.rehearsal import add_rehearse_command
+from flows.serve_commands import add_serve_commands
 from tasks.temporary_server import prepare_prefect
 from worldline_core.pipeline.steps import STEPS
 
@@ -90,6 +91,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_exchange_commands(commands)
     add_rehearse_command(commands)
     add_embodiment_commands(commands)
+    add_serve_commands(commands)
     _add_calibrate(commands)
     doctor = commands.add_parser("doctor", help="say what this machine can do")
     doctor.add_argument("--json", action="store_true", help="print JSON")

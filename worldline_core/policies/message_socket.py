@@ -102,7 +102,7 @@ class MessageSocket:
                     "The server did not answer in time", where=self.url, expected=f"a reply within {deadline:g} s",
                     next_step="connect again; allow more time where the server needs it",
                 ) from error  # fmt: skip
-            if error.sent is not None and error.sent.code == 1009:
+            if error.sent is not None and error.sent.code == 1009 and not error.rcvd_then_sent:
                 raise DataError(
                     "A reply is too large", where=self.url, expected=f"at most {self.max_bytes:,} bytes"
                 ) from error

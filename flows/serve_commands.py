@@ -1,0 +1,59 @@
+"""The verb that puts the simulator on a socket: `worldline serve`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_serve_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add them to the command line's parser."""
+    texts = {
+        "serve": "offer the simulator over a websocket and HTTP (extra: serve)",
+    }
+    for name, text in texts.items():
+        parser = commands.add_parser(name, help=text)
+        parser.add_argument(
+            "--config", type=Path, metavar="FILE", help="what differs from the defaults (docs/serve.md)"
+        )
+        parser.add_argument(
+            "--set", action="append", default=[], metavar="a.b=value", dest="overrides", help="change one value"
+        )
+        parser.set_defaults(run=serve_command)
+
+
+def serve_command(arguments: argparse.Namespace) -> None:
+    """Load the model and serve until interrupted."""
+    from worldline_core.config import apply_overrides, load_config, validate
+    from worldline_core.errors import UnavailableError
+    from worldline_core.serving.serve_config import ServeConfig
+
+    overrides = tuple(arguments.overrides)
+    if arguments.config is not None:
+        config = load_config(ServeConfig, path=arguments.config, overrides=overrides)
+    else:
+        config = validate(ServeConfig, apply_overrides({}, overrides), where="--set")
+    try:
+        import msgpack  # noqa: F401
+
+        from worldline_core.serving.app import make_server, server_token
+    except ImportError as error:
+        raise UnavailableError(
+            "The server needs packages that are not here", got=str(error), next_step="pip install 'worldline[serve]'"
+        ) from error
+    from worldline_core.rollout.worldline import WorldLine
+    from worldline_core.shipped import project_path
+
+    token, project = server_token(config), Path.cwd()
+    config = config.model_copy(
+        update={name: project_path(project, getattr(config, name)) for name in ("model", "episodes")}
+    )
+    world = WorldLine.from_pretrained(config.model, device=config.device, bfloat16=config.bfloat16, steps=config.steps)
+    server = make_server(world, config, token)
+    host = f"[{config.host}]" if ":" in config.host else config.host
+    print(f"{config.model} at ws://{host}:{config.port}/v1", flush=True)
+    server.run()
+    if not server.started:
+        raise UnavailableError(
+            "The server could not listen", where=f"{config.host}:{config.port}", next_step="--set port=..."
+        )

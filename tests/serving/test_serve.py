@@ -1,0 +1,261 @@
+"""`worldline serve`: sessions over websocket and HTTP, their independence, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import httpx
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from worldline_core import WorldLine
+from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.policies.array_messages import pack, unpack
+from worldline_core.policies.openpi import is_healthy
+from worldline_core.serving.app import server_token
+from worldline_core.serving.client import RemoteSimulation, SimulatorClient
+from worldline_core.serving.recorded_starts import RecordedStarts
+from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
+
+TOKEN, EPISODE = "correct horse", "ur5e_silver-test-s1-00000"
+
+
+@pytest.fixture(scope="module")
+def url(serving: Callable) -> Sequence[str]:  # type: ignore[misc]
+    with serving() as address:
+        yield address
+
+
+def drive(simulation: RemoteSimulation, steps: int, seed: int) -> str:
+    """Digest of all frames and states of a closed loop whose controls depend on what was seen."""
+    generator, digest = np.random.default_rng(seed), hashlib.sha256()
+    for _ in range(steps):
+        seen = np.array([[picture.mean() for picture in clip.values()] for clip in simulation.pictures]).mean()
+        state = simulation.state
+        rows = state[:, None] + generator.normal(0, 0.02, (len(state), simulation.frames_per_step, state.shape[1]))
+        for clip in simulation.step(rows + 1e-4 * seen):
+            digest.update(b"".join(video.tobytes() for video in clip.values()))
+        digest.update(simulation.states.tobytes())
+    return digest.hexdigest()
+
+
+def test_a_session_is_the_simulation_of_one_process(url: str, small_world: WorldLine, shipped) -> None:
+    starts = RecordedStarts(shipped / "recordings", small_world)
+    here = starts.simulate(starts.read(EPISODE), [3])
+    with SimulatorClient(url) as client:
+        assert is_healthy(url)
+        assert client.metadata["views"] == list(small_world.views)
+        assert client.metadata["fps"] == 8
+        assert EPISODE in {row["id"] for row in client.metadata["episodes"]}
+        assert httpx.get(url.replace("ws", "http") + "/v1").json() == client.metadata
+        there = client.start(EPISODE, seeds=[3])
+        assert there.frames_per_step == here.frames_per_step == 4
+        for step in range(3):
+            controls = np.repeat(here.state[:, None], 4, axis=1) + 0.02 * step
+            frames, expected = there.step(controls), here.step(controls)
+            for view in here.views:
+                assert np.array_equal(frames[0][view], expected[0][view]), view
+                assert np.array_equal(there.pictures[0][view], here.pictures[0][view])
+            assert np.array_equal(there.states, here.states)
+            assert np.array_equal(there.commands, here.commands)
+            assert np.array_equal(there.tool_poses, here.tool_poses)
+        assert there.num_frames == here.num_frames == 13
+        branches = there.fork(2)
+        controls = np.repeat(here.state[:, None], 4, axis=1)
+        both, one = branches.step(np.concatenate((controls, controls + 0.1))), there.step(controls)
+        assert all(np.array_equal(both[0][view], one[0][view]) for view in here.views)
+        assert not np.array_equal(both[1]["head"], one[0]["head"])
+        there.reset()
+        assert there.num_frames == 1
+        first = drive(there, 2, 0)
+        there.reset()
+        assert drive(there, 2, 0) == first
+        there.close()
+        with pytest.raises(DataError, match="no such session"):
+            there.step(controls)
+
+
+def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world: WorldLine, shipped) -> None:
+    start = RecordedStarts(shipped / "recordings", small_world).read(EPISODE)
+    given = {
+        "images": start.images,
+        "cameras": start.cameras,
+        "embodiment": "ur5e_silver",
+        "state": start.episode.action[0],
+    }
+    with SimulatorClient(url) as client:
+        recorded, sent = client.start(EPISODE, seeds=[1, 2]), client.start(**given, seeds=[1, 2])
+        assert drive(recorded, 2, 0) == drive(sent, 2, 0)
+        for change, match in (
+            ({"embodiment": "/etc/passwd"}, "Unknown embodiment"),
+            ({"embodiment": "../ur5e.yaml"}, "Unknown embodiment"),
+            ({"images": {"head": start.images["head"].astype(np.float32)}}, r"(?s)image is no picture.*uint8"),
+            ({"state": np.zeros(3)}, "wrong length"),
+            ({"state": np.full(14, np.nan)}, "not finite"),
+            ({"state": np.array(["a"] * 14)}, "Not an array of numbers"),
+            ({"episode": EPISODE}, r"(?s)starts at a recording, or at an observation.*got: images, cameras"),
+            ({"cameras": None}, "starts at a recording, or at an observation"),
+            ({"seeds": [-1]}, "seed is out of range"),
+            ({"seeds": []}, "not understood"),
+            ({"seeds": [0] * 10_000}, "Too many clips"),
+        ):
+            with pytest.raises(DataError, match=match):
+                client.start(**(given | change))
+        with pytest.raises(DataError, match="No recording of this name"):
+            client.start("nobody")
+        with pytest.raises(DataError, match=r"(?s)Controls of a step have another shape.*\(2, 4, 14\)"):
+            sent.step(np.zeros((1, 4, 14)))
+        with pytest.raises(DataError, match="No such clips"):
+            sent.select([7])
+        assert len(sent.step(np.repeat(sent.state[:, None], 4, axis=1))) == 2  # as it was before the errors
+        for request, match in (
+            ([1], "no map"),
+            ({"op": "eval"}, "Unknown request"),
+            ({"op": "step", "session": "x"}, "not understood"),
+        ):
+            with pytest.raises(DataError, match=match):
+                client.call(request)  # type: ignore[arg-type]
+    with SimulatorClient(url) as other, pytest.raises(DataError, match="no such session"):
+        other.call({"op": "step", "session": sent.session, "controls": np.zeros((2, 4, 14))})
+
+
+def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) -> None:
+    """The short version of `benchmarks/serve_load.py`; one client in four vanishes in the middle."""
+    episodes = [EPISODE, "aloha_viperx-test-s1-00000"]
+
+    def alone(client: SimulatorClient, number: int) -> str:
+        return drive(client.start(episodes[number % 2], seeds=[number]), 2, number)
+
+    with serving() as url:
+        with SimulatorClient(url) as client:
+            names = {row["id"] for row in client.metadata["episodes"]}
+            episodes[1] = next(name for name in sorted(names) if "viperx" in name)
+            expected = [alone(client, number) for number in range(8)]
+        assert len(set(expected)) == 8
+        found: dict[int, str] = {}
+
+        def work(number: int) -> None:
+            with SimulatorClient(url) as client:
+                if number % 4 == 3:
+                    drive(client.start(episodes[0], seeds=[99]), 1, 0)
+                    client._connection.socket.shutdown(socket.SHUT_RDWR)
+                    return
+                found[number] = alone(client, number)
+
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        assert found == {number: digest for number, digest in enumerate(expected) if number % 4 != 3}
+
+
+def test_limits_refuse_and_free_again(serving: Callable) -> None:
+    with serving(max_sessions=2, max_clips=3, max_connections=2, max_message_bytes=1 << 20, idle_s=0.6) as url:
+        with SimulatorClient(url) as client:
+            client.start(EPISODE)
+            pair = client.start(EPISODE, seeds=[1, 2])
+            with pytest.raises(UnavailableError, match=r"(?s)no room for another session.*2 sessions with 3 clips"):
+                client.start(EPISODE)
+            with pytest.raises(UnavailableError, match="no room"):
+                pair.fork(1)
+            with (
+                SimulatorClient(url),
+                pytest.raises(UnavailableError, match=r"(?s)closed the connection.*1013.*too many"),
+            ):
+                SimulatorClient(url)
+            with pytest.raises(UnavailableError, match="closed the connection"):
+                client.request({"op": "x" * (2 << 20)})  # larger than a message may be
+        with SimulatorClient(url) as client:
+            again = client.start(EPISODE, seeds=[1, 2])  # the sessions of the closed connection are gone
+            again.step(np.repeat(again.state[:, None], 4, axis=1))
+            time.sleep(1.2)
+            with pytest.raises(UnavailableError, match="closed the connection"):  # idle
+                again.step(np.repeat(again.state[:, None], 4, axis=1))
+        web = url.replace("ws", "http")
+        opened = unpack(httpx.post(f"{web}/v1", content=pack({"op": "start", "episode": EPISODE})).content, "server")
+        assert opened["pictures"]["head"].shape == (1, 64, 96, 3)
+        time.sleep(1.2)
+        reply = httpx.post(f"{web}/v1", content=pack({"op": "reset", "session": opened["session"]}))
+        assert reply.status_code == 400
+        assert "no such session" in unpack(reply.content, "server")["error"]["what"]
+        assert httpx.post(f"{web}/v1", content=b"0" * (2 << 20)).status_code == 413
+        assert httpx.post(f"{web}/v1", content=b"\xc1").status_code == 400
+
+
+def test_the_worker_refuses_what_it_cannot_take(serving: Callable) -> None:
+    with serving(max_waiting=1) as url, SimulatorClient(url) as client:
+        simulations = [client.start(EPISODE, seeds=[1] * 12)]
+        others = [SimulatorClient(url) for _ in range(4)]
+        simulations += [other.start(EPISODE, seeds=[1] * 12) for other in others]
+        refused: list[str] = []
+
+        def step(simulation: RemoteSimulation) -> None:
+            try:
+                simulation.step(np.repeat(simulation.state[:, None], 4, axis=1))
+            except UnavailableError as error:
+                refused.append(str(error))
+
+        threads = [threading.Thread(target=step, args=(simulation,)) for simulation in simulations]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        assert refused
+        assert all("The server is busy" in text and "a little later" in text for text in refused)
+        for other in others:
+            other.close()
+
+
+def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    def status(url: str, **headers: str) -> int:
+        host = headers.pop("host", None)
+        given = {name.title(): value for name, value in headers.items()} | ({} if host is None else {"Host": host})
+        codes = {httpx.get(url.replace("ws", "http") + "/v1", headers=given).status_code}
+        if host is None:
+            try:
+                with connect(url + "/v1", additional_headers=given, proxy=None):
+                    codes.add(200)
+            except InvalidStatus:  # a refused websocket is always 403
+                codes |= set() if codes == {401} else {403}
+        assert len(codes) == 1
+        return codes.pop()
+
+    with serving(origins=["http://friend:1"]) as url:
+        assert status(url) == 200
+        assert status(url, origin=url.replace("ws", "http")) == 200
+        assert status(url, origin="http://friend:1") == 200
+        assert status(url, origin="http://attacker.example") == 403
+        assert status(url, origin="null") == 403
+        assert status(url, host="attacker.example") == 403  # a name bound anew to this machine
+        assert status(url, host="localhost:1") == 200
+    with serving(token=TOKEN) as url:
+        assert status(url) == 401
+        assert status(url, authorization="Bearer wrong") == 401
+        assert status(url, authorization="Bearer correct hors") == 401
+        assert status(url, authorization=f"Bearer {TOKEN}") == 200
+        assert status(url, authorization=f"Bearer {TOKEN}", origin="http://attacker.example") == 403
+        assert is_healthy(url)
+        with pytest.raises(UnavailableError, match=r"(?s)403.*token"):
+            SimulatorClient(url)
+        with SimulatorClient(url, token=TOKEN) as client:
+            assert client.metadata["protocol"] == 1
+        with connect(url + "/v1?token=correct%20horse", proxy=None) as page:
+            page.recv()
+            page.send("no bytes")
+            assert "not understood" in unpack(page.recv(), "server")["error"]["what"]
+            with pytest.raises(ConnectionClosed, match="1007"):
+                page.recv()
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    assert server_token(ServeConfig()) is None
+    assert server_token(ServeConfig(host="::1")) is None
+    with pytest.raises(ConfigError, match=r"(?s)needs a token.*0\.0\.0\.0.*WORLDLINE_TOKEN="):
+        server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104
+    monkeypatch.setenv(TOKEN_VARIABLE, "abc")
+    assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104

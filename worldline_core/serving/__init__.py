@@ -1,0 +1,1 @@
+"""The simulator as a server (`worldline serve`), and its Python client."""

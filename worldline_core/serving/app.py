@@ -1,0 +1,149 @@
+"""The server's addresses: ``/healthz`` and ``/v1`` (requests over a websocket or HTTP).
+
+Over the websocket the server first sends its metadata; then each request is one message and has one reply. The next request
+is read when the reply was taken, so a client cannot pile up work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.policies.array_messages import pack, unpack
+from worldline_core.rollout.worldline import WorldLine
+from worldline_core.serving.gate import Gate
+from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
+from worldline_core.serving.session_host import SessionHost, error_message
+
+MEDIA_TYPE = "application/msgpack"
+TAKE_S = 30.0
+"""A client takes a reply, and sends a body, within this time."""
+_STATUS = {"BusyError": 503}
+
+
+def make_app(host: SessionHost, token: str | None) -> ASGIApp:
+    """The server as an ASGI application."""
+    config, connections = host.config, set[int]()
+    over_http = object()  # owns the sessions that were started over HTTP
+
+    async def health(_: Request) -> Response:
+        return PlainTextResponse("OK\n")
+
+    async def metadata(_: Request) -> Response:
+        return JSONResponse(host.metadata())
+
+    async def request(http: Request) -> Response:
+        body = bytearray()
+        try:
+            async with asyncio.timeout(TAKE_S):
+                async for part in http.stream():
+                    body += part
+                    if len(body) > config.max_message_bytes:
+                        return PlainTextResponse("the request is too large\n", 413, {"connection": "close"})
+        except (TimeoutError, ClientDisconnect):
+            return PlainTextResponse("the request did not come in time\n", 408, {"connection": "close"})
+        try:
+            reply = await host.handle(over_http, unpack(bytes(body), "request", max_bytes=config.max_message_bytes))
+        except DataError as error:
+            reply = {"error": error_message(error)}
+        status = _STATUS.get(reply["error"]["kind"], 400) if "error" in reply else 200
+        return Response(pack(reply), status, media_type=MEDIA_TYPE)
+
+    async def connected(websocket: WebSocket, serve: Callable[[WebSocket], Awaitable[None]]) -> None:
+        """Serve a connection until it ends, from either side."""
+        if len(connections) >= config.max_connections:
+            await websocket.accept()
+            await websocket.close(1013, "too many connections, try again later")
+            return
+        connections.add(id(websocket))
+        try:
+            await websocket.accept()
+            await serve(websocket)
+        except WebSocketDisconnect:
+            pass
+        except TimeoutError:
+            with suppress(WebSocketDisconnect, RuntimeError):  # gone already
+                await websocket.close(1008, "idle, or replies were not taken")
+        finally:
+            connections.discard(id(websocket))
+            host.leave(websocket)
+
+    async def messages(websocket: WebSocket) -> None:
+        await send_in_time(websocket, pack(host.metadata()))
+        while True:
+            async with asyncio.timeout(config.idle_s):
+                found = await websocket.receive()
+            if found["type"] == "websocket.disconnect":
+                return
+            try:
+                message = unpack(found.get("bytes") or b"", "request", max_bytes=config.max_message_bytes)
+            except DataError as error:
+                # What follows a message that is not understood cannot be trusted either.
+                await send_in_time(websocket, pack({"error": error_message(error)}))
+                await websocket.close(1007, "a message was not understood")
+                return
+            await send_in_time(websocket, pack(await host.handle(websocket, message)))
+
+    async def api(websocket: WebSocket) -> None:
+        await connected(websocket, messages)
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        reaper = asyncio.create_task(host.close_idle())
+        yield
+        reaper.cancel()
+        host.shut_down()
+
+    routes = [
+        Route("/healthz", health),
+        Route("/v1", metadata, methods=["GET"]),
+        Route("/v1", request, methods=["POST"]),
+        WebSocketRoute("/v1", api),
+    ]
+    return Gate(Starlette(routes=routes, lifespan=lifespan), config, token)
+
+
+async def send_in_time(websocket: WebSocket, content: bytes) -> None:
+    """Send to a client that reads.
+
+    Raises: TimeoutError for one that does not.
+    """
+    async with asyncio.timeout(TAKE_S):
+        await websocket.send_bytes(content)
+
+
+def server_token(config: ServeConfig) -> str | None:
+    """The token that clients must show, from the environment.
+
+    Raises: ConfigError when others can reach the server, and there is none.
+    """
+    token = os.environ.get(TOKEN_VARIABLE) or None
+    if token is None and not config.on_loopback:
+        raise ConfigError(
+            "A server that others can reach needs a token", where=f"host {config.host}",
+            expected=f"the environment variable {TOKEN_VARIABLE}", got="none",
+            next_step=f"{TOKEN_VARIABLE}={secrets.token_urlsafe(24)} worldline serve ..., or listen at 127.0.0.1",
+        )  # fmt: skip
+    return token
+
+
+def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvicorn.Server:
+    """A server that ``run()`` starts; its limits and timeouts are those of the configuration."""
+    settings = uvicorn.Config(
+        make_app(SessionHost(world, config), token), config.host, config.port, ws="websockets-sansio",
+        ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
+        timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
+    )  # fmt: skip
+    return uvicorn.Server(settings)

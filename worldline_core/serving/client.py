@@ -1,0 +1,141 @@
+"""A Python client of `worldline serve`: the simulator of another process or machine, driven like one of this process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from worldline_core.errors import DataError, UnavailableError
+from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
+from worldline_core.policies.message_socket import MessageSocket
+
+
+class SimulatorClient(MessageSocket):
+    """A connection to a server; sessions that were started over it end with it.
+
+    Args:
+        url: ``ws://host:port``.
+        token: of a server that asks for one.
+
+    Attributes:
+        metadata: what the server says of itself: views, fps, frames_per_step, image_size, episodes.
+
+    Raises:
+        UnavailableError: nobody answers there, or the token is refused.
+    """
+
+    def __init__(
+        self, url: str, *, token: str | None = None, deadline_s: float = 60.0, max_bytes: int = MAX_MESSAGE_BYTES
+    ) -> None:
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        super().__init__(f"{url.rstrip('/')}/v1", headers=headers, deadline_s=deadline_s, max_bytes=max_bytes)
+        self.metadata: dict[str, Any] = self.receive()
+
+    def start(
+        self,
+        episode: str | None = None,
+        *,
+        images: Mapping[str, np.ndarray] | None = None,
+        cameras: Mapping[str, Any] | None = None,
+        embodiment: str | None = None,
+        state: np.ndarray | None = None,
+        seeds: Sequence[int] = (42,),
+    ) -> RemoteSimulation:
+        """Begin a session at a recording of the server, or at an observation as of ``WorldLine.start``.
+
+        Args:
+            cameras: by view, ``Camera`` objects.
+            seeds: a clip for each.
+
+        Raises:
+            DataError: the start is not usable; UnavailableError: there is no room for it.
+        """
+        posed = None
+        if cameras is not None:
+            posed = {
+                view: {"K": np.asarray(camera.K), "T_base_camera": camera.T_base_camera}
+                for view, camera in cameras.items()
+            }
+        given = {"episode": episode, "images": images, "cameras": posed, "embodiment": embodiment, "state": state}
+        present = {name: value for name, value in given.items() if value is not None}
+        return RemoteSimulation(self, self.call({"op": "start", "seeds": list(seeds), **present}))
+
+    def call(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """The reply to one request.
+
+        Raises:
+            DataError: the server says what is wrong with it; UnavailableError: the server is busy or gone.
+        """
+        reply = self.request(request)
+        error = reply.get("error")
+        if error is not None:
+            kind = UnavailableError if error["kind"] in ("BusyError", "UnavailableError") else DataError
+            details = {name: error.get(name) for name in ("expected", "got", "next_step")}
+            raise kind(error["what"], where=error.get("where", self.url), **details)
+        return reply
+
+
+class RemoteSimulation:
+    """A session on a server.
+
+    Attributes:
+        pictures: last picture of every view, ``uint8 (H, W, 3)``, of each clip.
+        states, commands: ``(b, n, j)`` of the last step's frames, as of ``Simulation``.
+        tool_poses: ``(b, a, 4, 4)`` at the last picture.
+        frames_per_step: controls that a step takes.
+        seconds: that the server took for the last step, its queue included.
+    """
+
+    def __init__(self, client: SimulatorClient, opened: Mapping[str, Any]) -> None:
+        self._client = client
+        self.session: str = opened["session"]
+        self.frames_per_step: int = opened["frames_per_step"]
+        self.embodiment: str = opened["embodiment"]
+        self.state_names: list[str] = opened["state_names"]
+        self.seconds = 0.0
+        self._take(opened)
+
+    def _take(self, reply: Mapping[str, Any]) -> None:
+        self.num_frames: int = reply["num_frames"]
+        self.states, self.commands, self.tool_poses = (reply[name] for name in ("states", "commands", "tool_poses"))
+        if "pictures" in reply:
+            self.pictures = _by_clip(reply["pictures"])
+
+    @property
+    def state(self) -> np.ndarray:
+        """``(b, j)``: where the robot is at the last picture."""
+        return self.states[:, -1]
+
+    def step(self, controls: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """Predict the next frames under controls ``(b, frames_per_step, j)``; of every clip ``uint8 (n, H, W, 3)`` by view."""
+        reply = self._client.call({"op": "step", "session": self.session, "controls": np.asarray(controls, np.float64)})
+        self._take(reply)
+        self.seconds = reply["seconds"]
+        frames = _by_clip(reply["frames"])
+        self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
+        return frames
+
+    def fork(self, n: int, seeds: Sequence[int] | None = None) -> RemoteSimulation:
+        """``n`` branches of every clip as a session of their own."""
+        return self.select([clip for clip in range(len(self.states)) for _ in range(n)], seeds)
+
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> RemoteSimulation:
+        """These clips, in the state that they are in, as a session of their own."""
+        request = {"op": "fork", "session": self.session, "clips": [int(clip) for clip in clips]}
+        request |= {} if seeds is None else {"seeds": list(seeds)}
+        return RemoteSimulation(self._client, self._client.call(request))
+
+    def reset(self) -> None:
+        """Go back to the start."""
+        self._take(self._client.call({"op": "reset", "session": self.session}))
+
+    def close(self) -> None:
+        """End the session."""
+        self._client.call({"op": "close", "session": self.session})
+
+
+def _by_clip(arrays: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    count = len(next(iter(arrays.values())))
+    return [{view: values[clip] for view, values in arrays.items()} for clip in range(count)]

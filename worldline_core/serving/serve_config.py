@@ -1,0 +1,84 @@
+"""What `worldline serve` is told: the model, where it listens, its limits, and the policies that may drive."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+
+from pydantic import Field
+
+from worldline_core.config import StrictModel
+from worldline_core.shipped import SHIPPED
+
+TOKEN_VARIABLE = "WORLDLINE_TOKEN"  # noqa: S105  # the variable's name
+
+
+class PolicyConfig(StrictModel):
+    """An openpi policy server, and under which names it expects an observation.
+
+    Attributes:
+        url: ws://host:port.
+        api_key_variable: environment variable that holds its API key.
+        image_keys: by view. A dot or a slash is part of the name.
+        deadline_s: for one chunk of actions.
+    """
+
+    url: str = Field(pattern=r"^wss?://")
+    api_key_variable: str | None = None
+    image_keys: dict[str, str] = Field(
+        default_factory=lambda: {view: f"observation.images.{view}" for view in ("head", "left_wrist", "right_wrist")}
+    )
+    state_key: str = "observation.state"
+    prompt_key: str = "prompt"
+    deadline_s: float = Field(10.0, gt=0)
+
+
+class ServeConfig(StrictModel):
+    """Configuration of `worldline serve`.
+
+    Attributes:
+        model: folder of a causal or Stage II checkpoint.
+        steps: Euler steps; by default the model's own.
+        episodes: EpisodeSet whose recordings sessions may start from.
+        output: where sessions of the page are saved.
+        host: address to listen at. Anything but loopback needs a token (environment variable WORLDLINE_TOKEN).
+        origins: pages of other servers that may connect (http://host:port).
+        max_sessions, max_clips: at a time; clips of all sessions together.
+        max_message_bytes: of one request or reply.
+        max_waiting: requests that wait for the worker; beyond it they are refused as busy.
+        idle_s: sessions that nobody uses for so long are closed.
+        max_blocks: blocks that one session of the page keeps for rewinding and saving.
+    """
+
+    model: Path = SHIPPED / "models" / "causal"
+    device: str = "cpu"
+    bfloat16: bool = True
+    steps: int | None = Field(None, ge=1)
+    episodes: Path = SHIPPED / "recordings"
+    output: Path = Path("artifacts") / "play"
+    host: str = "127.0.0.1"
+    port: int = Field(8010, ge=0, le=65535)
+    origins: tuple[str, ...] = ()
+    max_connections: int = Field(128, ge=1)
+    max_sessions: int = Field(64, ge=1)
+    max_clips: int = Field(256, ge=1)
+    max_message_bytes: int = Field(64 << 20, ge=1 << 16)
+    max_waiting: int = Field(64, ge=1)
+    idle_s: float = Field(300.0, gt=0)
+    max_blocks: int = Field(300, ge=1)
+    policies: dict[str, PolicyConfig] = Field(default_factory=dict)
+
+    @property
+    def on_loopback(self) -> bool:
+        """Whether only this machine can reach the server."""
+        return is_loopback(self.host)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is this machine's own."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,321 @@
+"""Many running simulations behind one worker: requests in, replies out, with limits on everything.
+
+One thread computes, one request after another in the order of their arrival, so a session gives the bytes that it would give
+alone. Requests that find too many others waiting are refused as busy. Sessions belong to whoever started them (a websocket
+connection, or those who know the name of a session started over HTTP), and are closed when they leave, or stay idle.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from worldline_core.errors import DataError, UnavailableError, WorldLineError
+from worldline_core.geometry.embodiment import check_embodiment_name
+from worldline_core.rollout.observation import Camera
+from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.worldline import WorldLine
+from worldline_core.serving.recorded_starts import RecordedStarts
+from worldline_core.serving.serve_config import ServeConfig
+
+LARGEST_SEED = 2**63 - 1
+
+
+class BusyError(UnavailableError):
+    """A limit of the server is reached for now."""
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
+
+
+class _CameraMessage(_Request):
+    K: np.ndarray
+    T_base_camera: np.ndarray | None = None
+
+
+class StartRequest(_Request):
+    """Begin a session at a recording of the server, or at images, cameras, state and embodiment; a clip for each seed."""
+
+    op: Literal["start"]
+    episode: str | None = None
+    images: dict[str, np.ndarray] | None = None
+    cameras: dict[str, _CameraMessage] | None = None
+    embodiment: str | None = None
+    state: np.ndarray | None = None
+    seeds: list[int] = Field(default=[42], min_length=1)
+
+
+class StepRequest(_Request):
+    """Predict the next frames of a session under controls ``(clips, frames_per_step, state size)``."""
+
+    op: Literal["step"]
+    session: str
+    controls: np.ndarray
+
+
+class ForkRequest(_Request):
+    """Begin a session with these clips of another one, in the state that they are in; one may be named several times."""
+
+    op: Literal["fork"]
+    session: str
+    clips: list[int] = Field(min_length=1)
+    seeds: list[int] | None = None
+
+
+class SessionRequest(_Request):
+    """Bring a session back to its start, or close it."""
+
+    op: Literal["reset", "close"]
+    session: str
+
+
+Request = StartRequest | StepRequest | ForkRequest | SessionRequest
+_REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
+
+
+@dataclass
+class _Running:
+    owner: object
+    start: Simulation
+    simulation: Simulation
+    used: float
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+
+class SessionHost:
+    """All sessions of a server.
+
+    Attributes:
+        world, starts: the model, and the recordings to start from.
+    """
+
+    def __init__(self, world: WorldLine, config: ServeConfig) -> None:
+        self.world = world
+        self.config = config
+        self.starts = RecordedStarts(config.episodes, world)
+        self._running: dict[str, _Running] = {}
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simulator")
+        self._waiting = 0
+
+    def metadata(self) -> dict[str, Any]:
+        """What a client needs to know."""
+        world = self.world
+        return {
+            "protocol": 1,
+            "views": list(world.views),
+            "fps": world.contract.fps,
+            "frames_per_step": world.frames_per_unit if world.causal is not None else None,
+            "image_size": list(world.image_size),
+            "episodes": self.starts.listed(),
+            "policies": list(self.config.policies),
+        }
+
+    def __len__(self) -> int:
+        """Sessions that are open."""
+        return len(self._running)
+
+    async def compute[T](self, work: Callable[[], T]) -> T:
+        """What ``work`` returns, done by the one worker.
+
+        Raises: BusyError where too much is waiting.
+        """
+        if self._waiting >= self.config.max_waiting:
+            raise BusyError(
+                "The server is busy", expected=f"at most {self.config.max_waiting} waiting requests",
+                next_step="send the request again a little later",
+            )  # fmt: skip
+        self._waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._worker, work)
+        finally:
+            self._waiting -= 1
+
+    async def handle(self, owner: object, message: object) -> dict[str, Any]:
+        """The reply to one request: what was asked for, or ``error`` with what is wrong with it."""
+        try:
+            return await self._handle(owner, _parsed(message))
+        except WorldLineError as error:
+            return {"error": error_message(error)}
+
+    async def _handle(self, owner: object, request: Request) -> dict[str, Any]:
+        if isinstance(request, StartRequest):
+            self._check_room(len(request.seeds))
+            simulation = await self.compute(lambda: self._start(request))
+            return self._opened(owner, simulation, simulation.copy())
+        running = self._find(owner, request.session)
+        async with running.lock:
+            running.used = time.monotonic()
+            try:
+                return await self._act(owner, running, request)
+            finally:
+                running.used = time.monotonic()
+
+    async def _act(self, owner: object, running: _Running, request: Request) -> dict[str, Any]:
+        simulation = running.simulation
+        if isinstance(request, StepRequest):
+            begin = time.monotonic()
+            frames = await self.compute(lambda: simulation.step(request.controls))
+            seconds = time.monotonic() - begin
+            shown = {view: np.stack([clip[view] for clip in frames]) for view in simulation.views}
+            return {**_state_of(simulation), "frames": shown, "seconds": seconds}
+        if isinstance(request, ForkRequest):
+            self._check_room(len(request.clips))
+            branches = await self.compute(lambda: simulation.select(request.clips, request.seeds))
+            return self._opened(owner, branches, running.start.select(request.clips))
+        if isinstance(request, SessionRequest) and request.op == "reset":
+            running.simulation = running.start.copy()
+            return {**_state_of(running.simulation), "pictures": _pictures_of(running.simulation)}
+        self.close(request.session if isinstance(request, SessionRequest) else "")
+        return {"closed": True}
+
+    def _start(self, request: StartRequest) -> Simulation:
+        given = {
+            "images": request.images,
+            "cameras": request.cameras,
+            "embodiment": request.embodiment,
+            "state": request.state,
+        }
+        present = [name for name, value in given.items() if value is not None]
+        if (request.episode is not None) == bool(present) or (present and len(present) < len(given)):
+            raise DataError(
+                "A session starts at a recording, or at an observation", expected=f"episode, or {', '.join(given)}",
+                got=", ".join([*present, *(["episode"] if request.episode is not None else [])]) or "neither",
+            )  # fmt: skip
+        if request.episode is not None:
+            return self.starts.simulate(self.starts.read(request.episode), request.seeds)
+        images, cameras, name = request.images or {}, request.cameras or {}, request.embodiment or ""
+        check_embodiment_name(name)  # a path would name a file of this machine
+        if wrong := [
+            view for view, image in images.items() if image.dtype != np.uint8 or image.ndim != 3 or not image.size
+        ]:
+            raise DataError(
+                "An image is no picture", where=wrong[0], expected="uint8 (H, W, 3)", got=images[wrong[0]].dtype
+            )
+        numbers = {"state": request.state, **{f"K of {view}": camera.K for view, camera in cameras.items()}}
+        if wrong := [what for what, values in numbers.items() if values is None or values.dtype.kind not in "fiu"]:
+            raise DataError("Not an array of numbers", where=wrong[0], expected="reals or integers")
+        posed = {view: Camera(camera.K, camera.T_base_camera) for view, camera in cameras.items()}
+        rows = np.asarray(request.state, np.float64)
+        rows = np.repeat(rows[None], len(request.seeds), axis=0) if rows.ndim == 1 else rows
+        return self.world.start(
+            [images] * len(request.seeds), [posed] * len(request.seeds), embodiment=self.starts.kinematics(name),
+            state=rows, seed=request.seeds,
+        )  # fmt: skip
+
+    def _check_room(self, clips: int) -> None:
+        """Raises: BusyError when so many more clips pass a limit; DataError when their replies alone would."""
+        config = self.config
+        frames = self.world.frames_per_unit if self.world.causal is not None else self.world.unit(33)
+        size = clips * frames * len(self.world.views) * 3 * int(np.prod(self.world.image_size))
+        if size > 0.9 * config.max_message_bytes or clips > config.max_clips:
+            raise DataError(
+                "Too many clips for one session", expected=f"replies below {config.max_message_bytes:,} bytes, and at most "
+                f"{config.max_clips} clips", got=f"{clips} clips of {size // clips:,} bytes a step",
+            )  # fmt: skip
+        used = sum(len(running.simulation) for running in self._running.values())
+        if len(self._running) >= config.max_sessions or used + clips > config.max_clips:
+            raise BusyError(
+                "The server has no room for another session",
+                expected=f"at most {config.max_sessions} sessions with {config.max_clips} clips",
+                got=f"{len(self._running)} sessions with {used} clips, and {clips} more",
+                next_step="close sessions, or try again later",
+            )
+
+    def _opened(self, owner: object, simulation: Simulation, start: Simulation) -> dict[str, Any]:
+        self._check_room(len(simulation))  # others came while this one was made
+        name = secrets.token_urlsafe(12)
+        self._running[name] = _Running(owner, start, simulation, time.monotonic())
+        embodiment = simulation.embodiment
+        return {
+            **_state_of(simulation),
+            "session": name,
+            "pictures": _pictures_of(simulation),
+            "frames_per_step": simulation.frames_per_step,
+            "embodiment": embodiment.name,
+            "state_names": list(embodiment.state_names),
+        }
+
+    def _find(self, owner: object, name: str) -> _Running:
+        running = self._running.get(name)
+        if running is None or running.owner is not owner:
+            raise DataError("There is no such session", got=name, next_step="start one; idle sessions are closed")
+        return running
+
+    def close(self, name: str) -> None:
+        """Close a session, if it is there."""
+        self._running.pop(name, None)
+
+    def leave(self, owner: object) -> None:
+        """Close all sessions of an owner."""
+        for name in [name for name, running in self._running.items() if running.owner is owner]:
+            self.close(name)
+
+    async def close_idle(self) -> None:
+        """Close sessions that stay idle, for as long as the server runs."""
+        while True:
+            await asyncio.sleep(min(5.0, self.config.idle_s / 4))
+            now = time.monotonic()
+            for name, running in list(self._running.items()):
+                if not running.lock.locked() and now - running.used > self.config.idle_s:
+                    self.close(name)
+
+    def shut_down(self) -> None:
+        """Let go of all sessions and of the worker."""
+        self._running.clear()
+        self._worker.shutdown(wait=True, cancel_futures=True)
+
+
+def _parsed(message: object) -> Request:
+    if not isinstance(message, Mapping):
+        raise DataError("A request is no map", expected="op and its values", got=type(message).__name__)
+    kinds = {
+        "start": StartRequest,
+        "step": StepRequest,
+        "fork": ForkRequest,
+        "reset": SessionRequest,
+        "close": SessionRequest,
+    }
+    kind = kinds.get(str(message.get("op")))
+    if kind is None:
+        raise DataError("Unknown request", where="op", expected=", ".join(kinds), got=message.get("op"))
+    try:
+        request = kind.model_validate(dict(message))
+    except (ValidationError, TypeError) as error:
+        found = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
+        raise DataError(
+            "A request is not understood",
+            where=f"{message['op']}: {'.'.join(map(str, found['loc']))}",
+            got=found["msg"],
+        ) from error
+    seeds = getattr(request, "seeds", None) or ()
+    if any(not 0 <= seed <= LARGEST_SEED for seed in seeds):
+        raise DataError("A seed is out of range", expected=f"0 to {LARGEST_SEED}")
+    return request
+
+
+def _state_of(simulation: Simulation) -> dict[str, Any]:
+    return {
+        "num_frames": simulation.num_frames,
+        "states": simulation.states,
+        "commands": simulation.commands,
+        "tool_poses": simulation.tool_poses,
+    }
+
+
+def _pictures_of(simulation: Simulation) -> dict[str, np.ndarray]:
+    return {view: np.stack([clip[view] for clip in simulation.pictures]) for view in simulation.views}
+
+
+def error_message(error: WorldLineError) -> dict[str, Any]:
+    """An error as a client gets it."""
+    said = {name: getattr(error, name) for name in ("what", "where", "expected", "got", "next_step")}
+    return {"kind": type(error).__name__, **{name: str(value) for name, value in said.items() if value is not None}}
