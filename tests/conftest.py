@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import signal
 import socket
@@ -27,6 +28,13 @@ CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", 
 check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: looking through it again and again for garbage took up to a tenth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture
