@@ -13,13 +13,13 @@ _PARAMETERS = (
 _IN_URLS = (
     re.compile(r"(?<=://)[^/\s@:]*:[^/\s@]*(?=@)"),  # scheme://name:password@
     re.compile(r"(?<=http://)[^/\s@]+(?=@)|(?<=https://)[^/\s@]+(?=@)"),  # there a name alone is a token
-    re.compile(rf"(?i)(?<=[?&;])[\w-]*(?:{_PARAMETERS})=[^&\s'\"]+"),  # ?X-Amz-Signature=...
+    re.compile(rf"(?i)(?<=[?&;#])[\w-]*(?:{_PARAMETERS})=[^&\s'\"]+"),  # ?X-Amz-Signature=...
 )
 _CREDENTIALS = (
     *_IN_URLS,
     re.compile(r"(?i)\b(?:x-)?(?:api[-_]?key|authorization)['\"]?\s*[:=]\s*['\"]?(?:\w+\s+)?[^\s'\",}&]+"),
     re.compile(r"(?i)\bbearer\s+[\w.~+/=-]{6,}"),
-    re.compile(r"\b(?:hf_|sk-|ghp_|AKIA|ASIA)[\w-]{12,}"),
+    re.compile(r"\b(?:hf_|sk-|gh[oprsu]_|github_pat_|glpat-|xox[abprs]-|AIza|AKIA|ASIA)[\w-]{12,}"),
 )
 _SECRET_VARIABLE = re.compile(r"(?i)(?:token|key|secret|password)$")
 _SHORTEST_SECRET = 8

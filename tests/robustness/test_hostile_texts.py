@@ -48,6 +48,7 @@ URL_SECRETS = (
     "https://host/x?X-Amz-Credential=a-secret&X-Amz-Signature=b-secret",
     "https://host/v1?api_key=abc-secret",
     "simplecache::sftp://me:pw-secret@host/x",
+    "https://host/x#access_token=abc-secret",
 )
 
 
@@ -157,6 +158,10 @@ def test_credentials_in_urls_are_refused_and_never_repeated(url: str, tmp_path: 
         "x-api-key: abc-secret",
         "Incorrect API key provided: sk-abcdefghijklmnop-secret",
         "token hf_abcdefghijklmnopqrstuvwxyz0123-secret",
+        "cloned with ghs_abcdefghijklmnop_secret",
+        "remote: glpat-abcdefghijkl-secret is no token",
+        "invalid_auth: xoxb-123456789012-secret",
+        "key AIzaSyabcdefghijklm_secret not valid",
         "the token is value-of-the-environment-secret.",
     ],
 )
