@@ -147,7 +147,7 @@ _STEPS = (
     ),
     Step(
         "render_actions",
-        5,
+        6,
         "worldline_core.actions.render_actions",
         "render_actions",
         "actions.actions_config.RenderActionsConfig",
@@ -295,7 +295,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        10,
+        11,
         "worldline_core.report.report",
         "report",
         "report.context.ReportConfig",
