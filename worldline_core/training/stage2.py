@@ -22,10 +22,8 @@ from worldline_core.training.relational import RelationalTerm, TeacherRelations
 from worldline_core.training.stage import Stage
 from worldline_core.training.stage_cost import require_stage_fits
 from worldline_core.training.trainer import ParameterGroup
-from worldline_core.training.training_config import OptimizerConfig, Stage2Config
+from worldline_core.training.training_config import Stage2Config
 from worldline_core.training.video_teacher import load_teacher
-
-FULL_SCALE_OPTIMIZER = OptimizerConfig(learning_rate=1.5e-5, weight_decay=1e-6, clip_norm=0.2)
 
 
 def stage2_groups(model: WorldModel, action_multiplier: float) -> list[ParameterGroup]:

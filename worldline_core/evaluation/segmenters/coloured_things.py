@@ -102,8 +102,3 @@ def _projection(frames: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     along = chroma @ axis
     beside = np.linalg.norm(chroma - along[..., None] * axis, axis=-1)
     return (along - _OTHER_HUE * beside) / strength
-
-
-def thing_masks(frames: np.ndarray, thing: ColouredThing) -> np.ndarray:
-    """Pixels that are more of the thing than of anything else: bool (n, h, w) of one video, uint8 (n, h, w, 3)."""
-    return thing_share(frames, thing.colour, own_colour(frames, thing.colour)) > 0.5
