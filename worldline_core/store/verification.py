@@ -181,8 +181,8 @@ def _verify_input(name: str, folder: Path, mode: VerifyMode) -> None:
 
 
 def weights_digests(places: Mapping[str, Path | None], remembered: Path) -> dict[str, str]:
-    """Digest of the file, or of the files of the folder, of each place that is there. A file of the same size and time of change is not read again:
-    weights have gigabytes. Folders of the Hugging Face hub's cache consist of links; hidden files are its notes.
+    """Digest of each file, or of a folder's files, that is there. What has the same size and time of change is not read
+    again: weights have gigabytes. Folders of the Hugging Face hub's cache consist of links; hidden files are its notes.
 
     Args:
         remembered: JSON file that keeps what was read.
