@@ -107,17 +107,14 @@ def test_the_work_ends_with_a_command_that_is_killed(project_root: Path) -> None
 
 RECORDING = """
 import os, time
-from pathlib import Path
-from types import SimpleNamespace
-from worldline_core.recorder import record
+from worldline_core.recorder.record import run_in_processes
 
 def record_for_a_minute(task):
     os.write(1, f"{os.getpid()}\\n".encode())
     time.sleep(60)
 
-record._record_job = record_for_a_minute
 if __name__ == "__main__":
-    list(record._run_jobs([0, 1], SimpleNamespace(workers=2), Path()))
+    list(run_in_processes(record_for_a_minute, [0, 1], workers=2))
 """
 
 
