@@ -1,4 +1,4 @@
-"""The verbs that hand recordings and predictions to others: card, export, push, pull."""
+"""The verbs that hand recordings, predictions and figures to others: card, compare, export, push, pull."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet or a RolloutSet")
     export.add_argument(
         "--format", action="append", required=True, dest="formats",
-        choices=("lerobot", "mcap", "mcap-protobuf", "mcap-ros2", "rrd", "mp4"),
-        help="repeatable; lerobot: EpisodeSets only, mp4: RolloutSets only; mcap: JSON in Foxglove's schemas",
+        choices=("lerobot", "mcap", "mcap-protobuf", "mcap-ros2", "rrd", "mp4", "worldarena"),
+        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: JSON in Foxglove's schemas",
     )  # fmt: skip
     export.add_argument("--output", type=Path, required=True, help="where the files go")
     export.add_argument(
@@ -31,6 +31,17 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
         "--episodes", type=Path, metavar="FOLDER", dest="episode_set", help="the EpisodeSet of predictions"
     )
     export.set_defaults(run=_export)
+    compare = commands.add_parser(
+        "compare", help="compare two runs on the same recordings: paired differences with intervals",
+        description="A run is the folder of an evaluation or a report, or HISTORY:NIGHT (artifacts/nightly:2026-11-21).",
+    )  # fmt: skip
+    compare.add_argument("first", metavar="RUN_A")
+    compare.add_argument("second", metavar="RUN_B")
+    compare.add_argument("--methods", nargs=2, metavar=("A", "B"), help="this method of the first, that of the second")
+    compare.add_argument("--metric", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
+    compare.add_argument("--json", action="store_true", help="print JSON")
+    compare.add_argument("--scores", type=Path, metavar="FILE.parquet", help="write both runs' values, a row each")
+    compare.set_defaults(run=_compare)
     places = "hf://datasets/ORG/NAME (token: HF_TOKEN), a URL such as s3://bucket/folder, or a folder"
     push = commands.add_parser(
         "push", help="publish an EpisodeSet with its dataset card; continues after an interruption"
@@ -65,6 +76,21 @@ def _card(arguments: argparse.Namespace) -> None:
         arguments.artifact, arguments.output or arguments.artifact / "run" / "card", arguments.title
     ):
         print(f"wrote {path}")
+
+
+def _compare(arguments: argparse.Namespace) -> None:
+    from worldline_core.report.run_comparison import as_json, as_table, compare_runs, write_tidy
+
+    methods = None if arguments.methods is None else (arguments.methods[0], arguments.methods[1])
+    rows = compare_runs(arguments.first, arguments.second, methods, arguments.metric)
+    if arguments.scores is not None:
+        write_tidy(arguments.scores, (arguments.first, arguments.second))
+    if arguments.json:
+        import json
+
+        print(json.dumps(as_json(rows), indent=1))
+    else:
+        print(as_table(rows))
 
 
 def _export(arguments: argparse.Namespace) -> None:

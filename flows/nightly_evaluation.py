@@ -15,9 +15,10 @@ from worldline_core.report.nightly import NightlyComparison, compare_with_histor
 
 
 @task(name="compare_nights", persist_result=False)
-def compare_nights(scores: dict[str, Path], history: Path, night: str | None) -> NightlyComparison:
+def compare_nights(done: dict[str, Path], history: Path, night: str | None) -> NightlyComparison:
     """Append this night's scores to the history and write the comparison."""
-    return compare_with_history(scores, history, night)
+    scores = {name: path for name, path in done.items() if name.startswith("evaluate_")}
+    return compare_with_history(scores, history, night, done)
 
 
 @flow(name="nightly-evaluation")
@@ -34,9 +35,8 @@ def nightly_evaluation(
     """
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
     done = run_nodes(without_training(plan(settings, Path.cwd())), artifacts.resolve(), settings.runner)
-    scores = {name: reference.path for name, reference in done.items() if name.startswith("evaluate_")}
     history = artifacts.resolve() / "nightly"
-    compared = compare_nights(scores, history, night)
-    show_in_prefect(history, done)
+    compared = compare_nights({name: Path(str(reference.path)) for name, reference in done.items()}, history, night)
+    show_in_prefect(history, done, [history / file for file in compared.pictures.values()])
     refuse_regressions(compared, history)
     return history

@@ -7,7 +7,7 @@ from pathlib import Path
 from prefect import flow
 
 from tasks.artifact_task import ArtifactReference
-from tasks.prefect_artifacts import show_in_prefect
+from tasks.prefect_artifacts import report_pictures, show_in_prefect
 from tasks.run_nodes import run_nodes
 from tasks.run_page import RunPage
 from worldline_core.config import load_config
@@ -32,5 +32,5 @@ def pipeline(
     nodes = plan(settings, Path.cwd())
     with RunPage(artifacts.resolve(), [node.name for node in nodes], settings.runner.nodes_at_once) as page:
         done = run_nodes(nodes, artifacts.resolve(), settings.runner, page)
-    show_in_prefect(page.folder, done)
+    show_in_prefect(page.folder, done, report_pictures(Path(str(done["report"].path))))
     return done["report"]

@@ -83,17 +83,11 @@ def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
         return run_step(store, step_name, config, inputs | given, mapper)
 
     from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.plan import plan, run_node
+    from worldline_core.pipeline.plan import choose_node, plan, run_node
 
     whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=overrides)
     nodes = plan(whole, Path.cwd())
-    candidates = [node.name for node in nodes if node.step == step_name]
-    name = arguments.node or (step_name if step_name in candidates or not candidates else "")
-    if not name:
-        raise ConfigError(f"{step_name} occurs more than once in this run", expected=f"--node with one of {candidates}")
-    if name not in candidates:
-        raise ConfigError(f"This run has no such node of {step_name}", expected=f"one of {candidates}", got=name)
-    return run_node(name, nodes, store, mapper, given)
+    return run_node(choose_node(step_name, arguments.node, nodes), nodes, store, mapper, given)
 
 
 def _parse_input(text: str) -> tuple[str, Path]:

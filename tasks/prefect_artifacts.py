@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import httpx
 from prefect import Flow
-from prefect.artifacts import create_link_artifact, create_table_artifact
+from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from tasks.artifact_task import ArtifactReference
 from worldline_core.errors import UnavailableError
@@ -47,12 +47,22 @@ def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
         return done[0]
 
 
-def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference]) -> None:
-    """Add the artifacts `report` and `metrics` to the flow run that calls this.
+def report_pictures(report: Path) -> list[Path]:
+    """Pictures of a report to show: what was recorded, and what was predicted of the first episode."""
+    return [
+        path
+        for name in ("contact_sheet", "episode0_shipped_head")
+        if (path := report / "media" / f"{name}.jpg").is_file()
+    ]
+
+
+def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures: Sequence[Path] = ()) -> None:
+    """Add the artifacts `report`, `metrics` and `pictures` (a link, a table, images) to the flow run that calls this.
 
     Args:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
+        pictures: files to show; Prefect's page shows them in a browser that may read files of this machine.
     """
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     rows = [
@@ -65,5 +75,8 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference]) -> None:
             create_table_artifact(
                 rows, key="metrics", description="Means with 95 % intervals: what/where/method/metric"
             )
+        for number, picture in enumerate(pictures):
+            key = "picture" if number == 0 else f"picture-{number}"
+            create_image_artifact(picture.as_uri(), key=key, description=f"{picture.stem}: {page / 'index.html'}")
     except httpx.TransportError as error:
         logger.warning("Prefect's pages show nothing of this run: its server does not answer (%s)", error)

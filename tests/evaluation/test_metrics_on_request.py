@@ -11,12 +11,15 @@ import pytest
 import torch
 from scipy.linalg import sqrtm
 
+from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, metric_of
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.evaluation.video.fvd import distances, frechet_distance
 from worldline_core.evaluation.video.scene_consistency import SceneFrames, scene_consistency
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import plan, without_training
 from worldline_core.report.context import ReportConfig, ReportContext
 from worldline_core.report.quality import quality_section
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -89,9 +92,10 @@ def test_without_a_request_nothing_changes(recordings, tmp_path, measured):
 
 
 def test_metrics_whose_weights_are_not_there_are_named(recordings, tmp_path):
-    evaluate_video(ALWAYS.model_copy(update={"metrics": ("fvd",)}), recordings.inputs, tmp_path)
+    evaluate_video(ALWAYS.model_copy(update={"metrics": ("fvd", "action_following")}), recordings.inputs, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert "FVD is not available" in summary["unavailable"]["fvd"]
+    assert "no predictions under changed controls" in summary["unavailable"]["action_following"]
     assert not any(name.startswith("fvd") for name in summary["metrics"]["test"]["good"])
 
 
@@ -99,12 +103,25 @@ def test_what_is_asked_for_must_exist(recordings, tmp_path):
     with pytest.raises(ValueError, match="No metrics on request"):
         VideoEvaluationConfig(metrics=("hsdd",))
     with pytest.raises(ValueError, match="changed_controls go with a metric"):
-        VideoEvaluationConfig(metrics=("action_following",))
+        VideoEvaluationConfig(changed_controls={"good": {"mirrored": "other"}})
     config = VideoEvaluationConfig(
         segmenters=("colour",), metrics=("action_following",), changed_controls={"good": {"mirrored": "unheard"}}
     )
     with pytest.raises(ConfigError, match=r"were not predicted[\s\S]*unheard"):
         evaluate_video(config, recordings.inputs, tmp_path)
+
+
+def test_a_plan_asks_only_for_pairs_that_it_predicts(project_root: Path):
+    config = load_config(PipelineConfig, preset="tiny")
+    nodes = plan(config, project_root)
+    whole, nightly = (
+        next(node.config for node in chosen if node.name == "evaluate_video")
+        for chosen in (nodes, without_training(nodes))
+    )
+    assert whole == nightly == config.evaluate_video
+    fewer = {name: run for name, run in config.rollouts.items() if name != "shipped_stage2_shuffled"}
+    nodes = plan(config.model_copy(update={"rollouts": fewer}), project_root)
+    assert next(node.config for node in nodes if node.name == "evaluate_video").changed_controls == {}
 
 
 def test_controls_that_were_ignored_are_told_from_those_that_were_followed(recordings, tmp_path):

@@ -13,8 +13,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from worldline_core.evaluation.paired import read_series, write_series
+from worldline_core.report.nightly import scores_file
 
 PREFECT = [sys.executable, "-m", "prefect"]
 
@@ -74,23 +78,110 @@ def _stop(worker: subprocess.Popen[bytes]) -> None:
         worker.wait()
 
 
-@pytest.mark.slow
-def test_deployed_pipeline_runs_on_a_worker(environment: dict[str, str], project_root: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def worker_log(
+    environment: dict[str, str], project_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Path]:
+    """What a worker says that serves all deployments."""
     _prefect(environment, project_root, "work-pool", "create", "worldline", "--type", "process")
     _prefect(environment, project_root, "--no-prompt", "deploy", "--all")
+    log = tmp_path_factory.mktemp("worker") / "worker.log"
     worker = subprocess.Popen(
         [*PREFECT, "worker", "start", "--pool", "worldline"],
-        env=environment, cwd=project_root, stdout=(tmp_path / "worker.log").open("w"), stderr=subprocess.STDOUT,
-        start_new_session=True,
+        env=environment, cwd=project_root, stdout=log.open("w"), stderr=subprocess.STDOUT, start_new_session=True,
     )  # fmt: skip
-    parameters = json.dumps({"preset": "smoke", "artifacts": str(tmp_path / "artifacts")})
     try:
-        _prefect(
-            environment, project_root, "deployment", "run", "pipeline/pipeline",
-            "--params", parameters, "--watch", "--watch-timeout", "420", timeout=450,
-        )  # fmt: skip
+        yield log
     finally:
         _stop(worker)
+
+
+def _run(
+    environment: dict[str, str], cwd: Path, deployment: str, parameters: dict[str, Any], wait_s: int = 420
+) -> subprocess.CompletedProcess[str]:
+    """A deployed run, watched to its end."""
+    return subprocess.run(
+        [*PREFECT, "deployment", "run", deployment, "--params", json.dumps(parameters), "--watch", "--watch-timeout", f"{wait_s}"],
+        env=environment, cwd=cwd, capture_output=True, text=True, timeout=wait_s + 30, check=False,
+    )  # fmt: skip
+
+
+def _ask(environment: dict[str, str], path: str, body: dict[str, Any]) -> Any:
+    request = urllib.request.Request(
+        f"{environment['PREFECT_API_URL']}/{path}", json.dumps(body).encode(), {"Content-Type": "application/json"}
+    )
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        return json.load(answer)
+
+
+@pytest.mark.slow
+def test_nightly_guards_on_a_real_server_and_worker(
+    environment: dict[str, str], worker_log: Path, project_root: Path, tmp_path: Path
+) -> None:
+    config, artifacts = tmp_path / "nightly.yaml", tmp_path / "artifacts"
+    source = {"kind": "episode_set", "path": "artifacts/shipped/recordings", "name": "shipped", "license": "Apache-2.0",
+              "redistribution": "yes", "include": ["*-test-s1-0000[0-1]"]}  # fmt: skip
+    config.write_text(json.dumps({"extends": "smoke", "curate": {"sources": [source]}, "evaluate_policy": None}))
+    given = {"preset": None, "config": str(config), "artifacts": str(artifacts)}
+    first = _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "first"})
+    assert first.returncode == 0, first.stdout + first.stderr + worker_log.read_text()
+
+    # The good night was three points of IoU better than what is measured now.
+    history = artifacts / "nightly"
+    scores = read_series(scores_file(history, "first"))
+    better = {n: {r: v + 0.03 * ("robot_iou@head" in n) for r, v in values.items()} for n, values in scores.items()}
+    write_series(scores_file(history, "first"), better)
+    metric = "video/test/copy_first_frame/robot_iou@head"
+    assert len(scores[metric]) >= 8
+    second = _run(environment, project_root, "nightly-evaluation/nightly-evaluation", {**given, "night": "second"})
+    assert second.returncode == 1, second.stdout + second.stderr
+    runs = _ask(
+        environment,
+        "flow_runs/filter",
+        {"flows": {"name": {"any_": ["nightly-evaluation"]}}, "sort": "START_TIME_DESC"},
+    )
+    assert [run["state"]["type"] for run in runs] == ["FAILED", "COMPLETED"]
+    message = runs[0]["state"]["message"]
+    for part in (metric, "-0.030", "14 recordings, most on", "pictures/", "worldline nightly --accept second"):
+        assert part in message, message
+    for run in runs:
+        filters = {"artifacts": {"flow_run_id": {"any_": [run["id"]]}}}
+        kinds = {found["key"]: found["type"] for found in _ask(environment, "artifacts/filter", filters)}
+        assert (kinds["report"], kinds["metrics"], kinds["picture"]) == ("markdown", "table", "image")
+    assert metric in (history / "index.html").read_text()
+
+    command = [
+        sys.executable,
+        "-m",
+        "flows.command_line",
+        "nightly",
+        "--config",
+        str(config),
+        "--artifacts",
+        str(artifacts),
+    ]
+    third = subprocess.run(
+        [*command, "--night", "third"], env=environment, cwd=project_root, capture_output=True, text=True, check=False, timeout=200
+    )  # fmt: skip
+    assert third.returncode == 1
+    assert metric in third.stderr
+
+    step = _run(environment, project_root, "step/evaluate_video", {**given, "inputs": None, "overrides": []})
+    assert step.returncode != 0  # of a nightly evaluation only what needs no training is finished
+    filtered = _run(environment, project_root, "step/filter", given)
+    assert filtered.returncode == 0, filtered.stdout + filtered.stderr
+    _prefect(environment, project_root, "automation", "create", "--from-file", "examples/nightly_automation.yaml")
+    assert "A night became worse" in _prefect(environment, project_root, "automation", "ls")
+
+
+@pytest.mark.slow
+def test_deployed_pipeline_runs_on_a_worker(
+    environment: dict[str, str], worker_log: Path, project_root: Path, tmp_path: Path
+) -> None:
+    found = _run(
+        environment, project_root, "pipeline/pipeline", {"preset": "smoke", "artifacts": str(tmp_path / "artifacts")}
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
     reports = sorted(path.parent.name for path in (tmp_path / "artifacts" / "report").glob("*/index.html"))
-    assert len(reports) == 2, (tmp_path / "worker.log").read_text()
+    assert len(reports) == 2, worker_log.read_text()
     assert reports[1] == "latest"  # and before it, in hexadecimal, the report that it leads to

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 from prefect import Flow
 
-from worldline_core.config import preset_names, read_yaml
+from worldline_core.config import load_config, preset_names, read_yaml
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import plan
 
 TOP_KEYS = {"name", "prefect-version", "definitions", "deployments"}
 DEPLOYMENT_KEYS = {"name", "description", "entrypoint", "parameters", "schedules", "work_pool", "tags"}
@@ -25,12 +27,16 @@ def deployments(project_root: Path) -> list[dict[str, Any]]:
 
 
 def test_names(deployments: list[dict[str, Any]]) -> None:
-    assert [deployment["name"] for deployment in deployments] == ["pipeline", "nightly-evaluation"]
+    """The two flows, and every step of a run of the preset that they run."""
+    names = [deployment["name"] for deployment in deployments]
+    nodes = plan(load_config(PipelineConfig, preset="tiny"), Path.cwd())
+    assert names == ["pipeline", "nightly-evaluation", *dict.fromkeys(node.step for node in nodes)]
 
 
-@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize("index", range(14))
 def test_keys_entrypoint_and_parameters(deployments: list[dict[str, Any]], index: int) -> None:
     deployment = deployments[index]
+    assert len(deployments) == 14
     assert set(deployment) <= DEPLOYMENT_KEYS
     assert set(deployment["work_pool"]) <= WORK_POOL_KEYS
     for schedule in deployment.get("schedules", []):

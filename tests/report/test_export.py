@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
+
+import numpy as np
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.exports.export import export
 from worldline_core.exports.rollout import export_rollout
 from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -17,3 +23,25 @@ def test_a_prediction_is_exported_in_every_format(run_artifacts: dict[str, Path]
     written = export_rollout(rollouts, episodes, tracks, "aloha_viperx-1", tmp_path)
     assert sorted(path.suffix for path in written) == [".jpg"] * 3 + [".mcap"] + [".mp4"] * 3 + [".rrd"]
     assert all(path.stat().st_size > 500 for path in written)
+
+
+def test_predictions_are_exported_in_the_layout_of_worldarena(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
+    rollouts = RolloutSet.open(run_artifacts["rollout.shipped_causal"])
+    written = export(
+        run_artifacts["rollout.shipped_causal"], tmp_path, ["worldarena"], episodes=run_artifacts["curate"]
+    )
+    ids = json.loads((tmp_path / "episodes.json").read_text())
+    assert sorted(ids.values()) == sorted(rollouts.episode_ids)
+    assert sorted(path.name for path in (tmp_path / f"{rollouts.method}_sort").iterdir()) == sorted(
+        f"{n}.mp4" for n in ids
+    )
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert len(summary) == len(ids)
+    for entry, (stem, name) in zip(summary, ids.items(), strict=True):
+        assert re.fullmatch(r"lift_episode_\d+", stem)
+        predicted = decode_video(tmp_path / f"{rollouts.method}_sort" / f"{stem}.mp4")
+        np.testing.assert_array_equal(predicted, rollouts.frames(name, "head"))
+        assert len(decode_video(Path(entry["gt_path"]))) == len(predicted)
+        assert Path(entry["image"]).read_bytes().startswith(b"\x89PNG")
+        assert list(entry) == ["gt_path", "image", "prompt"]
+    assert set(written) == {path for path in tmp_path.rglob("*") if path.is_file() and not path.name.startswith(".")}

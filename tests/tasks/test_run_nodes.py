@@ -129,7 +129,8 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
 
     @flow
     def shown() -> None:
-        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores})
+        pictures = [tmp_path / "worst.jpg", tmp_path / "second.jpg"]
+        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, pictures)
 
     shown()
     with get_client(sync_client=True) as client:
@@ -137,6 +138,8 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
     assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
     row = {"metric": "planning/N=32/causal/success", "mean": 0.75, "95 % from": 0.5, "to": 1.0, "trajectories": 9}
     assert json.loads(str(found["metrics"])) == [row]
+    assert (tmp_path / "worst.jpg").as_uri() in str(found["picture"])
+    assert (tmp_path / "second.jpg").as_uri() in str(found["picture-1"])
 
 
 def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:

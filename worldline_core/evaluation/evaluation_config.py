@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Literal, Self
 
@@ -118,10 +118,19 @@ class VideoEvaluationConfig(StrictModel):
             raise ValueError(str(error)) from error
         return metrics
 
+    def of_methods(self, methods: Collection[str]) -> Self:
+        """The same for fewer methods: pairs of which one is not predicted are not compared."""
+        pairs = {
+            method: kept
+            for method, changes in self.changed_controls.items()
+            if method in methods and (kept := {c: other for c, other in changes.items() if other in methods})
+        }
+        return self.model_copy(update={"changed_controls": pairs})
+
     @model_validator(mode="after")
     def _pairs_are_compared(self) -> Self:
         compared = any(METRICS[name].needs == "changed_controls" for name in self.metrics)
-        if compared != bool(self.changed_controls):
+        if self.changed_controls and not compared:
             raise ValueError(
                 "changed_controls go with a metric that compares them: action_following, counterfactual_direction"
             )

@@ -23,6 +23,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLi
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
 from worldline_core.exports.rollout import MCAP_FORMATS, export_rollout, mcap_file, shown_tracks
+from worldline_core.exports.worldarena import export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import write_json_atomic
@@ -30,6 +31,7 @@ from worldline_core.store.store import alone_in
 
 logger = logging.getLogger(__name__)
 
+WORLDARENA = "worldarena"
 EPISODE_FORMATS = ("lerobot", *MCAP_FORMATS, "rrd")
 # Stream copies keep the stored videos as they are; this is for what has to be encoded again (a cut not at a key frame).
 _CRF, _PRESET = 10, "veryfast"
@@ -48,7 +50,8 @@ def export(
     Args:
         formats: of an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
             artifact refers to another one's), `mcap`, `mcap-protobuf`, `mcap-ros2` and
-            `rrd` (one file per episode); of a RolloutSet all but `lerobot`, and `mp4`.
+            `rrd` (one file per episode); of a RolloutSet all but `lerobot`, and `mp4` and
+            `worldarena` (`exports/worldarena.py`).
         episode_ids: which episodes; none: all.
         episodes: the EpisodeSet that predictions belong to; default: the one that their manifest names.
 
@@ -58,7 +61,7 @@ def export(
         another kind of artifact, or while another command exports into the folder.
     """
     kind = kind_of(artifact)
-    offered = {"EpisodeSet": EPISODE_FORMATS, "RolloutSet": ROLLOUT_FORMATS}.get(kind)
+    offered = {"EpisodeSet": EPISODE_FORMATS, "RolloutSet": (*ROLLOUT_FORMATS, WORLDARENA)}.get(kind)
     if offered is None:
         raise ArtifactError("This kind is not exported", where=artifact, expected="EpisodeSet or RolloutSet", got=kind)
     unknown = [wanted for wanted in formats if wanted not in offered]
@@ -165,6 +168,9 @@ def _export_rollouts(
     if missing:
         raise DataError("No prediction of this episode", where=artifact, got=", ".join(missing))
     written: list[Path] = []
-    for name in episode_ids or rollouts.episode_ids:
-        written += export_rollout(rollouts, recorded, tracks, name, output, formats)
+    if WORLDARENA in formats:
+        written += export_worldarena(rollouts, recorded, episode_ids or rollouts.episode_ids, output)
+    others = [wanted for wanted in formats if wanted != WORLDARENA]
+    for name in (episode_ids or rollouts.episode_ids) if others else ():
+        written += export_rollout(rollouts, recorded, tracks, name, output, others)
     return written

@@ -12,6 +12,7 @@ from typing import cast
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun, source_inputs
 from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.scale.mapping import ShardMapper
@@ -123,7 +124,8 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
     if recordings:
         shared: dict[str, str | Path] = {"episodes": "filter", "tracks": "render_actions", **segmenter}
         if config.evaluate_video is not None:
-            yield Node("evaluate_video", "evaluate_video", config.evaluate_video, {**shared, **recordings})
+            video = config.evaluate_video.of_methods([name.removeprefix("rollouts.") for name in recordings])
+            yield Node("evaluate_video", "evaluate_video", video, {**shared, **recordings})
             scores["evaluate_video"] = "evaluate_video"
         if config.evaluate_policy is not None:
             yield Node("evaluate_policy", "evaluate_policy", config.evaluate_policy, {**shared, **recordings})
@@ -163,14 +165,24 @@ def find_artifacts(nodes: list[Node], store: ArtifactStore) -> dict[str, Artifac
     return found
 
 
-def run_node(
-    name: str,
-    nodes: list[Node],
-    store: ArtifactStore,
-    mapper: ShardMapper | None = None,
-    given: Mapping[str, Path] | None = None,
-) -> Artifact:
-    """Run one node on the finished artifacts of those before it.
+def choose_node(step: str, name: str | None, nodes: list[Node]) -> str:
+    """The node of a step: the named one, or the only one.
+
+    Raises: ConfigError when there is no such node, or several and none is named.
+    """
+    candidates = [node.name for node in nodes if node.step == step]
+    chosen = name or (step if step in candidates or not candidates else "")
+    if not chosen:
+        raise ConfigError(f"{step} occurs more than once in this run", expected=f"--node with one of {candidates}")
+    if chosen not in candidates:
+        raise ConfigError(f"This run has no such node of {step}", expected=f"one of {candidates}", got=chosen)
+    return chosen
+
+
+def ready_node(
+    name: str, nodes: list[Node], store: ArtifactStore, given: Mapping[str, Path] | None = None
+) -> tuple[Node, dict[str, Path]]:
+    """A node, and the folders of its inputs: the finished artifacts of the nodes before it.
 
     Args:
         given: folders by input name, taken instead of the artifacts that the run would use.
@@ -193,6 +205,18 @@ def run_node(
             got=f"missing: {', '.join(missing)}",
             next_step=f"run `{_command(by_name[missing[0]])}` with the same preset first, or `worldline pipeline`",
         )
+    return node, inputs
+
+
+def run_node(
+    name: str,
+    nodes: list[Node],
+    store: ArtifactStore,
+    mapper: ShardMapper | None = None,
+    given: Mapping[str, Path] | None = None,
+) -> Artifact:
+    """Run one node on the finished artifacts of those before it; arguments and errors as of :func:`ready_node`."""
+    node, inputs = ready_node(name, nodes, store, given)
     return run_step(store, node.step, node.config, inputs, mapper)
 
 
@@ -226,5 +250,8 @@ def without_training(nodes: list[Node]) -> list[Node]:
         if node.name in dropped or without_videos or without_input:
             dropped.add(node.name)
             continue
-        kept.append(Node(node.name, node.step, node.config, needed))
+        settings = node.config
+        if isinstance(settings, VideoEvaluationConfig):
+            settings = settings.of_methods({name.removeprefix("rollouts.") for name in needed})
+        kept.append(Node(node.name, node.step, settings, needed))
     return kept

@@ -1,9 +1,10 @@
-"""Comparison with earlier nights: a history of summaries, and a flag on what became worse than chance explains.
+"""Comparison with earlier nights: a history of scores, and a flag on what became worse than chance explains.
 
 The history is one JSON object a line, oldest first: `{"night": "2026-11-21", "good": true, "metrics": {name: {mean, low,
-high, count}}}`. Metrics are named `<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`,
-`planning/N=32/true/success`. A night is compared with the last good one before it. A night with regressions is not good:
-the next one is held against the same reference, until the loss is repaired or accepted.
+high, count}}}`; the scores of each recording lie in `scores/`, a Parquet file a night. Metrics are named
+`<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`, `planning/N=32/true/success`. How a night is held
+against earlier ones says `night_changes`. A night with regressions is not good: the next one is held against the same
+reference, until the loss is repaired or accepted.
 """
 
 from __future__ import annotations
@@ -14,26 +15,29 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from markupsafe import Markup
 
 from worldline_core.errors import ArtifactError, RegressionError
-from worldline_core.evaluation.scores import Interval
+from worldline_core.evaluation.paired import EVALUATIONS, read_scores, read_series, write_series
+from worldline_core.evaluation.paired import Series as ScoreSeries
+from worldline_core.evaluation.scores import SCORES_FILE, Interval
 from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, interval, render, words
 from worldline_core.report.context import ReportConfig, ReportContext, Section
 from worldline_core.report.decisions import planning_section, policy_section
+from worldline_core.report.night_changes import DRIFT_NIGHTS, QUESTIONS, Change, NightlyComparison, compare_series
+from worldline_core.report.night_pictures import write_night_pictures
 from worldline_core.report.quality import quality_section
-from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
+from worldline_core.store.artifact_files import JsonObject, digest_value, read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import exclusive_lock
 
 HISTORY_FILE = "history.jsonl"
-EVALUATIONS = ("evaluate_video", "evaluate_policy", "evaluate_planning")
-LOWER_IS_BETTER = ("lpips", "error", "seconds", "malformed")
 TITLE = "Nights"
 MOST_CHARTS, MOST_LINES, MOST_TICKS = 8, 8, 8
+MOST_NIGHTS, MOST_COLUMNS = 30, 6
 HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
 
 
@@ -47,58 +51,31 @@ class Night:
     good: bool = True
 
 
-@dataclass(frozen=True)
-class Change:
-    """One metric beside the last good night; None where one of the two did not measure it."""
-
-    metric: str
-    present: Interval | None
-    previous: Interval | None
-
-    @property
-    def verdict(self) -> Literal["better", "worse", "same", "new", "missing"]:
-        """Better or worse only where the mean left the interval of the good night."""
-        if self.previous is None:
-            return "new"
-        if self.present is None:
-            return "missing"
-        if self.previous.low <= self.present.mean <= self.previous.high:
-            return "same"
-        fell = self.present.mean < self.previous.low
-        return "better" if fell == any(word in self.metric for word in LOWER_IS_BETTER) else "worse"
-
-
-@dataclass(frozen=True)
-class NightlyComparison:
-    """The present night against the last good one before it."""
-
-    night: str
-    previous: str | None
-    changes: Sequence[Change]
-
-    @property
-    def regressions(self) -> list[str]:
-        """Metrics that became worse beyond the interval, or are not measured any more."""
-        return [change.metric for change in self.changes if change.verdict in ("worse", "missing")]
-
-
-def compare_with_history(scores: Mapping[str, Path], history: Path, night: str | None = None) -> NightlyComparison:
-    """Record a night, and write `comparison.json` and pages with trends into the history's folder.
+def compare_with_history(
+    scores: Mapping[str, Path],
+    history: Path,
+    night: str | None = None,
+    artifacts: Mapping[str, Path] | None = None,
+) -> NightlyComparison:
+    """Record a night, and write `comparison.json`, pictures and pages with trends into the history's folder.
 
     Args:
         scores: finished Scores by step name.
         history: folder of the history.
         night: as `record_night` has it.
+        artifacts: the episodes (``filter``) and predictions (``rollout.<method>``) of this night, for pictures of the
+            recordings that lost most; a few of the first recordings when none did.
 
     Raises:
         ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
     """
     compared = record_night(history, night, scores)
+    compared = replace(compared, pictures=write_night_pictures(history, compared, artifacts or {}))
     changes = [asdict(change) | {"verdict": change.verdict} for change in compared.changes]
     content = asdict(compared) | {"changes": changes, "regressions": compared.regressions}
     write_json_atomic(history / "comparison.json", content)
     context = ReportContext(ReportConfig(), {**scores, "history": history}, history)
-    nights = nights_section(context)
+    nights = nights_section(context, compared)
     sections = [make(context) for make in (quality_section, policy_section, planning_section)]
     text = f"Night {compared.night}: {len(compared.regressions)} of {len(compared.changes)} metrics became worse."
     first = replace(nights, title="WorldLine nightly evaluation", lead=f"{text} {nights.lead}")
@@ -113,7 +90,8 @@ def refuse_regressions(compared: NightlyComparison, history: Path) -> None:
         raise RegressionError(
             f"{len(compared.regressions)} of {len(compared.changes)} metrics became worse than in {compared.previous}",
             where=history / "index.html",
-            got=", ".join(compared.regressions),
+            got="; ".join(str(change) for change in compared.worse)
+            + (f"; pictures: {', '.join(compared.pictures.values())}" if compared.pictures else ""),
             next_step=f"find the cause; if this is the new normal: worldline nightly --accept {compared.night}",
         )
 
@@ -139,16 +117,35 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
             got=", ".join(sorted(inputs)) or "none",
         )
     with exclusive_lock(history / ".lock"):
-        return _recorded(history, night, metrics)
+        return _recorded(history, night, metrics, _series(inputs))
 
 
-def _recorded(history: Path, night: str | None, metrics: Mapping[str, Interval]) -> NightlyComparison:
+def _series(inputs: Mapping[str, Path]) -> ScoreSeries:
+    """Scores by recording of all evaluations of a night; those of a variant (`evaluate_video.long`) under its name."""
+    found: ScoreSeries = {}
+    for name, folder in sorted(inputs.items()):
+        step, _, variant = name.partition(".")
+        if step in EVALUATIONS and (folder / SCORES_FILE).is_file():
+            for series, values in read_scores(folder).items():
+                what, _, rest = series.partition("/")
+                found[f"{what}.{variant}/{rest}" if variant else series] = values
+    return found
+
+
+def scores_file(history: Path, night: str) -> Path:
+    """Where the scores by recording of a night lie."""
+    return history / "scores" / f"{digest_value(night)[:16]}.parquet"
+
+
+def _recorded(
+    history: Path, night: str | None, metrics: Mapping[str, Interval], series: ScoreSeries
+) -> NightlyComparison:
     """`record_night` of these metrics, by one process at a time."""
     nights = read_history(history)
     known = {found.night: index for index, found in enumerate(nights)}
     name = night or time.strftime("%Y-%m-%d", time.gmtime())
     if name in known and nights[known[name]].metrics == metrics:
-        return compare_nights(nights[: known[name] + 1])
+        return compare_nights(nights[: known[name] + 1], history)
     if name in known and night is not None:
         raise ArtifactError(
             "This night is recorded with other scores", where=history / HISTORY_FILE, got=name,
@@ -156,7 +153,8 @@ def _recorded(history: Path, night: str | None, metrics: Mapping[str, Interval])
         )  # fmt: skip
     if name in known:
         name = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime())
-    compared = compare_nights([*nights, Night(name, metrics)])
+    write_series(scores_file(history, name), series)
+    compared = compare_nights([*nights, Night(name, metrics)], history)
     _write_history(history, [*nights, Night(name, metrics, good=not compared.regressions)])
     return compared
 
@@ -234,31 +232,51 @@ def intervals(step: str, summary: JsonObject) -> Iterator[tuple[str, str, str, A
             yield from ((f"N={n}", method, "success", v.get("success")) for n, v in values.get("budgets", {}).items())
 
 
-def compare_nights(nights: Sequence[Night]) -> NightlyComparison:
-    """The last of several nights against the last good one before it."""
+def compare_nights(nights: Sequence[Night], history: Path) -> NightlyComparison:
+    """The last of several nights against the good ones before it, whose scores by recording lie in the history's folder."""
     present = nights[-1]
-    previous = next((night for night in reversed(nights[:-1]) if night.good), None)
-    before = previous.metrics if previous else {}
+    good = [night for night in nights[:-1] if night.good]
+    before = good[-1].metrics if good else {}
     names = sorted({*present.metrics, *before})
-    changes = [Change(name, present.metrics.get(name), before.get(name)) for name in names]
-    return NightlyComparison(present.night, previous.night if previous else None, changes)
+    earlier = [read_series(scores_file(history, night.night)) for night in good[-DRIFT_NIGHTS:]]
+    tested = compare_series(read_series(scores_file(history, present.night)), earlier) if earlier else {}
+    changes = [Change(name, present.metrics.get(name), before.get(name), tested.get(name)) for name in names]
+    return NightlyComparison(present.night, good[-1].night if good else None, changes)
 
 
-def nights_section(context: ReportContext) -> Section:
-    """The present night against the one before, and charts over all nights."""
+def nights_section(context: ReportContext, compared: NightlyComparison | None = None) -> Section:
+    """The present night against the good ones before, pictures, and charts over all nights."""
     nights = read_history(context.inputs["history"])
     if not nights:
         return Section("nights", TITLE, missing="the history holds no night yet.")
-    compared = compare_nights(nights)
+    compared = compared or compare_nights(nights, context.inputs["history"])
     if compared.previous is None:
         lead = f"The first night, {compared.night}: there is nothing to compare it with yet."
     else:
         lead = (
-            f"Night {compared.night} beside {compared.previous}, the last good one. A metric is flagged when its mean left"
-            " the interval of that night, or when it is not measured any more."
+            f"Night {compared.night} beside {compared.previous}, the last good one, on the same recordings. Flagged is what"
+            " chance does not explain (two false alarms in a hundred nights, over all metrics), beside that night or over"
+            f" the last {DRIFT_NIGHTS} good ones, and what is not measured any more."
         )
     tables = [change_table(compared, name) for name in ("worse", "missing", "better")]
-    return context.section("nights", TITLE, lead, compared=compared, tables=tables, charts=trend_charts(nights))
+    shown = [{"file": file, "what": what} for what, file in compared.pictures.items()]
+    return context.section(
+        "nights", TITLE, lead, compared=compared, tables=tables, charts=trend_charts(nights), pictures=shown,
+        history=history_table(nights),
+    )  # fmt: skip
+
+
+def history_table(nights: Sequence[Night]) -> Table:
+    """Every night, the latest first: whether later ones are held against it, and its headline metrics."""
+    headlines = [n for n in nights[-1].metrics if n.split("/")[-1].startswith(HEADLINES)][:MOST_COLUMNS]
+    rows = [
+        [night.night, "good" if night.good else "red"]
+        + [interval(asdict(night.metrics[name]), 3) if name in night.metrics else None for name in headlines]
+        for night in list(nights)[::-1][:MOST_NIGHTS]
+    ]
+    return Table(
+        ("Night", "State", *headlines), rows, range(2, 2 + len(headlines)), f"The last {len(rows)} nights", dense=True
+    )
 
 
 def change_table(compared: NightlyComparison, verdict: str) -> Table | None:
@@ -267,11 +285,23 @@ def change_table(compared: NightlyComparison, verdict: str) -> Table | None:
         [
             code(c.metric),
             *(interval(None if value is None else asdict(value), 3) for value in (c.previous, c.present)),
+            difference_cell(c),
+            ", ".join(f"{recording} ({value:+.3f})" for recording, value in c.worst),
         ]
         for c in compared.changes
         if c.verdict == verdict
     ]
-    return Table(("Metric", "Last good night", "This night"), rows, [1, 2], verdict.capitalize()) if rows else None
+    headings = "Metric", "Last good night", "This night", "Difference on the same recordings", "Most on"
+    return Table(headings, rows, [1, 2, 3], verdict.capitalize()) if rows else None
+
+
+def difference_cell(change: Change) -> Markup | None:
+    """The paired difference, positive for better, to the good nights that the verdict is about."""
+    if change.tested is None:
+        return None
+    question, test = change.tested.shown
+    shown = interval({"mean": test.mean, "low": test.low, "high": test.high}, 3, signed=True)
+    return Markup("{}{}").format(shown, QUESTIONS[question])
 
 
 def trend_charts(nights: Sequence[Night]) -> list[Markup]:

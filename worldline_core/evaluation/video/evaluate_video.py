@@ -79,6 +79,9 @@ def evaluate_video(config: VideoEvaluationConfig, inputs: Mapping[str, Path], ou
     check_changed_controls(config, list(rollouts))
     unavailable: dict[str, str] = {}
     lpips = _open(load_lpips, config.lpips_weights, "lpips", unavailable)
+    if not config.changed_controls:
+        missing = "no predictions under changed controls (evaluate_video.changed_controls)"
+        unavailable |= {name: missing for name, metric in metrics.items() if metric.needs == "changed_controls"}
     i3d = _open(open_i3d, config.fvd_weights, "fvd", unavailable) if "fvd" in metrics else None
     parts = output / "run" / "parts"
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}

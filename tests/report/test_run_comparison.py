@@ -1,0 +1,101 @@
+"""`worldline compare`: paired differences of two runs, from folders of evaluations, reports and nights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from flows.command_line import main
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.evaluation.scores import Score, summarise, write_scores
+from worldline_core.report.nightly import record_night
+from worldline_core.report.run_comparison import compare_runs
+
+NUMBER = 24
+
+
+def evaluation(folder: Path, better_by: float, method: str = "model", first: int = 0) -> Path:
+    """SSIM and tool error of recordings that are easier or harder for every run alike."""
+    random = np.random.default_rng(0)
+    difficulty, noise = random.uniform(0.4, 0.9, 64), np.random.default_rng(first + 1).normal(0, 0.01, 64)
+    scores = []
+    for number in range(first, first + NUMBER):
+        robot, outcome = ("ur5e_pair", "viperx_pair")[number % 2], ("success", "failure")[number % 3 == 0]
+        for metric, value in (
+            ("ssim", difficulty[number] + better_by + noise[number]),
+            ("end_effector_error_px", 10 * (1 - difficulty[number] - better_by)),
+        ):
+            scores.append(Score(method, f"e{number}", robot, "test", "head", 1, metric, float(value), outcome=outcome))
+    folder.mkdir(parents=True)
+    write_scores(folder, scores)
+    (folder / "summary.json").write_text(
+        json.dumps(summarise(scores, comparisons=(), resamples=100, seed=0, by_view=True))
+    )
+    return folder
+
+
+def test_differences_are_of_the_same_recordings_by_metric_and_group(tmp_path: Path) -> None:
+    a, b = evaluation(tmp_path / "a", 0.05), evaluation(tmp_path / "b", 0.0, first=4)
+    rows = {(row.group, row.metric): row for row in compare_runs(f"{a}", f"{b}")}
+    assert set(rows) == {
+        (group, metric + view)
+        for group in ("test", "test/ur5e_pair", "test/viperx_pair", "test/success", "test/failure")
+        for metric in ("ssim", "end_effector_error_px")
+        for view in ("", "@head")
+    }
+    ssim, error = rows["test", "ssim@head"], rows["test", "end_effector_error_px@head"]
+    assert ssim.recordings == NUMBER - 4
+    assert ssim.difference == pytest.approx(0.05, abs=0.01)
+    assert (
+        ssim.low <= ssim.difference <= ssim.high < 0.07
+    )  # difficulties differ by 0.5: unpaired, this would be hopeless
+    assert error.difference == pytest.approx(-0.5)
+    assert (ssim.better, error.better) == ("first", "first")
+    back = {(row.group, row.metric): row for row in compare_runs(f"{b}", f"{a}")}["test", "ssim@head"]
+    assert (back.difference, back.better) == (pytest.approx(-ssim.difference), "second")
+
+
+def test_methods_of_other_names_are_paired(tmp_path: Path) -> None:
+    a, b = evaluation(tmp_path / "a", 0.05, "mine"), evaluation(tmp_path / "b", 0.0, "theirs")
+    with pytest.raises(ConfigError, match=r"no recording and method in common[\s\S]*--methods"):
+        compare_runs(f"{a}", f"{b}")
+    (row,) = (r for r in compare_runs(f"{a}", f"{b}", ("mine", "theirs"), ["ssim@head"]) if r.group == "test")
+    assert (row.method, row.better) == ("mine - theirs", "first")
+    with pytest.raises(ConfigError, match="No such method"):
+        compare_runs(f"{a}", f"{b}", ("mine", "mine"))
+    with pytest.raises(ConfigError, match="Metrics that not both runs have"):
+        compare_runs(f"{a}", f"{a}", None, ["sim"])
+
+
+def test_reports_and_nights_are_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a = evaluation(tmp_path / "store/evaluate_video/aa", 0.05)
+    b = evaluation(tmp_path / "other", 0.0)
+    report = tmp_path / "store/report/rr"
+    report.mkdir(parents=True)
+    (report / "manifest.json").write_text(json.dumps({"inputs": {"evaluate_video": {"path": "evaluate_video/aa"}}}))
+    history = tmp_path / "nightly"
+    record_night(history, "monday", {"evaluate_video": b})
+    main(["compare", str(report), f"{history}:monday", "--json", "--scores", str(tmp_path / "tidy.parquet")])
+    rows = {(row["group"], row["metric"]): row for row in json.loads(capsys.readouterr().out)}
+    direct = {(row.group, row.metric): row for row in compare_runs(f"{a}", f"{b}")}
+    assert rows["test", "ssim@head"]["difference"] == direct["test", "ssim@head"].difference
+    tidy = pq.read_table(tmp_path / "tidy.parquet").to_pandas()
+    assert list(tidy.columns) == ["source", "evaluation", "group", "method", "metric", "recording", "value"]
+    assert not tidy.duplicated(["source", "group", "method", "metric", "recording"]).any()
+    assert len(tidy.query("group == 'test' and metric == 'ssim@head' and source.str.endswith('rr')")) == NUMBER
+    main(["compare", str(report), str(b)])
+    heading, *lines = capsys.readouterr().out.splitlines()
+    assert heading.split() == ["metric", "group", "method", "first", "second", "difference", "95", "%", "n", "better"]
+    assert any(line.startswith("ssim@head") and line.endswith("first") for line in lines)
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    a = evaluation(tmp_path / "a", 0.0)
+    with pytest.raises(ArtifactError, match="Nothing to compare here"):
+        compare_runs(f"{tmp_path}", f"{a}")
+    with pytest.raises(ArtifactError, match="No such night"):
+        compare_runs(f"{tmp_path}:friday", f"{a}")

@@ -1,0 +1,74 @@
+"""Predictions in the layout that WorldArena's video evaluation reads (arXiv 2602.08971; `video_quality/README.md` of its
+repository, "Data and Naming Rules"):
+
+```
+<method>_sort/<task>_episode_<n>.mp4     predicted head views, no subfolders
+gt_video/<task>_episode_<n>.mp4          the recorded ones, as long and at the same rate
+gt_frames/<task>_episode_<n>.png         their first frames
+summary.json                             [{gt_path, image, prompt: [instruction]}, ...]
+episodes.json                            our episode id by their name
+```
+
+Its action following compares ``<method>_sort`` with ``<method>_1_sort`` and ``<method>_2_sort``: export the predictions under
+changed controls beside it and rename their folders. The leaderboard asks for RoboTwin's recordings, 121 frames at 24 fps.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.encoder import Encoding, VideoEncoder
+from worldline_core.errors import DataError
+from worldline_core.pictures.labels import png_bytes
+from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
+
+HEAD = "head"
+_TRUTH = Encoding(8, "veryfast", "yuv444p")
+
+
+def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequence[str], output: Path) -> list[Path]:
+    """Write the predictions (of the smallest seed) of some episodes; returns the files.
+
+    Raises: DataError for an episode without a predicted head view, or whose rate is no whole part of the recording's.
+    """
+    written: list[Path] = []
+    summary, ids = [], {}
+    for number, name in enumerate(sorted(names)):
+        if HEAD not in rollouts.views(name):
+            raise DataError("WorldArena looks at the head view", where=name, got=", ".join(rollouts.views(name)))
+        position = episodes.position(name)
+        row, clip = episodes.rows[position], rollouts.clip(name, HEAD)
+        stride = row.fps / rollouts.fps
+        if abs(stride - round(stride)) > 1e-3:
+            raise DataError("Another rate than the recording's", where=name, expected=row.fps, got=rollouts.fps)
+        stem = f"{safe_stem(row.task_family or 'task')}_episode_{number}"
+        predicted, true, first = (
+            output / folder / f"{stem}.{suffix}"
+            for folder, suffix in (
+                (f"{safe_stem(rollouts.method)}_sort", "mp4"),
+                ("gt_video", "mp4"),
+                ("gt_frames", "png"),
+            )
+        )
+        with atomic_path(predicted) as temporary:
+            shutil.copyfile(clip.path, temporary)
+        frames = np.asarray(episodes.frames(position, HEAD, [round(stride) * n for n in range(clip.num_frames)]))
+        size = (int(frames.shape[1]), int(frames.shape[2]))
+        with atomic_path(true) as temporary, VideoEncoder(temporary, size, rollouts.fps, _TRUTH) as encoder:
+            for frame in frames:
+                encoder.add(frame)
+        write_bytes_atomic(first, png_bytes(frames[0]))
+        written += [predicted, true, first]
+        summary.append({"gt_path": f"{true.resolve()}", "image": f"{first.resolve()}", "prompt": [row.instruction]})
+        ids[stem] = name
+    for file, content in (("summary.json", summary), ("episodes.json", ids)):
+        write_json_atomic(output / file, content)
+        written.append(output / file)
+    return written
