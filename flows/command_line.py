@@ -181,7 +181,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
 
 
 def _ablations(arguments: argparse.Namespace) -> None:
-    preset = _checked_preset(arguments)
+    preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.ablations import ablations
 

@@ -16,14 +16,17 @@ def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentP
         "rehearse",
         help="run a full-size preset at small size, with small random versions of every outside model",
         description="Make small random-weight versions of every outside model and small recordings in a folder, and run"
-        " the preset's own plan on them, from the import of the backbone to the report. Sizes alone change; each change"
-        " is printed. Nothing is learnt: what ends with an error here ends with it on many GPUs too.",
+        " the preset's own plan on them, from the import of the backbone to the report, and the five ablations. Sizes alone"
+        " change; each change is printed. Nothing is learnt: what ends with an error here ends with it on many GPUs too.",
     )
     add_preset_arguments(rehearse, "cosmos3-nano")
     rehearse.add_argument(
         "--output", type=Path, default=Path("rehearsal"), help="folder of weights, recordings and artifacts"
     )
     rehearse.add_argument("--processes", type=int, default=2, help="that share each training (default: 2)")
+    rehearse.add_argument(
+        "--without-ablations", action="store_true", help="end with the report of the preset's own plan"
+    )
     rehearse.set_defaults(run=rehearse_command)
 
 
@@ -34,7 +37,8 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
 
     path = None if arguments.config is None else arguments.config.resolve()
     preset = arguments.preset or (None if path else "cosmos3-nano")
-    changes = prepare(arguments.output, preset, path, arguments.overrides)
+    with_ablations = not arguments.without_ablations
+    changes, besides = prepare(arguments.output, preset, path, arguments.overrides, ablations=with_ablations)
     print(table(changes))
     overrides = (*arguments.overrides, *(change.override for change in changes))
     os.chdir(arguments.output)
@@ -45,3 +49,10 @@ def rehearse_command(arguments: argparse.Namespace) -> None:
 
     report = pipeline(preset, path, overrides, artifacts)
     print(f"report: {report.path / 'index.html'}")
+    if not with_ablations:
+        return
+    from flows.ablations import ablations
+
+    print("\nbesides, in the ablations:", table(besides), sep="\n")
+    ablated = ablations(preset, path, (*overrides, *(change.override for change in besides)), artifacts)
+    print((Path(ablated.path) / "table.md").read_text(), f"ablations: {ablated.path / 'index.html'}", sep="\n")

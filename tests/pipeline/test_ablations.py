@@ -56,6 +56,11 @@ def test_what_variants_share_is_one_node(nodes: dict[str, Node]) -> None:
     }
 
 
+def test_a_run_that_rolls_out_stage1_has_a_variant_without_it(project_root: Path) -> None:
+    names = {node.name for node in ablation_plan(partial(load, preset="cosmos3-nano"), project_root)}
+    assert {f"train_stage2.{name}" for name in VARIANTS} <= names
+
+
 def test_each_variant_changes_what_it_says_and_nothing_else(nodes: dict[str, Node]) -> None:
     full = nodes["train_stage2"]
 

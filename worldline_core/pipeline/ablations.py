@@ -61,6 +61,8 @@ def variant_config(
 ) -> PipelineConfig:
     """The configuration of a variant of the run whose configuration, with the table's rollouts, is ``full``."""
     changes = [change for change in variant.changes if _section(full, change) is not None]
+    # Its rollouts are not rows of the table, and a variant may train no Stage I.
+    changes += [f"rollouts.{name}=null" for name, run in load([]).rollouts.items() if run.checkpoint == "stage1"]
     if variant.matched_compute:
         changes.append(f"train_stage2.trainer.steps={matched_steps(full)}")
     rollouts = {

@@ -136,13 +136,16 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
     if config.evaluate_policy is not None:
         named["evaluate_policy.sam3_weights"] = config.evaluate_policy.sam3_weights
         named["evaluate_policy.vlm.weights"] = config.evaluate_policy.vlm.weights
+    for name, run in config.rollouts.items():
+        text = None if run.config is None else run.config.text
+        named[f"rollouts.{name}.config.text.path"] = None if text is None else text.path
     for key, path in named.items():
         if path is None:
             continue
         folder = project_path(project, Path(path))
         if not folder.is_dir() or not any(folder.iterdir()):
             missing.append(f"{key}: {path}")
-            step = _OUTSIDE.get(key, "check the path")
+            step = _OUTSIDE.get("train_stage1.text.path" if key.endswith(".text.path") else key, "check the path")
             advice += [step] if step not in advice else []
     if missing:
         raise UnavailableError(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from worldline_core.config import load_config
+from worldline_core.pipeline.ablations import ablation_plan
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.rehearsal.recordings import THREE_VIEWS, TWO_VIEWS, write_recordings
@@ -31,7 +32,7 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("models.tokenizer", f"{WEIGHTS}/Cosmos3-Nano/vae", _SMALL),
     ("models.base", f"{WEIGHTS}/base", _SMALL),
     ("models.teacher", f"{WEIGHTS}/vjepa2-vitg-fpc64-384", _SMALL),
-    ("train_stage1.text.path", f"{WEIGHTS}/Cosmos3-Nano/text_tokenizer", _SMALL),
+    ("*.text.path", f"{WEIGHTS}/Cosmos3-Nano/text_tokenizer", _SMALL),
     ("*.lpips_weights", _LPIPS, _SMALL),
     ("*.sam3_weights", _SAM3, _SMALL),
     ("evaluate_policy.vlm.weights", f"{WEIGHTS}/Qwen3-VL-8B-Instruct", _SMALL),
@@ -43,14 +44,22 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("*.trajectories.clips", 2, "one batch a process"),
     ("*.relational.student_layer", 2, "the model has 4 layers where 36 are published"),
     ("encode_latents.start_step", 48, "starts of cached clips"),
-    ("rollouts.*.seeds", [42, 43], "enough for a mean over seeds"),
+    ("rollouts.causal.*.seeds", [42, 43], "enough for a mean over seeds"),
+    ("rollouts.*.seeds", [42], "one seed is enough beside them"),
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
     ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
+    ("runner.nodes_at_once", 2, "two cores"),
 )
 """Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""
 
 
-ALWAYS = ("curate.sources", "encode_latents.start_step")
+ABLATION_SIZES: tuple[tuple[str, Any, str], ...] = (
+    ("rollouts.*.seeds", [42], "six models are evaluated"),
+    ("rollouts.*.num_frames", 33, "six models are evaluated"),
+)
+"""What the ablations change besides."""
+
+ALWAYS = ("curate.sources", "encode_latents.start_step", "runner.nodes_at_once")
 """Changed whatever they are; of the others nothing is made larger, and what is off stays off."""
 
 
@@ -69,7 +78,9 @@ class Change:
         return f"{self.key}={json.dumps(self.rehearsed)}"
 
 
-def changes_of(preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
+def changes_of(
+    preset: str | None, path: Path | None, overrides: Sequence[str], sizes: Sequence[tuple[str, Any, str]] = SIZES
+) -> list[Change]:
     """The values that a rehearsal of this configuration changes.
 
     Raises:
@@ -79,7 +90,7 @@ def changes_of(preset: str | None, path: Path | None, overrides: Sequence[str]) 
     before = dict(_leaves(config.model_dump(mode="json")))
     small: list[Change] = []
     for key, value in before.items():
-        fitting = next((size for size in SIZES if fnmatchcase(key, size[0])), None)
+        fitting = next((size for size in sizes if fnmatchcase(key, size[0])), None)
         if fitting is not None and (key in ALWAYS or _larger(value, fitting[1])):
             small.append(Change(key, value, *fitting[1:]))
     changed = [*overrides, *(change.override for change in small)]
@@ -93,8 +104,11 @@ def _larger(value: Any, small: Any) -> bool:
     """Whether a rehearsal makes it smaller."""
     if isinstance(value, int) and isinstance(small, int):
         return value > small
-    longer = not (isinstance(value, list) and isinstance(small, list) and len(value) < len(small))
-    return value is not None and value != small and longer
+    if isinstance(value, list) and isinstance(small, list):
+        return len(value) > len(small) or (
+            len(value) == len(small) and any(v > s for v, s in zip(value, small, strict=True))
+        )
+    return value is not None and value != small
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -122,18 +136,31 @@ def _shown(value: Any) -> str:
     return json.dumps([item["path"] for item in value] if sources else value)
 
 
-def prepare(folder: Path, preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
+def prepare(
+    folder: Path, preset: str | None, path: Path | None, overrides: Sequence[str], *, ablations: bool = True
+) -> tuple[list[Change], list[Change]]:
     """Write outside models, recordings and the list of changes into ``folder``; what is there already is kept.
 
+    Returns the changes, and those that the ablations make besides.
+
     Raises:
-        ConfigError: the configuration is not valid, or not with its changes.
+        ConfigError: the configuration is not valid, or not with its changes, or has nothing to ablate.
         UnavailableError: an outside model cannot be made small; the message names it.
     """
     changes = changes_of(preset, path, overrides)
+    changed = [*overrides, *(change.override for change in changes)]
+    besides = changes_of(preset, path, changed, ABLATION_SIZES) if ablations else []
+    if ablations:  # what is wrong with them is said now, not at the end
+
+        def load(more: Sequence[str]) -> PipelineConfig:
+            return load_config(PipelineConfig, preset=preset, path=path, overrides=[*changed, *more])
+
+        ablation_plan(load, folder)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / CHANGES_FILE) as temporary:
         temporary.write_text(
             f"# {preset or path}\n\nWhat the rehearsal changes; all else is as the file says.\n\n{table(changes)}\n"
+            + (f"\nBesides, in the ablations:\n\n{table(besides)}\n" if ablations else "")
         )
     if not (folder / WEIGHTS).is_dir():
         shutil.rmtree(folder / f"{WEIGHTS}.partial", ignore_errors=True)
@@ -142,4 +169,4 @@ def prepare(folder: Path, preset: str | None, path: Path | None, overrides: Sequ
     for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
         if not (folder / name / "index.parquet").is_file():
             write_recordings(folder / name, episodes, split=split)
-    return changes
+    return changes, besides

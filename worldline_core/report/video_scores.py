@@ -23,6 +23,8 @@ KINDS = {
     "stage2_shuffled": ("Stage II, shuffled actions", "c3"),
     "causal_zero": ("causal, no actions", "c4"),
     "causal_shuffled": ("causal, shuffled actions", "c3"),
+    "stage1": ("Stage I, text, no actions", "c7"),
+    "backbone": ("backbone, text, no actions", "c6"),
     "copy": ("copy first frame", "c5"),
     "other": ("", "c6"),
 }
@@ -81,15 +83,17 @@ def method(name: str) -> Method:
         return Method(name, TRUE_METHOD, TRUE_METHOD)
     if "copy" in words:
         return Method(name, "copy", "baseline")
+    # Another number of steps is another method: it must not stand under the label of the usual one.
+    if "steps" not in words and (found := words & {"stage1", "backbone"}):
+        return Method(name, found.pop(), "baseline")
     base = "causal" if "causal" in words else "stage2" if words & {"stage2", "stageii"} else ""
     control = "_zero" if words & ZERO_WORDS else "_shuffled" if words & SHUFFLED_WORDS else ""
-    # Another number of steps is another method: it must not stand under the label of the usual one.
     kind = f"{base}{control}" if base and "steps" not in words else "other"
     return Method(name, kind, "shipped" if "shipped" in words else "run")
 
 
 def in_order(names: Iterable[str]) -> list[Method]:
-    """Methods of several names: recorded videos, long-trained weights, this run's, then baselines without weights."""
+    """Methods of several names: recorded videos, long-trained weights, this run's, then baselines without actions."""
     return sorted((method(name) for name in names), key=lambda m: m.rank)
 
 
