@@ -1,0 +1,201 @@
+"""The simulator as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from worldline_core import WorldLine
+from worldline_core.environment import ENVIRONMENT
+from worldline_core.environment.environment import WorldLineEnv, WorldLineVectorEnv
+from worldline_core.environment.starts import EpisodeStarts
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.recordings import Trajectory
+
+ROBOT = "ur5e_silver"
+SHORT: dict[str, Any] = {"embodiment": ROBOT, "views": ["head"], "success": None}
+
+
+@pytest.fixture(scope="module")
+def shipped(project_root: Path) -> Path:
+    return project_root / "artifacts" / "shipped"
+
+
+@pytest.fixture(scope="module")
+def world(shipped: Path) -> WorldLine:
+    return WorldLine.from_pretrained(shipped / "models" / "causal")
+
+
+@pytest.fixture(scope="module")
+def starts(shipped: Path) -> EpisodeStarts:
+    return EpisodeStarts(shipped / "recordings", embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
+
+
+def commands(starts: EpisodeStarts, seeds: list[int], count: int) -> np.ndarray:
+    """Recorded commands of the starts that these seeds choose, ``(count, envs, j)``, the second moved a little."""
+    rows = []
+    for seed in seeds:
+        episode = starts._episodes.episode(starts._positions[seed % len(starts)])
+        index = np.minimum(np.arange(1, count + 1), len(episode.action) - 1)
+        rows.append(episode.action[index])
+    return np.stack(rows, axis=1)
+
+
+def test_gymnasiums_checker_finds_nothing(world: WorldLine) -> None:
+    environment = gymnasium.make(
+        ENVIRONMENT, model=world, render_mode="rgb_array", observe_every=8, episode_frames=20, **SHORT
+    )
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_env(environment.unwrapped)
+    # Joints have limits in radians, which are neither symmetric nor 1.
+    told = [str(one.message) for one in found if "symmetric and normalized space" not in str(one.message)]
+    assert not told
+    assert environment.unwrapped.metadata["render_fps"] == 8
+
+
+def test_episodes_are_simulations_of_recorded_starts(world: WorldLine, starts: EpisodeStarts) -> None:
+    """Block by block: pictures are new when a block is full, the state at every step; the end is that of a simulation."""
+    environment = WorldLineEnv(model=world, render_mode="rgb_array", episode_frames=20, **SHORT)
+    observed, info = environment.reset(seed=1)
+    start = starts[1]
+    assert info == {"is_success": False, "episode_id": start.episode_id, "task": start.instruction}
+    assert observed["pixels"]["head"].shape == (64, 96, 3)
+    simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=1)
+    assert np.array_equal(observed["pixels"]["head"], simulation.pictures[0]["head"])
+    driven = commands(starts, [1], 20)[:, 0]
+    first = observed["pixels"]["head"]
+    blocks = simulation.step(driven[:16])
+    for number, command in enumerate(driven, start=1):
+        observed, reward, terminated, truncated, info = environment.step(command)
+        if number < 16:
+            assert np.array_equal(observed["pixels"]["head"], first)
+            np.testing.assert_allclose(observed["agent_pos"], simulation.states[0, number - 1], atol=1e-6)
+        elif number < 20:
+            assert np.array_equal(observed["pixels"]["head"], blocks[0]["head"][-1])
+        assert (reward, terminated, truncated) == (0.0, False, number == 20)
+    # What was commanded until the end, the last command held.
+    ended = simulation.step(np.concatenate((driven[16:], np.repeat(driven[-1:], 12, axis=0))))[0]["head"][3]
+    assert np.array_equal(observed["pixels"]["head"], ended)
+    assert np.array_equal(environment.render(), ended)
+    with pytest.raises(DataError, match=r"(?s)episode has ended.*call reset first"):
+        environment.step(driven[0])
+
+
+def test_pictures_may_be_asked_for_more_often(world: WorldLine, starts: EpisodeStarts) -> None:
+    start, driven = starts[0], commands(starts, [0], 16)[:, 0]
+    simulation = world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=0)
+    environment = WorldLineEnv(model=world, observe_every=8, episode_frames=16, **SHORT)
+    environment.reset(seed=0)
+    seen = [environment.step(command)[0]["pixels"]["head"] for command in driven]
+    foreseen = simulation.copy().step(np.concatenate((driven[:8], np.repeat(driven[7:8], 8, axis=0))))[0]["head"]
+    assert np.array_equal(seen[7], foreseen[7])
+    assert np.array_equal(seen[6], simulation.pictures[0]["head"])
+    assert np.array_equal(seen[14], seen[7])
+    assert np.array_equal(seen[15], simulation.step(driven)[0]["head"][-1])
+    with pytest.raises(ConfigError, match=r"(?s)divisor of 16.*observe_every 5"):
+        WorldLineEnv(model=world, observe_every=5, **SHORT)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: EpisodeStarts, mode: AutoresetMode) -> None:
+    """Against Gymnasium's own vector environment, over the end of an episode, with one that ends early on success."""
+
+    def early(video: Trajectory) -> bool:
+        return video.num_frames == 17 and video.instruction == starts[1].instruction
+
+    assert starts[0].instruction != starts[1].instruction
+    options = {"model": world, "episode_frames": 20, "stop_at_success": True, **SHORT, "success": early}
+    command = over = np.zeros(0)
+    ours = gymnasium.make_vec(ENVIRONMENT, num_envs=2, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: WorldLineEnv(**options)] * 2, autoreset_mode=mode)
+    assert isinstance(ours, WorldLineVectorEnv)
+    assert (ours.action_space, ours.observation_space) == (theirs.action_space, theirs.observation_space)
+    seeds = [0, 1]
+    pair = [environment.reset(seed=seeds) for environment in (ours, theirs)]
+    assert data_equivalence(*pair)
+    for command in commands(starts, seeds, 20):
+        mine, other = (environment.step(command.astype(np.float32)) for environment in (ours, theirs))
+        over = mine[2] | mine[3]
+        if mode == AutoresetMode.SAME_STEP and over.any():
+            break  # what follows an autoreset is drawn by each one's own generator
+        for one, another in zip(mine[:4], other[:4], strict=True):
+            assert data_equivalence(one, another)
+        assert data_equivalence(mine[4], other[4])
+        if over.any():
+            break
+    assert over.tolist() == [False, True]
+    final = mine[4]["final_info"] if mode == AutoresetMode.SAME_STEP else mine[4]
+    assert final["is_success"].tolist() == [False, True]
+    assert (mine[1].tolist(), mine[2].tolist(), mine[3].tolist()) == ([0.0, 1.0], [False, True], [False, False])
+    assert sorted(mine[4]) == sorted(other[4])
+    if mode == AutoresetMode.SAME_STEP:
+        assert data_equivalence(mine[4]["final_obs"][1], other[4]["final_obs"][1])
+    after = ours.step(command)
+    fresh = after if mode == AutoresetMode.NEXT_STEP else mine
+    assert fresh[4]["is_success"].tolist() == [False, False]
+    # The one that goes on is not disturbed by the other's new beginning.
+    again = WorldLineEnv(**options)
+    again.reset(seed=0)
+    rows = commands(starts, [0], 20)[:, 0]
+    ends = [again.step(row) for row in [*rows[:16], rows[15]]][-1]
+    assert np.array_equal(after[0]["agent_pos"][0], ends[0]["agent_pos"])
+    assert np.array_equal(after[0]["pixels"]["head"][0], ends[0]["pixels"]["head"])
+    assert ours.call("_max_episode_steps") == (20, 20)
+    assert ours.get_attr("task_description")[0] == starts[0].instruction
+    assert [picture.shape for picture in ours.call("render")] == [(64, 96, 3)] * 2
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        ours.call("nothing")
+
+
+def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: EpisodeStarts) -> None:
+    for verdict, rewarded in ((None, False), (True, True), (False, False)):
+        environment = WorldLineVectorEnv(
+            1,
+            model=world,
+            episode_frames=1,
+            embodiment=ROBOT,
+            views=["head"],
+            success=lambda _, verdict=verdict: verdict,
+        )
+        environment.reset(seed=0)
+        _, reward, terminated, truncated, infos = environment.step(commands(starts, [0], 1)[0])
+        assert (bool(reward[0]), bool(terminated[0])) == (rewarded, rewarded)
+        assert (bool(truncated[0]), bool(infos["is_success"][0])) == (not rewarded, rewarded)
+
+
+@pytest.mark.slow
+def test_the_judge_sees_the_outcomes_of_recorded_commands(world: WorldLine) -> None:
+    """Replayed in the environment, recorded episodes end as they did: 8 of the 10 first ones at least."""
+    environment = WorldLineVectorEnv(10, model=world, episode_frames=32, embodiment=ROBOT, splits=("test", "ood_test"))
+    count = min(10, len(environment.starts))
+    recorded = [environment.starts._episodes.rows[position] for position in environment.starts._positions[:count]]
+    environment.reset(seed=0)
+    driven = commands(environment.starts, list(range(10)), 32)
+    for command in driven:
+        *_, infos = environment.step(command)
+    agree = [infos["is_success"][slot] == (row.outcome == "success") for slot, row in enumerate(recorded)]
+    assert sum(agree) >= 0.8 * count
+
+
+def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: EpisodeStarts) -> None:
+    environment = WorldLineVectorEnv(2, model=world, **SHORT)
+    with pytest.raises(DataError, match="call reset first"):
+        environment.step(np.zeros((2, 14)))
+    environment.reset(seed=3)
+    with pytest.raises(DataError, match=r"(?s)Not the commands of one step.*\(2, 14\): left/shoulder_pan_joint"):
+        environment.step(np.zeros((1, 14)))
+    with pytest.raises(DataError, match="not finite"):
+        environment.step(np.full((2, 14), np.nan))
+    with pytest.raises(DataError, match=r"(?s)of one robot.*left out.*of another split"):
+        EpisodeStarts(shipped / "recordings", embodiment=None, splits=("test",), views=("head",), fps=8.0)
+    with pytest.raises(DataError, match=r"(?s)of one robot.*of another rate"):
+        EpisodeStarts(shipped / "recordings", embodiment=ROBOT, splits=("test",), views=("head",), fps=10.0)
+    assert len(starts) > 1

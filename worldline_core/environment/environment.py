@@ -1,0 +1,330 @@
+"""The simulator as a batched Gymnasium environment, and as a single one.
+
+A step takes one command a frame, in the embodiment's layout and units. Pictures come block by block, because the model
+predicts a block at once: commands are collected, and when the block is full it is predicted. ``observe_every`` says how often a
+policy sees new pictures: by default once a block, so a policy should act in chunks of ``frames_per_step`` commands. With a
+smaller number the block is also predicted from what was commanded so far, the last command held, and predicted again when
+there are more (``frames_per_step / observe_every`` times the work). Between two observations the pictures stay; the state of the
+robot (``agent_pos``) is new at every step.
+
+Episodes begin at recorded first frames: a seed ``s`` at start ``s`` modulo their number, with noise of seed ``s``. They end after
+``episode_frames`` steps, where a judge looks at the whole video: ``is_success``, and a reward of 1. What the judge cannot see is no
+success. Environments that began together are stepped together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from worldline_core.environment.episodes import RunningEpisode, Success, Together, measured_success, tool_points
+from worldline_core.environment.starts import EpisodeStarts, Start
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.robot import Response
+from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.worldline import WorldLine
+from worldline_core.shipped import shipped_folder
+
+
+class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
+    """Episodes of one robot, side by side.
+
+    Args:
+        model: a Stage II or causal checkpoint, or a ``WorldLine``; by default the shipped causal one.
+        recordings: an EpisodeSet, whose first frames are the starts; by default the shipped one.
+        embodiment, splits: of the recordings that are used; ``embodiment`` may be left out where all are of one robot.
+        views: that are simulated, by default all of the model's.
+        episode_frames: steps of an episode.
+        observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
+        success: "measured" (by colour, with the shipped segmenter), a function, or None: then nothing is a success.
+        stop_at_success: ask the judge after every block, and end the episode where it sees success.
+        limits, response: as of ``WorldLine.start``.
+        autoreset_mode: of finished episodes: at the next step, in the same step, or never (``reset`` with ``reset_mask``).
+        options: further arguments of ``WorldLine.from_pretrained``.
+
+    Raises:
+        ConfigError: ``observe_every`` does not divide the block, or a number is not positive.
+        DataError: no recording fits.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        model: Path | str | WorldLine | None = None,
+        recordings: Path | str | None = None,
+        embodiment: str | None = None,
+        splits: Sequence[str] = ("test",),
+        views: Sequence[str] | None = None,
+        episode_frames: int = 32,
+        observe_every: int | None = None,
+        success: Literal["measured"] | Success | None = "measured",
+        stop_at_success: bool = False,
+        limits: bool = True,
+        response: Response | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: Literal["rgb_array"] | None = "rgb_array",
+        **options: Any,
+    ) -> None:
+        shipped = shipped_folder()
+        self.world = (
+            model
+            if isinstance(model, WorldLine)
+            else WorldLine.from_pretrained(model or shipped / "models" / "causal", **options)
+        )
+        self.views = self.world.chosen_views(self.world.views if views is None else views)
+        self.starts = EpisodeStarts(
+            Path(recordings or shipped / "recordings"),
+            embodiment=embodiment, splits=splits, views=self.views, fps=self.world.contract.fps,
+        )  # fmt: skip
+        self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
+        self.num_envs, self.episode_frames = num_envs, episode_frames
+        self._limits, self._response, self._stop_at_success = limits, response, stop_at_success
+        self._succeeds = measured_success(shipped / "models" / "segmenter") if success == "measured" else success
+        self.render_mode = render_mode
+        self._autoreset = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "render_modes": ["rgb_array"], "render_fps": round(self.world.contract.fps), "autoreset_mode": self._autoreset,
+        }  # fmt: skip
+        self._together: list[Together] = []
+        self._random = [np.random.default_rng() for _ in range(num_envs)]
+        self._done = np.ones(num_envs, dtype=bool)
+        self._episodes: list[RunningEpisode] = []
+        self.frames_per_step = self._begun([self.starts[0]], [0]).frames_per_step
+        self.observe_every = observe_every or self.frames_per_step
+        if min(num_envs, episode_frames, self.observe_every) < 1 or self.frames_per_step % self.observe_every:
+            raise ConfigError(
+                "An environment cannot be stepped so",
+                expected=f"at least one environment and frame, observe_every a divisor of {self.frames_per_step}",
+                got=f"num_envs {num_envs}, episode_frames {episode_frames}, observe_every {self.observe_every}",
+            )
+        self._spaces()
+
+    def _spaces(self) -> None:
+        arms = self.kinematics.embodiment
+        low, high = (np.full(arms.state_size, bound, np.float32) for bound in (-np.inf, np.inf))
+        for arm in arms.arms:
+            low[arms.joint_columns(arm)], high[arms.joint_columns(arm)] = np.array(arm.limits, np.float32).T
+            low[arms.gripper_column(arm)], high[arms.gripper_column(arm)] = sorted(
+                (arm.gripper.closed, arm.gripper.open)
+            )
+        picture = gymnasium.spaces.Box(0, 255, (*self.world.image_size, 3), np.uint8)
+        # A recording may begin a little beyond a limit, and stays where it is.
+        state = gymnasium.spaces.Box(low - LIMIT_TOLERANCE_RAD, high + LIMIT_TOLERANCE_RAD, dtype=np.float32)
+        self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        self.single_observation_space = gymnasium.spaces.Dict(
+            {"pixels": gymnasium.spaces.Dict(dict.fromkeys(self.views, picture)), "agent_pos": state}
+        )
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin new episodes, at the starts that the seeds say (an integer counts up), else at drawn ones.
+
+        Args:
+            options: ``reset_mask``, bool ``(num_envs)``: which ones begin anew.
+        """
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        self._begin([slot for slot in range(self.num_envs) if mask[slot]], seeds)
+        return self._observation(), self._infos([self._info(slot) for slot in range(self.num_envs)])
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One command for each episode; see the module's text for when pictures are new.
+
+        Raises:
+            DataError: the commands have another shape or are not finite, or an episode has ended or not begun.
+        """
+        commands = self._checked(actions)
+        restarted: list[int] = []
+        if self._autoreset == AutoresetMode.NEXT_STEP and self._episodes:
+            restarted = [slot for slot in range(self.num_envs) if self._done[slot]]
+        elif self._done.any():
+            raise DataError(
+                "An episode has ended or not begun",
+                got=np.flatnonzero(self._done).tolist(),
+                next_step="call reset first",
+            )
+        if not self._episodes:
+            raise DataError("The environment was not reset", next_step="call reset first")
+        going_on = [rest for group in self._together if (rest := group.without(restarted)) is not None]
+        for group in going_on:
+            self._advance(group, commands[group.slots])
+        ended = np.zeros(self.num_envs, dtype=bool)
+        for group in going_on:
+            ended[group.slots] = group.age == self.episode_frames
+        success = np.array([episode.success for episode in self._episodes])
+        success[restarted] = False
+        self._together, self._done = going_on, ended | success
+        if restarted:
+            self._begin(restarted, [None] * self.num_envs)
+        infos = [self._info(slot) for slot in range(self.num_envs)]
+        observation = self._observation()
+        finished = np.flatnonzero(self._done).tolist()
+        if self._autoreset == AutoresetMode.SAME_STEP and finished:
+            last = [{"final_obs": self._observed(slot), "final_info": infos[slot]} for slot in finished]
+            self._begin(finished, [None] * self.num_envs)
+            for slot, final in zip(finished, last, strict=True):
+                infos[slot] = self._info(slot) | final
+            observation = self._observation()
+        return observation, success.astype(np.float64), success, ended & ~success, self._infos(infos)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Latest picture of each episode, its views side by side, ``uint8 (H, views * W, 3)``."""
+        if self.render_mode is None:
+            return None
+        return tuple(
+            np.concatenate([episode.picture[view] for view in self.views], axis=1) for episode in self._episodes
+        )
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """An attribute of every environment, or what its method returns, as of Gymnasium's own vector environments."""
+        if name == "render":
+            return self.render() or ()
+        values = {
+            "task": [episode.start.instruction for episode in self._episodes],
+            "task_description": [episode.start.instruction for episode in self._episodes],
+            "_max_episode_steps": [self.episode_frames] * self.num_envs,
+        }
+        if name not in values:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r} for each environment")
+        return tuple(values[name])
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every environment."""
+        return self.call(name)
+
+    def _begun(self, starts: Sequence[Start], seeds: Sequence[int]) -> Simulation:
+        return self.world.start(
+            [start.images for start in starts],
+            [start.cameras for start in starts],
+            embodiment=self.kinematics,
+            state=np.stack([start.state for start in starts]),
+            seed=seeds,
+            limits=self._limits,
+            response=self._response,
+        )
+
+    def _begin(self, slots: Sequence[int], seeds: Sequence[int | None]) -> None:
+        chosen: list[int] = []
+        for slot in slots:
+            given = seeds[slot]
+            if given is not None:
+                self._random[slot] = np.random.default_rng(given)
+            chosen.append(int(self._random[slot].integers(2**31)) if given is None else int(given))
+        starts = [self.starts[number % len(self.starts)] for number in chosen]
+        simulation = self._begun(starts, chosen)
+        others = [rest for group in self._together if (rest := group.without(slots)) is not None]
+        self._together = [*others, Together(simulation, list(slots))]
+        episodes = dict(enumerate(self._episodes))
+        for index, slot in enumerate(slots):
+            picture = simulation.pictures[index]
+            video = {view: [frame[None]] for view, frame in picture.items()}
+            points = [tool_points(simulation, index)]
+            episodes[slot] = RunningEpisode(starts[index], video, points, picture, simulation.state[index])
+            self._done[slot] = False
+        if len(episodes) < self.num_envs:
+            raise DataError("Some episodes were never begun", next_step="reset all of them first")
+        self._episodes = [episodes[slot] for slot in range(self.num_envs)]
+
+    def _advance(self, group: Together, commands: np.ndarray) -> None:
+        """Take one command for each episode of a group; predict and judge when it is time."""
+        group.commands.append(commands)
+        group.age += 1
+        block, count = np.stack(group.commands, axis=1), len(group.commands)
+        for slot, state in zip(group.slots, group.simulation.follow(block)[:, -1], strict=True):
+            self._episodes[slot].state = state
+        full, last = count == self.frames_per_step, group.age == self.episode_frames
+        if not (full or last or count % self.observe_every == 0):
+            return
+        simulation = group.simulation if full else group.simulation.copy()
+        held = np.repeat(block[:, -1:], self.frames_per_step - count, axis=1)
+        clips = simulation.step(np.concatenate((block, held), axis=1))
+        for index, slot in enumerate(group.slots):
+            episode = self._episodes[slot]
+            episode.picture = {view: video[count - 1] for view, video in clips[index].items()}
+            if full or last:
+                for view, video in clips[index].items():
+                    episode.video[view].append(video[:count])
+                episode.points.append(tool_points(simulation, index)[:count])
+            if self._succeeds is not None and (last or (full and self._stop_at_success)):
+                episode.success = self._succeeds(episode.trajectory(self.world.contract.fps)) is True
+        if full:
+            group.commands = []
+
+    def _checked(self, actions: np.ndarray) -> np.ndarray:
+        commands = np.asarray(actions, dtype=np.float64)
+        if commands.shape != self.action_space.shape or not np.isfinite(commands).all():
+            raise DataError(
+                "Not the commands of one step",
+                expected=f"finite {self.action_space.shape}: {', '.join(self.kinematics.embodiment.state_names)}",
+                got=commands.shape if commands.shape != self.action_space.shape else "numbers that are not finite",
+            )
+        return commands
+
+    def _observed(self, slot: int) -> dict[str, Any]:
+        episode = self._episodes[slot]
+        pictures = {view: episode.picture[view].copy() for view in self.views}
+        return {"pixels": pictures, "agent_pos": episode.state.astype(np.float32)}
+
+    def _observation(self) -> dict[str, Any]:
+        each = [self._observed(slot) for slot in range(self.num_envs)]
+        pictures = {view: np.stack([one["pixels"][view] for one in each]) for view in self.views}
+        return {"pixels": pictures, "agent_pos": np.stack([one["agent_pos"] for one in each])}
+
+    def _info(self, slot: int) -> dict[str, Any]:
+        episode = self._episodes[slot]
+        return {
+            "is_success": episode.success,
+            "episode_id": episode.start.episode_id,
+            "task": episode.start.instruction,
+        }
+
+    def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        gathered: dict[str, Any] = {}
+        for slot, info in enumerate(infos):
+            gathered = self._add_info(gathered, info, slot)
+        return gathered
+
+
+class WorldLineEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
+    """One episode at a time; arguments as of :class:`WorldLineVectorEnv`."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}  # noqa: RUF012
+
+    def __init__(self, render_mode: Literal["rgb_array"] | None = None, **options: Any) -> None:
+        self.vector = WorldLineVectorEnv(1, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **options)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": self.vector.metadata["render_fps"]}
+        self.action_space = self.vector.single_action_space
+        self.observation_space = self.vector.single_observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode: at start ``seed`` modulo their number, or at a drawn one."""
+        super().reset(seed=seed)
+        chosen = int(self.np_random.integers(2**31)) if seed is None else seed
+        self.vector.reset(seed=[chosen])
+        return self.vector._observed(0), self.vector._info(0)
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One command."""
+        _, reward, terminated, truncated, _ = self.vector.step(np.asarray(action)[None])
+        observed, info = self.vector._observed(0), self.vector._info(0)
+        return observed, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> np.ndarray | None:
+        """Latest picture, its views side by side."""
+        pictures = self.vector.render()
+        return None if pictures is None else pictures[0]

@@ -1,0 +1,71 @@
+"""Episodes that run in an environment: their videos so far, which ones are stepped together, and whether one succeeded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldline_core.environment.starts import Start
+from worldline_core.evaluation.policy.judge import judge_trajectory
+from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
+from worldline_core.evaluation.recordings import HEAD, Trajectory
+from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.rollout.simulation import Simulation
+
+Success = Callable[[Trajectory], bool | None]
+"""Whether a video shows that its task was done; None where that cannot be seen."""
+
+
+def measured_success(segmenter: Path) -> Success:
+    """Success by the embedded judge, which follows what the instruction names by colour."""
+    judge = MeasuredEvidenceJudge(open_segmenter("learned", learned=segmenter, sam3=None))
+    return lambda trajectory: judge_trajectory(judge, trajectory).success
+
+
+@dataclass
+class RunningEpisode:
+    """One running episode: its start, its video so far and the tools in the head view."""
+
+    start: Start
+    video: dict[str, list[np.ndarray]]
+    points: list[np.ndarray]
+    picture: dict[str, np.ndarray]
+    state: np.ndarray
+    success: bool = False
+
+    def trajectory(self, fps: float) -> Trajectory:
+        """The video so far, as a judge sees it."""
+        video: dict[str, Any] = {view: np.concatenate(pieces) for view, pieces in self.video.items()}
+        return Trajectory(self.start.instruction, video, fps, np.concatenate(self.points))
+
+
+@dataclass
+class Together:
+    """Episodes that began together, and the commands since their last finished block."""
+
+    simulation: Simulation
+    slots: list[int]
+    age: int = 0
+    commands: list[np.ndarray] = field(default_factory=list)
+
+    def without(self, slots: Sequence[int]) -> Together | None:
+        """The others."""
+        kept = [index for index, slot in enumerate(self.slots) if slot not in slots]
+        if len(kept) in (0, len(self.slots)):
+            return self if kept else None
+        commands = [rows[kept] for rows in self.commands]
+        return Together(self.simulation.select(kept), [self.slots[index] for index in kept], self.age, commands)
+
+
+def tool_points(simulation: Simulation, clip: int) -> np.ndarray:
+    """Tools in the head view of the last step ``(n, arms, 2)`` [px of the simulated picture], NaN where not seen."""
+    tracks = simulation.tracks[clip]
+    column = tracks.views.index(HEAD)
+    scale = np.array(simulation.image_size[::-1]) / np.array(tracks.image_size[::-1])
+    points = (tracks.uv[:, column] + 0.5) * scale - 0.5
+    points[~tracks.valid[:, column]] = np.nan
+    return points
