@@ -57,7 +57,7 @@ def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
         DataError: none matches.
     """
     counts: Counter[str] = Counter()
-    chosen = []
+    chosen: list[int] = []
     limit = config.max_episodes_per_embodiment
     for position in episodes.select(split=config.splits):
         row = episodes.rows[position]
