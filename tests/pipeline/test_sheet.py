@@ -106,13 +106,16 @@ def test_the_check_before_training_lets_through_what_fits_by_a_hair(monkeypatch:
 
 
 @pytest.mark.slow
-def test_the_trainings_of_the_full_size_preset_fit_cards_of_80_gb() -> None:
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    # Both towers of Cosmos3-Nano; student and fake score of the video tower, which is what takes most memory.
+    [("train_stage1", (14e9, 15e9)), ("distribution_matching", (13.5e9, 14.5e9))],
+)
+def test_the_full_size_fits_cards_of_80_gb(name: str, parameters: tuple[float, float]) -> None:
     planner = Planner(load_config(PipelineConfig, preset="cosmos3-nano"), PROJECT, Machine.of(8, "80GB", "H100", 0.4))
-    needs: dict[str, StageMemory] = {}
-    for name, (estimate, trainer, _) in planner.trainings().items():
-        needs[name] = need = estimate(Spread.of(trainer, 8))
-        assert need.fits(80e9), need.line(80e9)
-        assert replace(need, spread=Spread.of(trainer, 64)).total < need.total
-    assert 13e9 < needs["train_stage1"].trained < 16e9  # both towers of Cosmos3-Nano
-    assert 6.5e9 < needs["train_stage2"].trained < 7.5e9
-    assert needs["distribution_matching"].trained == 2 * needs["teacher_forcing"].trained
+    estimate, trainer, _ = planner.trainings()[name]
+    need = estimate(Spread.of(trainer, 8))
+    assert parameters[0] < need.trained < parameters[1]
+    assert need.fits(80e9), need.line(80e9)
+    assert replace(need, spread=Spread.of(trainer, 64)).total < need.total
