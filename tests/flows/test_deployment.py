@@ -142,7 +142,7 @@ def test_nightly_guards_on_a_real_server_and_worker(
     )
     assert [run["state"]["type"] for run in runs] == ["FAILED", "COMPLETED"]
     message = runs[0]["state"]["message"]
-    for part in (metric, "-0.030", "14 recordings, most on", "pictures/", "worldline nightly --accept second"):
+    for part in (metric, "-0.030", "12 recordings, most on", "pictures/", "worldline nightly --accept second"):
         assert part in message, message
     for run in runs:
         filters = {"artifacts": {"flow_run_id": {"any_": [run["id"]]}}}
@@ -166,8 +166,6 @@ def test_nightly_guards_on_a_real_server_and_worker(
     assert third.returncode == 1
     assert metric in third.stderr
 
-    step = _run(environment, project_root, "step/evaluate_video", {**given, "inputs": None, "overrides": []})
-    assert step.returncode != 0  # of a nightly evaluation only what needs no training is finished
     filtered = _run(environment, project_root, "step/filter", given)
     assert filtered.returncode == 0, filtered.stdout + filtered.stderr
     _prefect(environment, project_root, "automation", "create", "--from-file", "examples/nightly_automation.yaml")
