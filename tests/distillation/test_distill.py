@@ -314,8 +314,8 @@ def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path)
     nodes = torch.randn(2, 5, 3, 4, 4, 2, 2, generator=torch.Generator().manual_seed(0))
     mask = torch.ones(2, 3, 5, 2, 2)
 
-    def make(number: int) -> tuple[list[Clip], torch.Tensor, torch.Tensor]:
-        return [Clip("a", number, 17, 1), Clip("b", number, 17, 1)], nodes + number, mask
+    def make(number: int) -> tuple[list[Clip], dict[str, torch.Tensor]]:
+        return [Clip("a", number, 17, 1), Clip("b", number, 17, 1)], {"nodes": nodes + number, "mask": mask}
 
     with pytest.raises(ArtifactError, match="Not a folder of finished"):
         TrajectoryStore.open(tmp_path)
@@ -325,5 +325,7 @@ def test_trajectories_are_read_as_written_and_refused_when_other(tmp_path: Path)
     assert store.clips([3, 0]) == (Clip("b", 1, 17, 1), Clip("a", 0, 17, 1))
     torch.testing.assert_close(store.nodes([3, 0]), torch.stack((nodes[1] + 1, nodes[0])), rtol=2e-3, atol=2e-3)
     assert store.masks([1]).dtype == torch.float32
+    with pytest.raises(ArtifactError, match=r"(?s)lacks a tensor.*shard-00000.*latents"):
+        store.latents([1])
     with pytest.raises(ArtifactError, match="other settings"):
         write_trajectories(tmp_path, 2, make, {"seed": 2})

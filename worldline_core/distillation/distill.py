@@ -47,14 +47,13 @@ from worldline_core.model.lpips import load_lpips
 from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_config import ClipSampling
+from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import ClipRow, named_rows, training_rows
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows, training_rows
 from worldline_core.training.processes import ALONE, BatchPlan, join_processes, processes, wait_for_all
 from worldline_core.training.sharding import gathered, place_model
-from worldline_core.training.stage import validation_function
+from worldline_core.training.stage import clip_batches, input_facts, open_source, validation_function
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
 
@@ -67,7 +66,10 @@ LPIPS_OFF = "off: no LPIPS weights configured"
 
 
 def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Distill `stage2` on `latents`, `tracks` and `episodes`; `tokenizer` decodes frames for the perceptual term.
+    """Distill `stage2` on `tracks` and `episodes`; `tokenizer` decodes frames for the perceptual term.
+
+    Clips are cached `latents`, or frames that `tokenizer` encodes on the way (once for a step of teacher forcing; the
+    trajectories keep theirs).
 
     Raises:
         CheckpointError: the checkpoint is not of Stage II, or its action maps and latents are not those given here.
@@ -99,7 +101,7 @@ class DistillationRun:
     config: DistillConfig
     stage2: Path
     stage2_info: CheckpointInfo
-    store: LatentStore
+    store: ClipSource
     loader: ClipLoader
     rows: list[ClipRow]
     output: Path
@@ -117,7 +119,8 @@ class DistillationRun:
         join_processes(device)
         info = read_checkpoint_info(Path(inputs["stage2"]))
         native = info.config.native_size
-        store, episodes = LatentStore.open(Path(inputs["latents"])), EpisodeSet.open(Path(inputs["episodes"]))
+        episodes = EpisodeSet.open(Path(inputs["episodes"]))
+        store = open_source(config.input, config.clips, inputs, episodes, config.views, device)
         tracks = ActionTracks.open(Path(inputs["tracks"]), None if native is None else episodes)
         contract = info.contract
         if not set(config.views) <= set(info.views):
@@ -128,7 +131,7 @@ class DistillationRun:
                 got=config.views,
             )
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
-        contract.require(where=inputs["latents"], **found)
+        contract.require(where=store.root, **found)
         rows = training_rows(store, episodes, stage=2, tracks=tracks)
         contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
@@ -170,9 +173,9 @@ class DistillationRun:
         plan = batch_plan(settings.trainer, self._work(STEPS[0]))
         sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
         objective = TeacherForcingObjective(model.train(), self.config)
-        return self._train(
-            STEPS[0], settings.trainer, objective, lambda index: self.loader.load(sampler.clips(index)), info
-        )
+        micro_steps = settings.trainer.steps * plan.accumulation
+        with clip_batches(self.loader, sampler, self.config.input, self._work(STEPS[0]), micro_steps) as load:
+            return self._train(STEPS[0], settings.trainer, objective, load, info)
 
     def trajectory_regression(self) -> dict[str, float]:
         """Step 2, from step 1's model, on trajectories that this model makes."""
@@ -226,15 +229,19 @@ class DistillationRun:
             teacher.to(trainer.device).eval().requires_grad_(False)
             per_shard = min(settings.clips, settings.clips_per_shard)
             sampler = self._sampler(per_shard, settings.seed, self.config.clips, ALONE)
-            make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, sampler=sampler)
+            # Processes take shards in turn, so none is read ahead.
+            reading = self.config.input.model_copy(update={"workers": 0})
             facts = {
                 "teacher": teacher_info.weights_sha256,
                 "causal": self.config.spec.model_dump(mode="json"),
                 "precision": trainer.precision,
                 "clips": self.config.clips.model_dump(mode="json"),
                 **settings.model_dump(mode="json"),
+                **self.config.model_dump(mode="json", include={"input"}),
             }
-            write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
+            with clip_batches(self.loader, sampler, reading, folder, 0) as load:
+                make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, load=load)
+                write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if processes()[0] == 0:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
         wait_for_all()
@@ -248,6 +255,7 @@ class DistillationRun:
             seed=trainer.seed,
             plan=batch_plan(trainer, self._work(step)),
             generated_history=self.config.trajectory_regression.trajectories.history == "generated",
+            kept_latents=isinstance(self.config.input, FrameInput),
         )
         return loader.load
 
@@ -277,7 +285,13 @@ class DistillationRun:
             objective=objective,
             load=load,
             validate=validation_function(
-                self.loader, self.config.clips, self.config.validation_splits, trainer, self.rows, objective
+                self.loader,
+                self.config.clips,
+                self.config.validation_splits,
+                trainer,
+                self.rows,
+                objective,
+                self.config.input,
             ),
             output=work,
             identity={
@@ -309,6 +323,7 @@ class DistillationRun:
                     "tokenizer": self.store.description["tokenizer"],
                     "lpips": self.lpips,
                     "metrics": result.metrics,
+                    **input_facts(self.config.input, self.store, self._work(STEPS[0]), self._trajectory_folder),
                 },
                 state_dict=weights,
             )

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
-from worldline_core.training.clip_config import ClipSampling
+from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
 from worldline_core.training.training_config import LossWeighting, OptimizerConfig, SigmaSampling, TrainerConfig
 
 CYCLE = 6
@@ -133,8 +133,12 @@ class DistillConfig(StrictModel):
     """Stage III. What it trains, the model keeps: ``spec`` is saved with it and read by everything that rolls it out.
 
     ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
+    ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
+    are encoded when the teacher sees them; the trajectories keep the latents of their clips.
     """
 
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
     clips: ClipSampling = ClipSampling()
     splits: list[str] = Field(default=["train"], min_length=1)
     validation_splits: list[str] = Field(default=["validation"])

@@ -12,7 +12,7 @@ columns.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -27,8 +27,8 @@ from worldline_core.model.block_causal_attention import block_bounds
 from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import VelocityField, integrate
-from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler
+from worldline_core.training.clip_config import FrameInput
+from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.trainer import autocast, step_generator
 
@@ -128,11 +128,19 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
 
 
 def trajectory_shard(
-    number: int, config: DistillConfig, teacher: WorldModel, loader: ClipLoader, sampler: ClipSampler
-) -> tuple[Sequence[Clip], Float[Tensor, "b k v c u h w"], Float[Tensor, "b v t h w"]]:
-    """Clips, nodes and robot masks of one shard of the store: a function of the seed and the shard's number."""
+    number: int,
+    config: DistillConfig,
+    teacher: WorldModel,
+    loader: ClipLoader,
+    load: Callable[[int], Batch],
+) -> tuple[Sequence[Clip], dict[str, Tensor]]:
+    """Clips and tensors of one shard of the store: a function of the seed and the shard's number.
+
+    Args:
+        load: reads the shard's clips by its number.
+    """
     settings, trainer = config.trajectory_regression.trajectories, config.trajectory_regression.trainer
-    batch = loader.load(sampler.clips(number))
+    batch = load(number)
     generator = step_generator(settings.seed, number, trainer.device)
     noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
     with autocast(trainer):
@@ -147,4 +155,7 @@ def trajectory_shard(
             fps=batch.fps,
             generated_history=settings.history == "generated",
         )
-    return batch.clips, nodes, robot_masks(loader, batch.clips, batch.views)
+    tensors = {"nodes": nodes, "mask": robot_masks(loader, batch.clips, batch.views)}
+    if isinstance(config.input, FrameInput):
+        tensors["latents"] = batch.latents
+    return batch.clips, tensors

@@ -2,7 +2,8 @@
 
 Which clips and which noise a shard holds follows from the seed and the shard's number alone, so a shard that is missing
 is remade with the same bytes. Layout: `shard-00000.safetensors` ... (`nodes`, half precision, axes n k v c u h w;
-`mask`, bytes, axes n v t h w; the clips in the header) and `trajectories.json` (settings and the digest of every shard),
+`mask`, bytes, axes n v t h w; where clips are read as frames their `latents`, half precision, axes n v c t h w; the clips
+in the header) and `trajectories.json` (settings and the digest of every shard),
 written last.
 
 Axes: b clips (n in a shard), k nodes, v views, c latent channels, t latent frames, u = t - 1 without the observed one.
@@ -11,7 +12,7 @@ Axes: b clips (n in a shard), k nodes, v views, c latent channels, t latent fram
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,9 @@ from worldline_core.training.processes import BatchPlan, processes, wait_for_all
 
 INDEX = "trajectories.json"
 
-MakeShard = Callable[[int], tuple[Sequence[Clip], Tensor, Tensor]]
-"""Clips, their nodes (n k v c u h w) and robot masks (n v t h w) of a shard, by its number."""
+MakeShard = Callable[[int], tuple[Sequence[Clip], Mapping[str, Tensor]]]
+"""Clips of a shard by its number, and their ``nodes`` (n k v c u h w), robot ``mask`` (n v t h w) and perhaps ``latents``
+(n v c t h w)."""
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -69,10 +71,12 @@ def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dic
         for number in mine:
             path = shard_path(folder, number)
             if not path.is_file():
-                clips, nodes, mask = make(number)
+                clips, tensors = make(number)
                 header = {"clips": json.dumps([asdict(clip) for clip in clips])}
-                tensors = {"nodes": nodes.to("cpu", torch.float16), "mask": mask.to("cpu", torch.uint8)}
-                content = {name: value.contiguous() for name, value in tensors.items()}
+                content = {
+                    name: value.to("cpu", torch.uint8 if name == "mask" else torch.float16).contiguous()
+                    for name, value in tensors.items()
+                }
                 write_bytes_atomic(path, save(content, metadata=header))
             progress.advance()
     wait_for_all()
@@ -119,11 +123,18 @@ class TrajectoryStore:
         """The robot masks of some trajectories."""
         return self._read("mask", indices)
 
+    def latents(self, indices: Sequence[int]) -> Float[Tensor, "b v c t h w"]:
+        """The latents of some trajectories' clips, where they are kept, in single precision."""
+        return self._read("latents", indices)
+
     def _read(self, name: str, indices: Sequence[int]) -> Tensor:
         rows = []
         for index in indices:
             number, row, _ = self._clips[index]
-            with safe_open(shard_path(self.folder, number), framework="pt") as shard:
+            path = shard_path(self.folder, number)
+            with safe_open(path, framework="pt") as shard:
+                if name not in shard.keys():  # noqa: SIM118  (no mapping)
+                    raise ArtifactError("A shard of trajectories lacks a tensor", where=path, expected=name)
                 rows.append(shard.get_slice(name)[row : row + 1])
         values = torch.cat(rows).float()
         if not bool(torch.isfinite(values).all()):
@@ -176,6 +187,7 @@ class TrajectoryLoader:
 
     Args:
         generated_history: whether the teacher saw its own clean blocks before each block (else the recorded ones).
+        kept_latents: whether the clips' latents are with the trajectories.
     """
 
     def __init__(
@@ -187,6 +199,7 @@ class TrajectoryLoader:
         seed: int,
         plan: BatchPlan,
         generated_history: bool,
+        kept_latents: bool = False,
     ) -> None:
         self.store = store
         self.loader = loader
@@ -194,6 +207,7 @@ class TrajectoryLoader:
         self.seed = seed
         self.plan = plan
         self.generated_history = generated_history
+        self.kept_latents = kept_latents
         # A batch has one shape, so its clips have one length: a group is drawn by its size, then clips within it.
         lengths = [clip.num_frames for clip in store.clips(range(len(store)))]
         self._groups = [
@@ -208,7 +222,11 @@ class TrajectoryLoader:
         group = self._groups[int(random.choice(len(self._groups), p=self._shares))]
         draws = random.integers(len(group), size=self.batch_size * self.plan.together)
         rows = [group[int(draw)] for draw in draws[part * self.batch_size : (part + 1) * self.batch_size]]
-        batch = self.loader.load(ClipBatch(self.store.clips(rows), None))
+        clips = ClipBatch(self.store.clips(rows), None)
+        if self.kept_latents:
+            batch = self.loader.conditioned(clips, self.store.latents(rows).to(self.loader.device))
+        else:
+            batch = self.loader.load(clips)
         nodes = self.store.nodes(rows).to(self.loader.device)
         history = batch.latents
         if self.generated_history:

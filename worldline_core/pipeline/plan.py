@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import cast
 
 from worldline_core.config import StrictModel
+from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun, source_inputs
@@ -44,14 +45,11 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
     yield Node("curate", "curate", config.curate, source_inputs(config.curate, project))
     yield Node("filter", "filter", config.filter, {"episodes": "curate"})
     yield Node("render_actions", "render_actions", config.render_actions, {"episodes": "filter"})
-    yield Node(
-        "encode_latents",
-        "encode_latents",
-        config.encode_latents,
-        {"episodes": "filter", "tokenizer": models["tokenizer"]},
-    )
+    if _caches_latents(config):
+        encoded: dict[str, str | Path] = {"episodes": "filter", "tokenizer": models["tokenizer"]}
+        yield Node("encode_latents", "encode_latents", config.encode_latents, encoded)
 
-    def clips(stage: StageConfig) -> dict[str, str | Path]:
+    def clips(stage: StageConfig | DistillConfig) -> dict[str, str | Path]:
         """A stage's episodes, and what makes latents of their clips: the cache, or the tokenizer itself."""
         if isinstance(stage.input, FrameInput):
             return {"episodes": "filter", "tokenizer": models["tokenizer"]}
@@ -73,8 +71,7 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
         "distill",
         config.distill,
         {
-            "latents": "encode_latents",
-            "episodes": "filter",
+            **clips(config.distill),
             "tracks": "render_actions",
             "stage2": "train_stage2",
             "tokenizer": models["tokenizer"],
@@ -86,6 +83,12 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
     for name, run in config.rollouts.items():
         yield _rollout_node(name, run, models, project)
     yield from _evaluation_nodes(config, models, project)
+
+
+def _caches_latents(config: PipelineConfig) -> bool:
+    """Whether a step reads latents that were made before it."""
+    stages = (config.train_stage1, config.train_stage2, config.distill)
+    return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
 
 
 def _rollout_node(name: str, run: RolloutRun, models: Mapping[str, Path], project: Path) -> Node:
@@ -144,6 +147,7 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
         scores["evaluate_planning"] = "evaluate_planning"
     trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")
     left_out = {"train_stage1"} if config.train_stage1 is None else set[str]()
+    left_out |= set[str]() if _caches_latents(config) else {"encode_latents"}
     report: dict[str, str | Path] = {name: name for name in trained if name not in left_out}
     report |= {f"rollout.{name}": f"rollout.{name}" for name in config.rollouts}
     report |= {f"models.{name}": path for name, path in models.items()}

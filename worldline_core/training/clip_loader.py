@@ -231,15 +231,18 @@ class ClipLoader:
         Raises:
             ArtifactError: if the tracks lack an episode.
         """
-        clips, views = read.batch.clips, read.batch.slots(self.views)
-        latents = self.store.latents(read.data, self.device)
+        frames = read.data if read.data.dtype == torch.uint8 else None
+        return self.conditioned(read.batch, self.store.latents(read.data, self.device), frames)
+
+    def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
+        """Latents of a batch's clips, with the conditions that this loader adds; raises as `finish` does."""
+        clips, views = batch.clips, batch.slots(self.views)
         maps = None if self.tracks is None else self.action_maps(clips, views)
         ids = mask = None
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in clips]
             ids, mask = self.text([self.store.row(clip.episode_id).instruction for clip in clips], facts)
             ids, mask = ids.to(self.device), mask.to(self.device)
-        frames = read.data if read.data.dtype == torch.uint8 else None
         rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
         fps = None if rates is None else torch.tensor(rates, device=self.device)
         return Batch(clips, views, latents, maps, ids, mask, frames, fps)

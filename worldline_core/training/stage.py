@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.clip_config import JOINT, ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader, ClipReader, SkipLog
 from worldline_core.training.clip_prefetcher import ClipPrefetcher
 from worldline_core.training.clip_sampler import ClipSampler
@@ -81,7 +81,7 @@ class Stage:
         model, parent = load_model()
         place_model(model, config.trainer.sharding, precision=config.trainer.precision, device=device).train()
         episodes = EpisodeSet.open(Path(inputs["episodes"]))
-        source = _open_source(config, inputs, episodes, model.config.views)
+        source = open_source(config.input, config.clips, inputs, episodes, model.config.views, device)
         needed = config.clips.needed_views(model.config.views)
         views = None if needed == model.config.views else needed
         rows = training_rows(source, episodes, stage=number, tracks=tracks, outcomes=config.outcomes, views=views)
@@ -134,24 +134,8 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config, trainer = self.config, self.config.trainer
-        skips = SkipLog(self.output / "run", processes()[0], config.input.max_skipped)
-        here = ClipReader(self.source, self.sampler, loader.views, config.input)
-        reading = nullcontext(here)
-        if config.input.workers:
-            reading = ClipPrefetcher(
-                here,
-                workers=config.input.workers,
-                prefetch=config.input.prefetch,
-                stop=trainer.steps * self.plan.accumulation,
-                pinned=torch.device(trainer.device).type == "cuda",
-            )
-        with reading as reader:
-
-            def load(index: int) -> Batch:
-                read = reader.read(index)
-                skips.add(read.skipped)
-                return loader.finish(read)
-
+        micro_steps = trainer.steps * self.plan.accumulation
+        with clip_batches(loader, self.sampler, config.input, self.output / "run", micro_steps) as load:
             return train(
                 trainer,
                 groups=groups,
@@ -208,16 +192,46 @@ class Stage:
 
     def _input_facts(self) -> dict[str, Any]:
         """How clips were read, for the checkpoint; nothing where they were cached latents in the default order."""
-        facts: dict[str, Any] = {}
-        source, trainer = self.config.input, self.config.trainer
-        micro_steps = trainer.steps * self.plan.accumulation
-        if isinstance(source, FrameInput):
-            facts["input"] = {"kind": source.kind, "decoder": self.source.description["decoder"]}
-        if self.config.clips.order == "epochs":
-            facts["epochs"] = self.sampler.epochs(micro_steps)
-        if source.on_unreadable == "skip":
-            facts["skipped_clips"] = SkipLog.count(self.output / "run")
-        return facts
+        micro_steps = self.config.trainer.steps * self.plan.accumulation
+        epochs = {"epochs": self.sampler.epochs(micro_steps)} if self.config.clips.order == "epochs" else {}
+        return epochs | input_facts(self.config.input, self.source, self.output / "run")
+
+
+def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:
+    """How clips were read, and how many were skipped by what is written in the folders ``runs``."""
+    facts: dict[str, Any] = {}
+    if isinstance(reading, FrameInput):
+        facts["input"] = {"kind": reading.kind, "decoder": source.description["decoder"]}
+    if reading.on_unreadable == "skip":
+        facts["skipped_clips"] = sum(SkipLog.count(run) for run in runs)
+    return facts
+
+
+@contextmanager
+def clip_batches(
+    loader: ClipLoader, sampler: ClipSampler, reading: ReadingConfig, run: Path, micro_steps: int
+) -> Iterator[Callable[[int], Batch]]:
+    """Gives a function that reads the batch of a micro-step, in this process or ahead of it in others.
+
+    Args:
+        run: folder in which skipped clips are counted.
+    """
+    skips = SkipLog(run, processes()[0], reading.max_skipped)
+    here = ClipReader(loader.store, sampler, loader.views, reading)
+    reader_of = nullcontext(here)
+    if reading.workers:
+        pinned = torch.device(loader.device).type == "cuda"
+        reader_of = ClipPrefetcher(
+            here, workers=reading.workers, prefetch=reading.prefetch, stop=micro_steps, pinned=pinned
+        )
+    with reader_of as reader:
+
+        def load(index: int) -> Batch:
+            read = reader.read(index)
+            skips.add(read.skipped)
+            return loader.finish(read)
+
+        yield load
 
 
 class ValidatedObjective(Protocol):
@@ -266,25 +280,35 @@ def validation_function(
     return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
 
 
-def _open_source(
-    config: StageConfig, inputs: Mapping[str, Path], episodes: EpisodeSet, views: tuple[str, ...]
+def open_source(
+    reading: ClipInput,
+    clips: ClipSampling,
+    inputs: Mapping[str, Path],
+    episodes: EpisodeSet,
+    views: Sequence[str],
+    device: str,
 ) -> ClipSource:
-    needed = "tokenizer" if isinstance(config.input, FrameInput) else "latents"
+    """Cached ``latents``, or frames that ``tokenizer`` encodes on the way.
+
+    Raises:
+        ConfigError: the input that the clips come from is not given.
+    """
+    needed = "tokenizer" if isinstance(reading, FrameInput) else "latents"
     if needed not in inputs:
         raise ConfigError(
-            f"Clips from {config.input.kind} need the input {needed}.",
+            f"Clips from {reading.kind} need the input {needed}.",
             where="input.kind",
             expected=f"an input named {needed}",
             got=", ".join(sorted(inputs)),
             next_step=f"give --input {needed}=FOLDER, or choose the other kind of input",
         )
-    if not isinstance(config.input, FrameInput):
+    if not isinstance(reading, FrameInput):
         return LatentStore.open(Path(inputs["latents"]))
     return FrameSource.open(
         episodes,
         Path(inputs["tokenizer"]),
-        config.input,
-        views=config.clips.needed_views(views),
-        primary_alone=set(config.clips.view_weights or {}) == {PRIMARY},
-        device=config.trainer.device,
+        reading,
+        views=clips.needed_views(views),
+        primary_alone=set(clips.view_weights or {}) == {PRIMARY},
+        device=device,
     )
