@@ -54,6 +54,7 @@ from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows,
 from worldline_core.training.processes import ALONE, BatchPlan, join_processes, processes, wait_for_all
 from worldline_core.training.sharding import gathered, place_model
 from worldline_core.training.stage import clip_batches, input_facts, open_source, validation_function
+from worldline_core.training.stage_cost import latent_grid
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
 
@@ -68,17 +69,16 @@ LPIPS_OFF = "off: no LPIPS weights configured"
 def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Distill `stage2` on `tracks` and `episodes`; `tokenizer` decodes frames for the perceptual term.
 
-    Clips are cached `latents`, or frames that `tokenizer` encodes on the way (once for a step of teacher forcing; the
-    trajectories keep theirs).
+    Clips are cached `latents`, or frames that `tokenizer` encodes on the way (the trajectories keep their latents).
 
     Raises:
         CheckpointError: the checkpoint is not of Stage II, or its action maps and latents are not those given here.
         DataError: no clip fits the blocks.
         TrainingError: a loss or gradient is not finite.
     """
-    grid = LatentStore.open(Path(inputs["latents"])).latent_shape[1:]
-    model = read_checkpoint_info(Path(inputs["stage2"])).config.model_copy(update={"towers": "generation"})
-    DistillEstimates(config, model, grid, Path(inputs["tokenizer"])).require_fit()
+    if (grid := latent_grid(config.input, inputs)) is not None:
+        model = read_checkpoint_info(Path(inputs["stage2"])).config.model_copy(update={"towers": "generation"})
+        DistillEstimates(config, model, grid, Path(inputs["tokenizer"])).require_fit()
     torch.manual_seed(config.teacher_forcing.trainer.seed)
     run = DistillationRun.open(config, inputs, output)
     metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}
@@ -135,15 +135,10 @@ class DistillationRun:
         rows = training_rows(store, episodes, stage=2, tracks=tracks)
         contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
-            store,
-            views=tuple(config.views),
-            tracks=tracks,
-            wrist_projection=contract.wrist_projection,
-            action_frames=info.config.action_frames,
-            frame_rates={row.episode_id: row.fps for row in episodes.rows},
-            native_size=native,
-            device=device,
-        )
+            store, views=tuple(config.views), tracks=tracks, wrist_projection=contract.wrist_projection,
+            action_frames=info.config.action_frames, frame_rates={row.episode_id: row.fps for row in episodes.rows},
+            native_size=native, device=device,
+        )  # fmt: skip
         return cls(
             config=config,
             stage2=Path(inputs["stage2"]),

@@ -24,9 +24,9 @@ from worldline_core.model.step_cost import StepCost, cost_at_depth, cost_of, in_
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.training.clip_config import ClipSampling
+from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_source import latent_frame_count
-from worldline_core.training.stage_cost import frozen_bytes, parameter_counts, trained_cost
+from worldline_core.training.stage_cost import encoding_cost, frozen_bytes, parameter_counts, trained_cost
 from worldline_core.training.stage_memory import (
     USABLE,
     ClipShape,
@@ -118,7 +118,13 @@ class DistillEstimates:
 
                 return cost_of(make)
 
-        return 4 * parameter_counts(self.model)[0], cost_at_depth(trace, self.model.num_layers)
+        encoder, encoding = self._encoding(shape)
+        made = cost_at_depth(trace, self.model.num_layers)
+        return 4 * parameter_counts(self.model)[0] + encoder, made if encoding is None else encoding.then(made)
+
+    def _encoding(self, shape: ClipShape) -> tuple[int, StepCost | None]:
+        """Bytes of what encodes clips on the way, and its cost; none where latents are cached."""
+        return encoding_cost(self.tokenizer, shape) if isinstance(self.config.input, FrameInput) else (0, None)
 
     def _teacher_forcing(self, spread: Spread) -> StageMemory:
         settings = self.config.teacher_forcing
@@ -190,7 +196,14 @@ class DistillEstimates:
                     products=cost.products + decoding.products,
                 )
         counts = parameter_counts(self.model)
-        return StageMemory(title, trainer, spread, shape, shape.tokens(self.model), *counts, cost, frozen)
+        encoder, encoding = self._encoding(shape)
+        if encoding is not None:
+            frozen["encoder"] = encoder
+        # Trajectories keep the latents of their clips.
+        before = encoding if encoding is not None and title == TEACHER_FORCING else StepCost()
+        return StageMemory(
+            title, trainer, spread, shape, shape.tokens(self.model), *counts, cost, frozen, before=before
+        )
 
     def _shape(self, trainer: TrainerConfig, spread: Spread, clips: ClipSampling | None = None) -> ClipShape:
         return largest_clips(

@@ -45,7 +45,7 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
     yield Node("curate", "curate", config.curate, source_inputs(config.curate, project))
     yield Node("filter", "filter", config.filter, {"episodes": "curate"})
     yield Node("render_actions", "render_actions", config.render_actions, {"episodes": "filter"})
-    if _caches_latents(config):
+    if caches_latents(config):
         encoded: dict[str, str | Path] = {"episodes": "filter", "tokenizer": models["tokenizer"]}
         yield Node("encode_latents", "encode_latents", config.encode_latents, encoded)
 
@@ -85,7 +85,7 @@ def _nodes(config: PipelineConfig, project: Path) -> Iterator[Node]:
     yield from _evaluation_nodes(config, models, project)
 
 
-def _caches_latents(config: PipelineConfig) -> bool:
+def caches_latents(config: PipelineConfig) -> bool:
     """Whether a step reads latents that were made before it."""
     stages = (config.train_stage1, config.train_stage2, config.distill)
     return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
@@ -147,7 +147,7 @@ def _evaluation_nodes(config: PipelineConfig, models: Mapping[str, Path], projec
         scores["evaluate_planning"] = "evaluate_planning"
     trained = ("curate", "filter", "render_actions", "encode_latents", "train_stage1", "train_stage2", "distill")
     left_out = {"train_stage1"} if config.train_stage1 is None else set[str]()
-    left_out |= set[str]() if _caches_latents(config) else {"encode_latents"}
+    left_out |= set[str]() if caches_latents(config) else {"encode_latents"}
     report: dict[str, str | Path] = {name: name for name in trained if name not in left_out}
     report |= {f"rollout.{name}": f"rollout.{name}" for name in config.rollouts}
     report |= {f"models.{name}": path for name, path in models.items()}

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
+from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distill_memory import DistillEstimates
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import DESCRIPTION, read_checkpoint_info
@@ -23,6 +24,7 @@ from worldline_core.model.step_cost import Card, StepCost, without_values
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model_config import WorldModelConfig, cosmos3_nano_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.pipeline.plan import caches_latents
 from worldline_core.pipeline.rollout_cost import decoding_cost, rollout_cost
 from worldline_core.pipeline.sheet import Machine, Row
 from worldline_core.rollout.rollout_config import RolloutConfig
@@ -80,7 +82,8 @@ class Planner:
     def rows(self) -> Iterator[Row]:
         """The stages, in the order of a run."""
         size = self.config.encode_latents.image_size
-        yield self._encoding(size)
+        if caches_latents(self.config):
+            yield self._encoding(size)
         for name, (estimate, trainer, clips) in self.trainings().items():
             if name == "trajectory_regression":
                 yield self._trajectories()
@@ -110,10 +113,10 @@ class Planner:
 
     @property
     def _distillation(self) -> DistillEstimates:
-        grid = self.grid(self.config.encode_latents.image_size)
+        grid = self._stage_grid(self.config.distill)
         return DistillEstimates(self.config.distill, self.generation, grid, self.folder("tokenizer"))
 
-    def _stage_grid(self, stage: StageConfig) -> tuple[int, int]:
+    def _stage_grid(self, stage: StageConfig | DistillConfig) -> tuple[int, int]:
         size = self.config.encode_latents.image_size
         return self.grid(stage.input.image_size if isinstance(stage.input, FrameInput) else size)
 
@@ -172,7 +175,8 @@ class Planner:
         shards = -(-self.config.distill.trajectory_regression.trajectories.clips // shape.clips)
         latents = (latent_frame_count(shape.frames) - 1) * shape.grid[0] * shape.grid[1] * self.model.latent_channels
         nodes = shape.clips * (self.config.distill.spec.steps + 1) * len(shape.views) * latents
-        facts = {"clips of a shard": shape.clips, "bytes stored": 2 * nodes * shards}
+        kept = shape.clips * len(shape.views) * latents if isinstance(self.config.distill.input, FrameInput) else 0
+        facts = {"clips of a shard": shape.clips, "bytes stored": 2 * (nodes + kept) * shards}
         row = self._row(
             f"distill: trajectories (a shard of {shape.clips} clips)", weights // 4,
             {"weights": weights, "activations": cost.activations}, cost, facts, "fewer clips_per_shard",

@@ -15,7 +15,7 @@ from worldline_core.model.step_cost import StepCost, cost_at_depth, cost_of, in_
 from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.training.clip_config import FrameInput
+from worldline_core.training.clip_config import ClipInput, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.latent_store import LatentStore
@@ -176,20 +176,24 @@ def require_stage_fits(
     Raises:
         ConfigError: the sheet's line, and the setting that would fit.
     """
-    if isinstance(config.input, FrameInput):
-        if "tokenizer" not in inputs:
-            return  # `Stage.open` says so
-        with without_values():
-            space = tokenizer_outline(Path(inputs["tokenizer"])).spatial_compression
-        grid = (config.input.image_size[0] // space, config.input.image_size[1] // space)
-    elif "latents" in inputs:
-        grid = LatentStore.open(Path(inputs["latents"])).latent_shape[1:]
-    else:
-        return
+    grid = latent_grid(config.input, inputs)
+    if grid is None:
+        return  # `Stage.open` says so
     folders = {name: Path(inputs[name]) for name in ("tokenizer", "teacher") if name in inputs}
     estimate = flow_matching_estimate(title, config, model, grid, **folders, **more)
     shape = largest_clips(config.clips, config.trainer.batch_size, model.views, grid)
     require_fit(estimate, config.trainer, config.clips.lengths, rough_bytes(model, shape))
+
+
+def latent_grid(reading: ClipInput, inputs: Mapping[str, Path]) -> tuple[int, int] | None:
+    """Rows and columns of the latents that a training reads; None where the input that they come from is not given."""
+    if isinstance(reading, FrameInput) and "tokenizer" in inputs:
+        with without_values():
+            space = tokenizer_outline(Path(inputs["tokenizer"])).spatial_compression
+        return reading.image_size[0] // space, reading.image_size[1] // space
+    if not isinstance(reading, FrameInput) and "latents" in inputs:
+        return LatentStore.open(Path(inputs["latents"])).latent_shape[1:]
+    return None
 
 
 class _OutlinedRelations(RelationalTerm):
