@@ -92,6 +92,20 @@ def test_small_presets_train_on_8_gb_without_a_closer_look(preset: str, monkeypa
 
 
 @pytest.mark.slow
+def test_distillation_from_frames_holds_what_encodes_them() -> None:
+    frames = "distill.input={kind: frames, image_size: [64, 96]}"
+    sheets = []
+    for overrides in ([], [frames]):
+        config = load_config(PipelineConfig, preset="smoke", overrides=overrides)
+        planner = Planner(config, PROJECT, Machine.of(1, "16GB", "H100", 0.4))
+        trainings = planner.trainings()
+        sheets.append([trainings[name][0](Spread()) for name in ("teacher_forcing", "trajectory_regression")])
+    for cached, online in zip(*sheets, strict=True):
+        assert online.total >= cached.total + online.frozen["encoder"] > cached.total
+    assert [online.before.activations > 0 for online in sheets[1]] == [True, False]
+
+
+@pytest.mark.slow
 def test_the_check_before_training_lets_through_what_fits_by_a_hair(monkeypatch: pytest.MonkeyPatch) -> None:
     planner = Planner(load_config(PipelineConfig, preset="smoke"), PROJECT, Machine.of(1, "16GB", "H100", 0.4))
     estimate, trainer, clips = planner.trainings()["train_stage2"]
