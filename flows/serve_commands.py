@@ -1,4 +1,4 @@
-"""The verb that puts the simulator on a socket: `worldline serve`."""
+"""The verbs that put the simulator on a socket: `worldline serve`, and `worldline play` with its page."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ def add_serve_commands(commands: argparse._SubParsersAction[argparse.ArgumentPar
     """Add them to the command line's parser."""
     texts = {
         "serve": "offer the simulator over a websocket and HTTP (extra: serve)",
+        "play": "drive the simulator by hand: serve, and say where its page is (extra: serve)",
     }
     for name, text in texts.items():
         parser = commands.add_parser(name, help=text)
@@ -52,6 +53,8 @@ def serve_command(arguments: argparse.Namespace) -> None:
     server = make_server(world, config, token)
     host = f"[{config.host}]" if ":" in config.host else config.host
     print(f"{config.model} at ws://{host}:{config.port}/v1", flush=True)
+    hint = "" if token is None else "#token=..., with the token of WORLDLINE_TOKEN"
+    print(f"drive it by hand at http://{host}:{config.port}/play{hint}", flush=True)
     server.run()
     if not server.started:
         raise UnavailableError(

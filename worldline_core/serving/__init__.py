@@ -1,1 +1,1 @@
-"""The simulator as a server (`worldline serve`), and its Python client."""
+"""The simulator as a server (`worldline serve`), its Python client, and the page to drive it by hand (`worldline play`)."""

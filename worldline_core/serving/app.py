@@ -1,4 +1,4 @@
-"""The server's addresses: ``/healthz`` and ``/v1`` (requests over a websocket or HTTP).
+"""The server's addresses: ``/healthz``, ``/v1`` (requests over a websocket or HTTP), and ``/play``, the page to drive it by hand.
 
 Over the websocket the server first sends its metadata; then each request is one message and has one reply. The next request
 is read when the reply was taken, so a client cannot pile up work.
@@ -15,15 +15,17 @@ from contextlib import asynccontextmanager, suppress
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.pages.page import render
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.gate import Gate
+from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
 from worldline_core.serving.session_host import SessionHost, error_message
 
@@ -96,6 +98,27 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
                 return
             await send_in_time(websocket, pack(await host.handle(websocket, message)))
 
+    async def page(_: Request) -> Response:
+        return HTMLResponse(render("serving/play.html", title="Play", subtitle="", script="serving/play.js"))
+
+    async def played(websocket: WebSocket) -> None:
+        async def send(content: str | bytes) -> None:
+            async with asyncio.timeout(TAKE_S):
+                await (websocket.send_text(content) if isinstance(content, str) else websocket.send_bytes(content))
+
+        session = PlaySession(host, send)
+        try:
+            await session.greet()
+            while True:
+                async with asyncio.timeout(config.idle_s):
+                    text = await websocket.receive_text()
+                await session.receive(text)
+        finally:
+            await session.close()
+
+    async def play(websocket: WebSocket) -> None:
+        await connected(websocket, played)
+
     async def api(websocket: WebSocket) -> None:
         await connected(websocket, messages)
 
@@ -111,6 +134,8 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
         Route("/v1", metadata, methods=["GET"]),
         Route("/v1", request, methods=["POST"]),
         WebSocketRoute("/v1", api),
+        Route("/play", page),
+        WebSocketRoute("/play/session", play),
     ]
     return Gate(Starlette(routes=routes, lifespan=lifespan), config, token)
 
@@ -141,8 +166,10 @@ def server_token(config: ServeConfig) -> str | None:
 
 def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvicorn.Server:
     """A server that ``run()`` starts; its limits and timeouts are those of the configuration."""
+    host = SessionHost(world, config)
+    host.warm_up()
     settings = uvicorn.Config(
-        make_app(SessionHost(world, config), token), config.host, config.port, ws="websockets-sansio",
+        make_app(host, token), config.host, config.port, ws="websockets-sansio",
         ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
         timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
     )  # fmt: skip

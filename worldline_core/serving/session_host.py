@@ -106,6 +106,11 @@ class SessionHost:
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simulator")
         self._waiting = 0
 
+    def warm_up(self) -> None:
+        """Begin one simulation, so that the first client does not wait for what is imported and built once."""
+        for row in self.starts.listed()[:1]:
+            self.starts.simulate(self.starts.read(row["id"]), [0])
+
     def metadata(self) -> dict[str, Any]:
         """What a client needs to know."""
         world = self.world

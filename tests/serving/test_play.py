@@ -1,0 +1,228 @@
+"""`worldline play`: the page in a headless browser, and its protocol without one."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from tests.policies.test_openpi import policy_server
+from worldline_core import WorldLine
+from worldline_core.data.episodes.episode_set import EpisodeSet
+
+EPISODE = "ur5e_silver-test-s1-00000"
+
+
+class Page:
+    """A page of a browser, over the DevTools protocol."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection, self._count = connection, 0
+        self.messages: list[str] = []
+        self.call("Runtime.enable")
+        self.call("Log.enable")
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        self._count += 1
+        self._connection.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
+        while True:
+            reply = json.loads(self._connection.recv(timeout=60))
+            if reply.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.messages.append(json.dumps(reply["params"]))
+            if reply.get("id") == self._count:
+                assert "error" not in reply, reply
+                return reply["result"]
+
+    def value(self, expression: str) -> Any:
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def until(self, expression: str, seconds: float = 60) -> Any:
+        deadline = time.monotonic() + seconds
+        while not (found := self.value(expression)):
+            assert time.monotonic() < deadline, (expression, self.value("document.getElementById('said').textContent"))
+            time.sleep(0.05)
+        return found
+
+    def key(self, kind: str, key: str) -> None:
+        self.call("Input.dispatchKeyEvent", type=kind, key=key)
+
+    def screenshot(self, path: Path) -> None:
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+
+
+@contextmanager
+def browser(folder: Path, url: str) -> Iterator[Page]:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium is here (apt-get install chromium)")
+    folder.mkdir()
+    options = [
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-timer-throttling",
+        "--remote-debugging-port=0",
+        "--window-size=1280,900",
+    ]
+    with (folder / "chromium.log").open("w") as log:
+        process = subprocess.Popen(
+            [chromium, *options, f"--user-data-dir={folder}", "about:blank"], stdout=log, stderr=log
+        )
+    try:
+        told = folder / "DevToolsActivePort"
+        deadline = time.monotonic() + 60
+        while not (told.is_file() and len(told.read_text().splitlines()) == 2):
+            assert time.monotonic() < deadline and process.poll() is None, (folder / "chromium.log").read_text()
+            time.sleep(0.05)
+        port = told.read_text().splitlines()[0]
+        target = httpx.put(f"http://127.0.0.1:{port}/json/new?{url}", trust_env=False, timeout=60).json()
+        with connect(target["webSocketDebuggerUrl"], max_size=None, proxy=None, compression=None) as connection:
+            yield Page(connection)
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+@pytest.mark.slow
+def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, shipped: Path, tmp_path: Path) -> None:
+    world = WorldLine.from_pretrained(shipped / "models" / "causal")
+    with serving(world=world, output=tmp_path / "saved") as url:
+        address = f"{url.replace('ws', 'http')}/play?episode={EPISODE}"
+        with browser(tmp_path / "profile", address) as page:
+            page.until("document.querySelectorAll('#episode option').length > 3")
+            page.value("document.getElementById('start').click()")
+            page.until("window.play.node === 0 && window.play.position !== null")
+            assert page.value("document.querySelectorAll('#views canvas').length") == 3
+            begin = np.array(page.value("window.play.position"))
+            target = begin[1] + (0.0, 0.0, 0.08)  # the right arm, 8 cm up
+            page.key("keyDown", "e")
+            page.until(f"window.play.position[1][2] > {target[2] - 0.005}")
+            page.key("keyUp", "e")
+            page.until("window.play.blocks >= 1")
+            page.until("window.play.shown >= 8")
+            page.screenshot(tmp_path / "driving.png")
+            there = np.array(page.value("window.play.position"))
+            assert abs(there[1, 2] - target[2]) < 0.05
+            assert np.abs(there[0] - begin[0]).max() < 1e-3  # the other arm was left alone
+            page.value("document.querySelector('[data-save=episodes]').click()")
+            saved = page.until("window.play.saved")
+            page.value("document.getElementById('back').click()")
+            page.screenshot(tmp_path / "saved.png")
+            latency = page.value("window.play.latency")
+            assert len(latency) >= 1
+            assert page.messages == []
+    episodes = EpisodeSet.open(Path(saved["paths"][0]))
+    episode = episodes.episode(0)
+    assert episode.num_frames == saved["frames"] >= 17
+    assert episodes.frames(0, "head").shape == (saved["frames"], 64, 96, 3)
+    assert set(episode.cameras) == {"head", "left_wrist", "right_wrist"}
+    assert episode.conventions["driven_by"] == "by hand"
+
+
+class Driver:
+    """The page's side of the protocol."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self.marks: dict[str, Any] = {}
+
+    def tell(self, **message: object) -> None:
+        self.connection.send(json.dumps(message))
+
+    def until(self, kind: str) -> dict[str, Any]:
+        while True:
+            found = self.connection.recv(timeout=30)
+            if isinstance(found, bytes):
+                length = int.from_bytes(found[:4], "little")
+                message = json.loads(found[4 : 4 + length])
+                assert 4 + length + sum(message["sizes"]) == len(found)
+                assert found[4 + length : 6 + length] == b"\xff\xd8"  # JPEG
+            else:
+                message = json.loads(found)
+            if message["type"] == "marks":
+                self.marks = message
+            if message["type"] == kind:
+                return message
+            assert message["type"] != "error", message
+
+    def until_error(self) -> dict[str, Any]:
+        while True:
+            found = self.connection.recv(timeout=30)
+            if isinstance(found, str) and (message := json.loads(found))["type"] == "error":
+                return message
+
+    def block(self, **wish: object) -> dict[str, Any]:
+        for _ in range(4):
+            self.tell(type="tick", arms=[{}, wish])
+        return self.until("block")
+
+
+def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def act(observation: dict[str, Any]) -> dict[str, Any]:
+        asked.append(observation)
+        return {"actions": np.repeat(observation["state"][None], 5, axis=0)[:, : 14 if len(asked) < 2 else 3]}
+
+    with policy_server(act) as policy:
+        settings = {"url": policy, "state_key": "state"}
+        with serving(output=tmp_path, policies={"mine": settings}, max_blocks=4) as url:
+            assert "Play" in httpx.get(url.replace("ws", "http") + "/play").text
+            with connect(url + "/play/session", proxy=None, max_size=None) as connection:
+                page = Driver(connection)
+                assert page.until("hello")["policies"] == ["mine"]
+                page.tell(type="tick", arms=[])
+                assert "Nothing is being played" in page.until_error()["what"]
+                page.tell(type="start", episode=EPISODE, seed=1)
+                assert page.until("started")["frames_per_step"] == 4
+                assert page.until("block")["node"] == 0
+                page.until("marks")
+                before = np.array(page.marks["position"])
+                first = page.block(move=[0, 0, 1])
+                assert (first["node"], first["parent"], first["frames"]) == (1, 0, 4)
+                after = np.array(page.marks["position"])
+                assert np.allclose(after[1] - before[1], (0, 0, 0.1), atol=2e-3)  # 0.2 m/s for half a second
+                assert page.block(grip=-1)["parent"] == 1
+                page.tell(type="go", node=1)
+                page.until("marks")
+                assert np.allclose(page.marks["position"], after)
+                assert page.block(move=[1, 0, 0])["parent"] == 1  # a branch
+                page.tell(type="go", node=0)
+                page.tell(type="advance", policy="mine")
+                by_policy = page.until("block")
+                assert (by_policy["driver"], by_policy["parent"]) == ("mine", 0)
+                assert asked[0]["observation.images.head"].shape == (64, 96, 3)
+                assert asked[0]["prompt"]
+                page.tell(type="go", node=3)
+                page.tell(type="save", formats=["episodes", "mcap", "rrd"])
+                saved = page.until("saved")
+                page.tell(type="go", node=0)
+                page.tell(type="advance", policy="mine")
+                assert "do not fit the robot" in page.until_error()["what"]
+                for number, wrong in enumerate(
+                    ({"type": "eval"}, {"type": "go", "node": 9}, {"type": "tick", "arms": [{}]})
+                ):
+                    page.tell(**wrong)
+                    assert page.until_error()["what"], number
+                page.tell(type="save", formats=["episodes"])
+                assert "nothing to save" in page.until_error()["what"]
+    folder, *others = map(Path, saved["paths"])
+    assert [path.suffix for path in others] == [".mcap", ".rrd"]
+    episodes = EpisodeSet.open(folder)
+    episode = episodes.episode(0)
+    assert len(episode.state) == len(episode.action) == saved["frames"] == 9
+    assert episodes.frames(0, "right_wrist").shape == (9, 64, 96, 3)
+    assert episode.cameras["right_wrist"].moving
+    assert not episode.cameras["head"].moving
+    assert episode.conventions["started_at"] == EPISODE

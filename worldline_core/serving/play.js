@@ -1,0 +1,240 @@
+"use strict";
+const $ = (id) => document.getElementById(id);
+const colours = { left: "#ff9d4d", right: "#6ea6ff" };
+const play = { blocks: 0, node: null, marks: null, position: null, saved: null, latency: [], shown: 0, error: null };
+window.play = play;  // what tests and the curious read
+let hello = null, started = null, running = false, behind = false, asked = false, arm = 0, goal = null;
+let nodes = new Map(), queue = [], showing = null, ticks = 0, due = [], begun = 0, seen = [];
+const keys = new Set();
+const token = new URLSearchParams(location.hash.slice(1)).get("token");
+const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/play/session${token ? `?token=${encodeURIComponent(token)}` : ""}`);
+socket.binaryType = "arraybuffer";
+const tell = (message) => socket.readyState === 1 && socket.send(JSON.stringify(message));
+const say = (text, bad) => { $("said").textContent = text; $("said").className = bad ? "bad" : "muted"; };
+socket.addEventListener("close", (event) => { run(false); say(`Disconnected${event.reason ? `: ${event.reason}` : ""}. Load the page again; a server with a token wants …/play#token=TOKEN.`, true); });
+
+const bool = (on) => (on ? 1 : 0);
+const down = (more, less) => bool(keys.has(more)) - bool(keys.has(less));
+const dead = (value) => (Math.abs(value || 0) < 0.15 ? 0 : value);
+const limit = (value) => Math.max(-1, Math.min(1, value));
+function wish() {
+  const move = [down("d", "a"), down("w", "s"), down("e", "q")], turn = [down("k", "i"), down("o", "u"), down("j", "l")];
+  let grip = down("x", "z");
+  const pad = [...navigator.getGamepads()].find((found) => found && found.mapping === "standard");
+  if (pad) {
+    const [x, y, yaw, lift] = pad.axes.map(dead);
+    move[0] += x; move[1] -= y; move[2] -= lift; turn[2] -= yaw;
+    grip += pad.buttons[7].value - pad.buttons[6].value;
+  }
+  return { move: move.map(limit), turn: turn.map(limit), grip: limit(grip), goal };
+}
+let held = false;
+function padButtons() {
+  const pad = [...navigator.getGamepads()].find((found) => found && found.mapping === "standard");
+  const pressed = pad && (pad.buttons[4].pressed || pad.buttons[5].pressed || pad.buttons[9].pressed);
+  if (pressed && !held) pad.buttons[9].pressed ? run(!running) : choose(arm + 1);
+  held = Boolean(pressed);
+}
+function choose(index) { arm = (index + started.arms.length) % started.arms.length; $("arm").value = arm; }
+function run(on) { running = Boolean(on && started); $("run").setAttribute("aria-pressed", running); $("run").textContent = running ? "Pause" : "Run"; }
+
+// One frame: show the next picture, and send what is wished for the next command.
+function frame() {
+  if (!started) return;
+  padButtons();
+  if (queue.length) {
+    showing = queue.shift();
+    play.shown += 1;
+    seen.push(performance.now());
+    seen = seen.filter((time) => time > performance.now() - 3000);
+    if (seen.length > 3) $("rate").textContent = `${(1000 * (seen.length - 1) / (seen.at(-1) - seen[0])).toFixed(1)} frames/s of ${started.views.length} views`;
+  }
+  const policy = $("driver").value;
+  if (running && policy) {
+    if (!asked && queue.length <= started.frames_per_step / 2) { asked = true; due.push(performance.now()); tell({ type: "advance", policy }); }
+  } else if (running && !behind) {
+    tell({ type: "tick", arms: started.arms.map((_, index) => (index === arm ? wish() : {})) });
+    ticks += 1;
+    if (ticks % started.frames_per_step === 0) due.push(performance.now());
+  }
+  draw();
+}
+
+function draw() {
+  for (const canvas of document.querySelectorAll("#views canvas")) {
+    const view = canvas.dataset.view, pen = canvas.getContext("2d");
+    if (showing) {
+      const picture = showing.pictures[view];
+      const scale = Math.max(1, Math.round(960 / picture.width));
+      if (canvas.width !== picture.width * scale) { canvas.width = picture.width * scale; canvas.height = picture.height * scale; }
+      pen.imageSmoothingQuality = "high";
+      pen.drawImage(picture, 0, 0, canvas.width, canvas.height);
+      (showing.marks[view] || []).forEach((mark, index) => ring(pen, canvas, mark, index));
+    }
+    if (play.marks) (play.marks[view] || []).forEach((mark, index) => cross(pen, canvas, mark, index));
+  }
+}
+const colour = (index) => colours[started.arms[index]] || "#4fc793";
+function ring(pen, canvas, mark, index) {
+  if (!mark) return;
+  const [x, y] = [mark.at[0] * canvas.width, mark.at[1] * canvas.height];
+  pen.lineWidth = canvas.width / 240;
+  pen.strokeStyle = colour(index);
+  pen.beginPath(); pen.arc(x, y, canvas.width * (0.008 + 0.012 * mark.open), 0, 7); pen.stroke();
+  if (mark.tip) { pen.beginPath(); pen.moveTo(x, y); pen.lineTo(mark.tip[0] * canvas.width, mark.tip[1] * canvas.height); pen.stroke(); }
+}
+function cross(pen, canvas, mark, index) {
+  if (!mark) return;
+  const [x, y, r] = [mark.at[0] * canvas.width, mark.at[1] * canvas.height, canvas.width * (index === arm ? 0.022 : 0.012)];
+  for (const [style, width] of [["#14161a", canvas.width / 120], [colour(index), canvas.width / 260]]) {
+    pen.strokeStyle = style; pen.lineWidth = width;
+    pen.beginPath(); pen.moveTo(x - r, y); pen.lineTo(x + r, y); pen.moveTo(x, y - r); pen.lineTo(x, y + r); pen.stroke();
+  }
+}
+
+async function block(data) {
+  const length = new DataView(data).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  let offset = 4 + length;
+  const made = [];
+  for (const size of head.sizes) { made.push(createImageBitmap(new Blob([new Uint8Array(data, offset, size)], { type: "image/jpeg" }))); offset += size; }
+  const pictures = await Promise.all(made);
+  const frames = [];
+  for (let i = 0; i < head.frames; i += 1) {
+    frames.push({ marks: head.marks[i], pictures: Object.fromEntries(head.views.map((view, v) => [view, pictures[i * head.views.length + v]])) });
+  }
+  nodes.set(head.node, { ...head, shown: frames });
+  play.node = head.node; play.blocks = nodes.size - 1;
+  asked = false; behind = false;
+  if (head.node === 0) { queue = []; showing = frames[0]; $("first").textContent = `${((performance.now() - begun) / 1000).toFixed(2)} s`; }
+  else {
+    queue.push(...frames);
+    if (due.length) { const waited = performance.now() - due.shift(); play.latency.push(waited); $("latency").textContent = `${(waited / 1000).toFixed(2)} s`; }
+    $("computed").textContent = `${head.seconds.toFixed(2)} s`;
+    $("ratio").textContent = `${(head.frames / hello.fps / head.seconds).toFixed(1)} ×`;
+  }
+  tree();
+  draw();
+}
+
+// A row for each branch; a moment stands in the column of its depth.
+function tree() {
+  const box = $("tree"), depth = new Map(), row = new Map(), ends = new Set();
+  let rows = 0;
+  box.replaceChildren();
+  for (const [number, node] of [...nodes].sort(([a], [b]) => a - b)) {
+    depth.set(number, node.parent === null ? 0 : depth.get(node.parent) + 1);
+    row.set(number, node.parent === null || ends.has(node.parent) ? (rows += 1) : row.get(node.parent));
+    if (node.parent !== null) ends.add(node.parent);
+    const button = document.createElement("button");
+    button.textContent = number === 0 ? "start" : `${(depth.get(number) * started.frames_per_step / hello.fps).toFixed(0)} s`;
+    button.style.gridColumn = depth.get(number) + 1;
+    button.style.gridRow = row.get(number);
+    button.title = `${node.driver}, block ${number}`;
+    if (node.driver !== "by hand") button.classList.add("policy");
+    button.setAttribute("aria-pressed", number === play.node);
+    button.addEventListener("click", () => go(number));
+    box.append(button);
+  }
+}
+function go(number) {
+  run(false);
+  const node = nodes.get(number);
+  if (!node) return;
+  play.node = number; queue = []; due = []; ticks = 0; asked = false; showing = node.shown.at(-1);
+  tell({ type: "go", node: number });
+  tree(); draw();
+  say(`At ${number === 0 ? "the start" : `block ${number}`}: what follows is a branch of its own.`);
+}
+const back = () => { const node = nodes.get(play.node); if (node && node.parent !== null) go(node.parent); };
+
+socket.addEventListener("message", ({ data }) => {
+  if (data instanceof ArrayBuffer) { chain = chain.then(() => block(data)); return; }
+  const message = JSON.parse(data);
+  if (message.type === "hello") {
+    hello = message;
+    for (const row of message.episodes) $("episode").add(new Option(`${row.embodiment}: ${row.instruction} (${row.id})`, row.id));
+    for (const name of message.policies) $("driver").add(new Option(`by ${name}`, name));
+    const wanted = new URLSearchParams(location.search).get("episode");
+    if (wanted) $("episode").value = wanted;
+    $("about").textContent = `${message.episodes.length} recordings to start from · ${message.fps} frames/s · ${message.views.length} views`;
+    say("Choose a recording and press Start.");
+    setInterval(frame, 1000 / message.fps);
+  } else if (message.type === "started") {
+    started = message; nodes = new Map(); queue = []; showing = null; ticks = 0; due = []; goal = null; asked = false; behind = false;
+    $("about").textContent = `${message.embodiment} · ${message.instruction}`;
+    $("views").replaceChildren(...message.views.map((view) => {
+      const figure = document.createElement("figure"), canvas = document.createElement("canvas"), caption = document.createElement("figcaption");
+      canvas.dataset.view = view; caption.textContent = view.replaceAll("_", " ");
+      pointer(canvas);
+      figure.append(canvas, caption);
+      return figure;
+    }));
+    $("arm").replaceChildren(...message.arms.map((name, index) => new Option(name, index)));
+    choose(message.arms.length - 1);
+    for (const button of document.querySelectorAll("button:disabled")) button.disabled = false;
+    say("Press Run, or any key of those below.");
+  } else if (message.type === "marks") {
+    play.marks = message.views; play.position = message.position;
+    $("pending").textContent = `${message.pending} of ${started.frames_per_step}`;
+  } else if (message.type === "behind") {
+    behind = true; ticks -= 1;
+    if ((ticks + 1) % started.frames_per_step === 0) due.pop();
+    say("The simulator is behind: commands wait until its pictures have caught up.");
+  } else if (message.type === "saved") {
+    play.saved = message;
+    say(`Saved ${message.frames} frames: ${message.paths.join(", ")}`);
+  } else if (message.type === "error") {
+    play.error = message; asked = false; behind = false; due = [];
+    run(false);
+    say([message.what, message.where, message.expected && `expected ${message.expected}`, message.got && `got ${message.got}`, message.next_step].filter(Boolean).join(" · "), true);
+  }
+});
+let chain = Promise.resolve();
+
+function pointer(canvas) {
+  const place = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return [limit((event.clientX - box.left) / box.width), limit((event.clientY - box.top) / box.height)].map((share) => Math.max(0, share));
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    const [u, v] = place(event), view = canvas.dataset.view;
+    const away = (play.marks?.[view] || []).map((mark) => (mark ? Math.hypot(mark.at[0] - u, mark.at[1] - v) : 9));
+    const nearest = away.indexOf(Math.min(...away));
+    if (nearest < 0 || away[nearest] > 0.15) return;
+    choose(nearest);
+    goal = { view, u, v };
+    canvas.setPointerCapture(event.pointerId);
+    run(true);
+  });
+  canvas.addEventListener("pointermove", (event) => { if (goal && goal.view === canvas.dataset.view) { const [u, v] = place(event); goal = { view: goal.view, u, v }; } });
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { goal = null; });
+}
+document.addEventListener("keydown", (event) => {
+  if (!started || event.ctrlKey || event.metaKey || event.altKey || /^(SELECT|INPUT)$/.test(event.target.tagName)) return;
+  const key = event.key.toLowerCase();
+  if (key === "p") run(!running);
+  else if (key === "tab") choose(arm + 1);
+  else if (key === "backspace") back();
+  else if ("adwseqjlikuoxz".includes(key) && key.length === 1) {
+    keys.add(key);
+    if ($("driver").value) { $("driver").value = ""; go(play.node); }  // a hand at the keys takes over
+    run(true);
+  } else return;
+  event.preventDefault();
+});
+document.addEventListener("keyup", (event) => keys.delete(event.key.toLowerCase()));
+addEventListener("blur", () => keys.clear());
+$("start").addEventListener("click", () => {
+  run(false);
+  begun = performance.now();
+  tell({ type: "start", episode: $("episode").value, seed: Number($("seed").value) });
+  $("start").blur();
+});
+$("run").addEventListener("click", () => { run(!running); $("run").blur(); });
+$("back").addEventListener("click", back);
+$("driver").addEventListener("change", () => { go(play.node); $("driver").blur(); });
+$("arm").addEventListener("change", () => { arm = Number($("arm").value); $("arm").blur(); });
+for (const button of document.querySelectorAll("[data-save]")) {
+  button.addEventListener("click", () => { run(false); say("Saving …"); tell({ type: "save", formats: [button.dataset.save] }); button.blur(); });
+}

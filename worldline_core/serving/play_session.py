@@ -1,0 +1,311 @@
+"""One person at the page: ticks of wishes in, blocks of pictures out, with a tree of moments to go back to.
+
+Every tick is one frame at the model's rate. When as many commands are there as a block takes, the block is predicted while the
+next ticks come in; one block may wait, then ticks are refused until the pictures catch up. Every block is a node of a tree: to go back is
+to choose a node, and whatever follows there is a branch of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from starlette.websockets import WebSocketDisconnect
+
+from worldline_core.errors import DataError, WorldLineError
+from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.policies.openpi import OpenpiPolicy
+from worldline_core.rollout.simulation import Simulation
+from worldline_core.serving.played_episode import save_played
+from worldline_core.serving.recorded_starts import RecordedStart
+from worldline_core.serving.session_host import LARGEST_SEED, SessionHost, error_message
+from worldline_core.serving.teleoperation import ArmInput, Teleoperation, frame_marks
+
+BY_HAND = "by hand"
+JPEG_QUALITY = 93
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Start(_Message):
+    """Begin at a recording."""
+
+    type: Literal["start"]
+    episode: str
+    seed: int = Field(42, ge=0, le=LARGEST_SEED)
+
+
+class Tick(_Message):
+    """Wishes for one frame, by arm."""
+
+    type: Literal["tick"]
+    arms: tuple[ArmInput, ...] = Field(max_length=8)
+
+
+class Go(_Message):
+    """Go on from a node; what was commanded and not yet predicted is dropped."""
+
+    type: Literal["go"]
+    node: int
+
+
+class Advance(_Message):
+    """Predict the next block under a policy's actions."""
+
+    type: Literal["advance"]
+    policy: str
+
+
+class Save(_Message):
+    """Save the way from the start to the current node."""
+
+    type: Literal["save"]
+    formats: tuple[Literal["episodes", "mcap", "rrd"], ...]
+
+
+Message = Annotated[Start | Tick | Go | Advance | Save, Field(discriminator="type")]
+_MESSAGE: TypeAdapter[Start | Tick | Go | Advance | Save] = TypeAdapter(Message)
+
+
+@dataclass(frozen=True)
+class Node:
+    """A moment, and the block that led to it; the first one holds the observed frame.
+
+    Attributes:
+        simulation: as it is there.
+        frames: by view.
+        states, commands: (n, j).
+    """
+
+    parent: int | None
+    simulation: Simulation
+    frames: dict[str, np.ndarray]
+    states: np.ndarray
+    commands: np.ndarray
+    driver: str
+
+
+class PlaySession:
+    """One connection of the page.
+
+    Args:
+        send: of texts (JSON) and bytes: the length of a JSON head as four bytes (little endian), the head, then JPEG
+            pictures, frame by frame and in each the views in order.
+    """
+
+    def __init__(self, host: SessionHost, send: Callable[[str | bytes], Awaitable[None]]) -> None:
+        self._host, self._send = host, send
+        self._start: RecordedStart
+        self._hand: Teleoperation | None = None
+        self._nodes: list[Node] = []
+        self._current, self._seed = 0, 0
+        self._pending: list[np.ndarray] = []
+        self._working: asyncio.Task[None] | None = None
+        self._policies: dict[str, OpenpiPolicy] = {}
+
+    async def greet(self) -> None:
+        """What the page may choose from."""
+        await self._send(json.dumps({"type": "hello", **self._host.metadata()}))
+
+    async def receive(self, text: str) -> None:
+        """Take one message; what is wrong with it is told to the page."""
+        try:
+            try:
+                message = _MESSAGE.validate_json(text)
+            except ValidationError as error:
+                found = error.errors()[0]
+                raise DataError("A message is not understood", where=found["loc"], got=found["msg"]) from error
+            await self._act(message)
+        except WorldLineError as error:
+            await self._send(json.dumps({"type": "error", **error_message(error)}))
+
+    async def _act(self, message: Start | Tick | Go | Advance | Save) -> None:
+        if isinstance(message, Start):
+            await self._begin(message)
+            return
+        if self._hand is None:
+            raise DataError("Nothing is being played yet", next_step="start at a recording")
+        if isinstance(message, Tick):
+            await self._tick(self._hand, message)
+        elif isinstance(message, Advance):
+            if self._working is None:
+                self._work(self._advance(message.policy))
+        elif isinstance(message, Go):
+            await self._settled()
+            if not 0 <= message.node < len(self._nodes):
+                raise DataError("No such moment", expected=f"0..{len(self._nodes) - 1}", got=message.node)
+            self._current = message.node
+            self._pending.clear()
+            self._hand.take_over(self._nodes[message.node].commands[-1])
+            await self._send_marks(self._hand)
+        else:
+            await self._settled()
+            await self._save(message)
+
+    async def _begin(self, message: Start) -> None:
+        begin = time.monotonic()
+        await self._settled()
+        self._hand = None
+        self._start = await self._host.compute(lambda: self._host.starts.read(message.episode))
+        start, seed = self._start, message.seed
+        simulation = await self._host.compute(lambda: self._host.starts.simulate(start, [seed]))
+        hand = await asyncio.to_thread(Teleoperation, start, simulation.fps)
+        first = {view: picture[None] for view, picture in simulation.pictures[0].items()}
+        self._nodes = [Node(None, simulation, first, simulation.states[0], simulation.commands[0], "recording")]
+        self._current, self._seed, self._hand = 0, seed, hand
+        self._pending.clear()
+        arms = [arm.name for arm in start.kinematics.embodiment.arms]
+        await self._send(json.dumps({
+            "type": "started", "episode": message.episode, "embodiment": start.episode.embodiment, "arms": arms,
+            "instruction": start.episode.instruction, "frames_per_step": simulation.frames_per_step,
+            "views": list(first), "seconds": time.monotonic() - begin,
+        }))  # fmt: skip
+        await self._send_block(0, time.monotonic() - begin, [hand.marks()["views"]])
+        await self._send_marks(hand)
+
+    async def _tick(self, hand: Teleoperation, message: Tick) -> None:
+        size = self._nodes[0].simulation.frames_per_step
+        if len(self._pending) >= size and self._working is not None:
+            await self._send(json.dumps({"type": "behind"}))
+            return
+        # Milliseconds of inverse kinematics and projection: beside the worker, which may be at a block.
+        self._pending.append(await asyncio.to_thread(hand.tick, message.arms))
+        await self._send_marks(hand)
+        if len(self._pending) >= size and self._working is None:
+            self._work(self._predict(self._taken(size), BY_HAND))
+
+    def _taken(self, size: int) -> np.ndarray:
+        rows = np.stack(self._pending[:size])
+        del self._pending[:size]
+        return rows
+
+    async def _send_marks(self, hand: Teleoperation) -> None:
+        await self._send(json.dumps({"type": "marks", "pending": len(self._pending), **hand.marks()}))
+
+    def _work(self, work: Awaitable[None]) -> None:
+        async def told() -> None:
+            try:
+                await work
+            except WorldLineError as error:
+                await self._send(json.dumps({"type": "error", **error_message(error)}))
+            finally:
+                self._working = None
+
+        def ended(task: asyncio.Task[None]) -> None:
+            # A page that is gone, or takes no pictures, ends the session where its messages are read.
+            if not task.cancelled() and not isinstance(
+                task.exception(), (WebSocketDisconnect, TimeoutError, type(None))
+            ):
+                task.get_loop().call_exception_handler({"message": "a block failed", "exception": task.exception()})
+
+        self._working = asyncio.create_task(told())
+        self._working.add_done_callback(ended)
+
+    async def _settled(self) -> None:
+        """Wait until no block is being made."""
+        while (working := self._working) is not None:
+            await working
+
+    async def _predict(self, rows: np.ndarray, driver: str) -> None:
+        """The next block under these commands, as a child of the current node."""
+        if len(self._nodes) > self._host.config.max_blocks:
+            raise DataError(
+                "This session has as many blocks as it may keep", expected=self._host.config.max_blocks,
+                next_step="save it, and start again",
+            )  # fmt: skip
+        begin, parent = time.monotonic(), self._current
+        simulation = self._nodes[parent].simulation.copy()
+        frames = (await self._host.compute(lambda: simulation.step(rows[None])))[0]
+        seconds = time.monotonic() - begin
+        self._nodes.append(Node(parent, simulation, frames, simulation.states[0], simulation.commands[0], driver))
+        self._current = len(self._nodes) - 1
+        tracks = simulation.tracks[0]
+        marks = [frame_marks(tracks, frame, list(frames)) for frame in range(len(rows))]
+        await self._send_block(self._current, seconds, marks)
+
+    async def _send_block(self, number: int, seconds: float, marks: list[dict[str, Any]]) -> None:
+        node = self._nodes[number]
+        count = len(next(iter(node.frames.values())))
+        pictures = await asyncio.to_thread(
+            lambda: [jpeg_bytes(video[i], JPEG_QUALITY) for i in range(count) for video in node.frames.values()]
+        )
+        head = json.dumps({
+            "type": "block", "node": number, "parent": node.parent, "driver": node.driver, "frames": count,
+            "views": list(node.frames), "sizes": [len(picture) for picture in pictures], "seconds": seconds, "marks": marks,
+        }).encode()  # fmt: skip
+        await self._send(len(head).to_bytes(4, "little") + head + b"".join(pictures))
+
+    async def _advance(self, name: str) -> None:
+        policy, hand = self._host.config.policies.get(name), self._hand
+        if policy is None or hand is None:
+            raise DataError(
+                "No such policy", expected=list(self._host.config.policies) or "policies in the settings", got=name
+            )
+        self._pending.clear()
+        simulation = self._nodes[self._current].simulation
+        observation: dict[str, Any] = {
+            policy.image_keys[view]: picture
+            for view, picture in simulation.pictures[0].items()
+            if view in policy.image_keys
+        }
+        observation[policy.state_key] = simulation.state[0].astype(np.float32)
+        observation[policy.prompt_key] = self._start.episode.instruction
+
+        def ask() -> np.ndarray:
+            if name not in self._policies:
+                key = None if policy.api_key_variable is None else os.environ.get(policy.api_key_variable)
+                self._policies[name] = OpenpiPolicy(policy.url, api_key=key, deadline_s=policy.deadline_s)
+            return self._policies[name].infer(observation)["actions"]
+
+        size, columns = simulation.frames_per_step, simulation.state.shape[1]
+        try:
+            actions = await asyncio.to_thread(ask)
+            if actions.shape[1] != columns or len(actions) < size:
+                raise DataError(
+                    "The policy's actions do not fit the robot", where=name,
+                    expected=f"at least {size} rows of {columns} columns", got=actions.shape,
+                )  # fmt: skip
+        except WorldLineError:
+            if (broken := self._policies.pop(name, None)) is not None:
+                await asyncio.to_thread(broken.close)
+            raise
+        await self._predict(actions[:size], name)
+        hand.take_over(self._nodes[self._current].commands[-1])
+        await self._send_marks(hand)
+
+    async def _save(self, message: Save) -> None:
+        way: list[Node] = []
+        number: int | None = self._current
+        while number is not None:
+            way.insert(0, self._nodes[number])
+            number = way[0].parent
+        if len(way) < 2:
+            raise DataError("There is nothing to save yet", expected="a predicted block", got="the start")
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3]
+        start, config = self._start, self._host.config
+        drivers = ", ".join(dict.fromkeys(node.driver for node in way[1:]))
+        frames = {view: np.concatenate([node.frames[view] for node in way]) for view in way[0].frames}
+        states, commands = (np.concatenate([getattr(node, name) for node in way]) for name in ("states", "commands"))
+        paths = await asyncio.to_thread(
+            save_played, config.output, f"{start.episode.episode_id}-played-{stamp}", start, frames, states, commands,
+            fps=way[0].simulation.fps, formats=message.formats,
+            notes={"driven_by": drivers, "model": config.model.name, "seed": self._seed},
+        )  # fmt: skip
+        await self._send(json.dumps({"type": "saved", "paths": [str(path) for path in paths], "frames": len(states)}))
+
+    async def close(self) -> None:
+        """Let go of what is under way, and of the policies."""
+        if self._working is not None:
+            self._working.cancel()
+        for policy in self._policies.values():
+            await asyncio.to_thread(policy.close)
