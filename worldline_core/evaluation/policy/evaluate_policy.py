@@ -85,7 +85,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
 
     decisions: list[dict[str, Any]] = []
     too_short: Counter[str] = Counter()
-    for row in with_progress(chosen, "evaluate_policy", "trajectory"):
+    for row in with_progress(chosen, "evaluate_policy", "recording"):
         name = row.episode_id
         videos = [
             (TRUE_METHOD, 0),
