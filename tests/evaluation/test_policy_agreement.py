@@ -119,3 +119,9 @@ def test_the_step_compares_the_sources_of_its_episodes(policies, tmp_path):
     page = policy_ranking(found)
     assert "policy_b" in str(page["chart"])
     assert page["table"].rows[0][:3] == ["policy_a", 3, "1.00"]
+
+
+def test_one_source_is_refused_before_anything_is_judged(recordings, tmp_path, monkeypatch):
+    monkeypatch.setattr("worldline_core.evaluation.policy.evaluate_policy.judge_trajectory", None)
+    with pytest.raises(DataError, match="at least three sources"):
+        evaluate_policy(COMPARED, recordings.inputs, tmp_path)

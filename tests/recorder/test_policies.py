@@ -10,6 +10,7 @@ pytest.importorskip("mujoco")
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import read_clip
+from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.recorder.banks import BankGrid
 from worldline_core.recorder.controllers import plan_waypoints
 from worldline_core.recorder.policies import RecordPoliciesConfig, ScriptedPolicy, attempt, draw_start, record_policies
@@ -102,3 +103,5 @@ def test_the_shipped_comparison_is_large_enough():
     families = [start.family for start in config.starts.specs()]
     assert len(config.policies) >= 8
     assert min(families.count(family) for family in set(families)) >= 40
+    evaluated = load_config(PipelineConfig, preset="small_world_policies").curate.sources
+    assert [(source.name, source.include) for source in evaluated] == [(p, (f"*-{p}",)) for p in config.policies]

@@ -56,6 +56,15 @@ def _statistics(recorded: np.ndarray, predicted: np.ndarray) -> dict[str, np.nda
     }
 
 
+def require_policies(policies: set[str]) -> None:
+    """Raises: DataError for fewer than three policies, which have no ranking worth the name."""
+    if len(policies) < 3:
+        raise DataError(
+            "Policies cannot be ranked", expected="episodes of at least three sources, a policy each", got=sorted(policies),
+            next_step="name each policy's recordings as a source of their own, or set evaluate_policy.compare_policies: false",
+        )  # fmt: skip
+
+
 def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
     """Recorded and predicted success rates of every policy and how they agree, by method and task.
 
@@ -70,12 +79,7 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
     Raises:
         DataError: fewer than three policies.
     """
-    policies = sorted({row["policy"] for row in rows})
-    if len(policies) < 3:
-        raise DataError(
-            "Policies cannot be ranked", expected="episodes of at least three sources, a policy each", got=policies,
-            next_step="name each policy's recordings as a source of their own, or set evaluate_policy.compare_policies: false",
-        )  # fmt: skip
+    require_policies({row["policy"] for row in rows})
     found: dict[str, dict[str, Any]] = defaultdict(dict)
     for method in sorted({row["method"] for row in rows}):
         of_method = [row for row in rows if row["method"] == method]

@@ -22,7 +22,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
-from worldline_core.evaluation.policy.agreement import policy_agreement
+from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
 from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
@@ -76,6 +76,8 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     times = Counter(name for names in predicted.values() for name in names)
     rows = rows_of(episodes, times)
     chosen = choose_trajectories(config, rows, times)
+    if config.compare_policies and chosen:
+        require_policies({row.source for row in chosen})
 
     def verdict_on(row: EpisodeRow, method: str, seed: int) -> dict[str, Any]:
         rollout = rollouts.get(method)
