@@ -20,6 +20,8 @@ from websockets.sync.client import ClientConnection, connect
 from tests.policies.test_openpi import policy_server
 from worldline_core import WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import UnavailableError
+from worldline_core.serving.client import SimulatorClient
 
 EPISODE = "ur5e_silver-test-s1-00000"
 
@@ -226,3 +228,20 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
     assert episode.cameras["right_wrist"].moving
     assert not episode.cameras["head"].moving
     assert episode.conventions["started_at"] == EPISODE
+
+
+def test_somebody_at_the_page_takes_the_room_of_a_session(serving: Callable) -> None:
+    with serving(max_sessions=1) as url:
+        with connect(url + "/play/session", proxy=None, max_size=None) as connection:
+            page = Driver(connection)
+            for _ in range(2):  # starting again takes no further room
+                page.tell(type="start", episode=EPISODE)
+                page.until("started")
+            with SimulatorClient(url) as client, pytest.raises(UnavailableError, match="no room"):
+                client.start(EPISODE)
+        with SimulatorClient(url) as client:
+            client.start(EPISODE)
+            with connect(url + "/play/session", proxy=None, max_size=None) as connection:
+                page = Driver(connection)
+                page.tell(type="start", episode=EPISODE)
+                assert "no room" in page.until_error()["what"]

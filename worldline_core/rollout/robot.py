@@ -5,9 +5,9 @@ A policy reads the robot's state, which no picture shows. It follows from the co
 1. Limits. A joint's command is clipped to its position limits and to what its top speed reaches in a frame from the command
    before; a gripper's to its range. These are the *executed* commands. Top speeds are those of the embodiment's file
    (``max_speeds``), else pi rad/s and 1 m/s, which arms of this size reach. A limit never moves a robot that began beyond it.
-2. Response. Without a fitted one the joints are where the commands want them one frame later at the latest, that is at once,
-   and a gripper follows at its speed (``travel_s`` of the embodiment's file, 0.4 s by default). A fitted :class:`Response`
-   says for each column after which delay and with which lag the state follows; it replaces the gripper's speed too.
+2. Response. Without a fitted one the joints are at every frame where that frame's command wants them, and a gripper follows
+   at its speed (``travel_s`` of the embodiment's file, 0.4 s by default). A fitted :class:`Response` says for each column after
+   which delay and with which lag the state follows; it replaces the gripper's speed too.
 
 Axis legend: b clips, n frames, j columns of the state.
 """

@@ -154,6 +154,7 @@ class PlaySession:
 
     async def _begin(self, message: Start) -> None:
         begin = time.monotonic()
+        self._host.admit(self)
         await self._settled()
         self._hand = None
         self._start = await self._host.compute(lambda: self._host.starts.read(message.episode))
@@ -304,7 +305,8 @@ class PlaySession:
         await self._send(json.dumps({"type": "saved", "paths": [str(path) for path in paths], "frames": len(states)}))
 
     async def close(self) -> None:
-        """Let go of what is under way, and of the policies."""
+        """Let go of what is under way, of the session's room, and of the policies."""
+        self._host.dismiss(self)
         if self._working is not None:
             self._working.cancel()
         for policy in self._policies.values():

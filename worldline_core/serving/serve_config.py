@@ -43,7 +43,7 @@ class ServeConfig(StrictModel):
         output: where sessions of the page are saved.
         host: address to listen at. Anything but loopback needs a token (environment variable WORLDLINE_TOKEN).
         origins: pages of other servers that may connect (http://host:port).
-        max_sessions, max_clips: at a time; clips of all sessions together.
+        max_sessions, max_clips: at a time, those of the page included; clips of all sessions together.
         max_message_bytes: of one request or reply.
         max_waiting: requests that wait for the worker; beyond it they are refused as busy.
         idle_s: sessions that nobody uses for so long are closed.

@@ -103,6 +103,7 @@ class SessionHost:
         self.config = config
         self.starts = RecordedStarts(config.episodes, world)
         self._running: dict[str, _Running] = {}
+        self._players: set[object] = set()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simulator")
         self._waiting = 0
 
@@ -226,14 +227,28 @@ class SessionHost:
                 "Too many clips for one session", expected=f"replies below {config.max_message_bytes:,} bytes, and at most "
                 f"{config.max_clips} clips", got=f"{clips} clips of {size // clips:,} bytes a step",
             )  # fmt: skip
-        used = sum(len(running.simulation) for running in self._running.values())
-        if len(self._running) >= config.max_sessions or used + clips > config.max_clips:
+        sessions = len(self._running) + len(self._players)
+        used = len(self._players) + sum(len(running.simulation) for running in self._running.values())
+        if sessions >= config.max_sessions or used + clips > config.max_clips:
             raise BusyError(
                 "The server has no room for another session",
                 expected=f"at most {config.max_sessions} sessions with {config.max_clips} clips",
-                got=f"{len(self._running)} sessions with {used} clips, and {clips} more",
+                got=f"{sessions} sessions with {used} clips, and {clips} more",
                 next_step="close sessions, or try again later",
             )
+
+    def admit(self, player: object) -> None:
+        """Count somebody at the page as a session of one clip, until :meth:`dismiss`.
+
+        Raises: BusyError where there is no room.
+        """
+        if player not in self._players:
+            self._check_room(1)
+            self._players.add(player)
+
+    def dismiss(self, player: object) -> None:
+        """Give the room of somebody at the page to others."""
+        self._players.discard(player)
 
     def _opened(self, owner: object, simulation: Simulation, start: Simulation) -> dict[str, Any]:
         self._check_room(len(simulation))  # others came while this one was made
