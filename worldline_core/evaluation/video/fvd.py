@@ -2,8 +2,8 @@
 
 The file is the TorchScript export of I3D trained on Kinetics-400 that FVD is usually computed with (``i3d_torchscript.pt``:
 called with ``rescale=True, resize=True, return_features=True`` on (b, 3, t, h, w) in 0..255, it gives (b, 400)). It is opened
-by TorchScript's own reader, not by pickle, and nothing is downloaded. The distance of two small sets of videos is biased
-upwards: compare only methods over the same recordings.
+by TorchScript's own reader, not by pickle, and nothing is downloaded; but it is a program, so take it from where you trust.
+The distance of two small sets of videos is biased upwards: compare only methods over the same recordings.
 """
 
 from __future__ import annotations
