@@ -17,6 +17,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,7 @@ SHORT = 33
 """Frames of a short recording; all others are long."""
 EPISODES_A_FILE = 10
 FIRST_SEED, VALIDATION_SEED = 3000, 3990
+VARIED_SEEDS = range(3200, 3208)
 PATIENCE_S = 600.0
 
 
@@ -82,15 +84,19 @@ def recordings(last_seed: int) -> list[tuple[str, RecordConfig]]:
     "validation" is fifty more episodes of each body in training scenes, of a seed that nothing trains on.
     """
     folder = CONFIG_ROOT / "recording"
-    training, test, long = (
+    training, varied, test, long = (
         load_config(RecordConfig, path=folder / f"{name}.yaml")
-        for name in ("small_world", "small_world_test", "small_world_long")
+        for name in ("small_world", "small_world_varied", "small_world_test", "small_world_long")
     )
     chunks = [("small_world", training.model_copy(update={"seed": seed})) for seed in range(FIRST_SEED, last_seed + 1)]
     groups = tuple(group.model_copy(update={"count": 50}) for group in training.groups if group.split == "validation")
     validation = ("validation", training.model_copy(update={"groups": groups, "seed": VALIDATION_SEED}))
     held_out, long_ones = ("small_world_test", test), ("small_world_long", long)
-    return [*chunks[:1], validation, *chunks[1:4], held_out, *chunks[4:8], long_ones, *chunks[8:]]
+    first = [*chunks[:1], validation, *chunks[1:4], held_out, *chunks[4:6], long_ones]
+    worse = [("small_world_varied", varied.model_copy(update={"seed": seed})) for seed in VARIED_SEEDS]
+    # By turns, so that a training that does not wait for all has some of each.
+    turns = [name for pair in zip_longest(worse, chunks[6:]) for name in pair if name is not None]
+    return [*first, *turns]
 
 
 def plan_files(folder: Path, last_seed: int, only: str | None) -> list[FileTask]:
@@ -171,7 +177,12 @@ def record_file(task: FileTask) -> None:
 
 def _recorded(recorder: EpisodeRecorder, job: Job, num_frames: int) -> Recording:
     return recorder.record(
-        episode_id=job.episode_id, split=job.split, family=job.family, entropy=job.entropy, num_frames=num_frames
+        episode_id=job.episode_id,
+        split=job.split,
+        family=job.family,
+        entropy=job.entropy,
+        num_frames=num_frames,
+        policy=job.policy,
     )
 
 

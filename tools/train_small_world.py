@@ -562,7 +562,9 @@ def main() -> None:
     recording.add_argument(
         "--last-seed", type=int, default=3019, help="chunks of training recordings end with this one"
     )
-    recording.add_argument("--only", help="small_world, validation, small_world_test or small_world_long")
+    recording.add_argument(
+        "--only", help="small_world, small_world_varied, validation, small_world_test or small_world_long"
+    )
     recording.add_argument("--start", type=int, default=0, help="leave out so many files, to share work among machines")
     recording.add_argument("--files", type=int, help="record so many files")
     for name, text in (

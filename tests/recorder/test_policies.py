@@ -1,5 +1,6 @@
 import json
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import read_clip
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.recorder.banks import BankGrid
-from worldline_core.recorder.controllers import plan_waypoints
-from worldline_core.recorder.policies import RecordPoliciesConfig, ScriptedPolicy, attempt, draw_start, record_policies
-from worldline_core.recorder.record import open_recorder
+from worldline_core.recorder.controllers import ScriptedPolicy, plan_waypoints
+from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies
+from worldline_core.recorder.record import RecordConfig, Variety, open_recorder, plan_jobs
 from worldline_core.recorder.things import sample_layout
 
 POLICIES = {
@@ -49,7 +50,7 @@ def test_every_policy_tries_the_same_start(recorder):
 def test_a_late_policy_does_the_same_later_and_a_late_gripper_alone(recorder):
     layout = sample_layout(recorder.scene.robot, "lift", np.random.default_rng(2))
     on_time, late, gripper = (
-        attempt(recorder, layout, policy, np.random.default_rng(9), 33).action
+        recorder.move(layout, np.random.default_rng(9), 33, policy).action
         for policy in (
             ScriptedPolicy(),
             ScriptedPolicy(delay_frames=5),
@@ -78,6 +79,40 @@ def test_mistakes_set_the_share_of_wrong_plans(recorder):
     assert aims(0.0) == 1.0
     assert aims(1.0) == 0.0
     assert 0.3 < aims(0.5) < 0.7
+
+
+def test_variety_is_drawn_within_its_limits_and_changes_nothing_else():
+    path = Path(__file__).resolve().parents[2] / "configs/recording/small_world_varied.yaml"
+    config = load_config(RecordConfig, path=path)
+    jobs = plan_jobs(config)
+    policies = [job.policy for job in jobs]
+    assert None not in policies
+    assert {policy.mistakes for policy in policies} == {None}
+    noise, delay, gripper = (
+        np.array([getattr(policy, name) for policy in policies])
+        for name in ("noise_m", "delay_frames", "gripper_delay_frames")
+    )
+    assert (noise == 0).mean() == pytest.approx(0.5, abs=0.1)
+    assert 0.04 < noise.max() <= 0.05
+    assert set(delay) == set(range(17))
+    assert set(gripper) == set(range(-8, 7))
+    plain = plan_jobs(config.model_copy(update={"variety": None}))
+    assert [replace(job, policy=None) for job in jobs] == plain
+    half = Variety(share=0.5, noise_m=0.01, delay_frames=0)
+    drawn = [half.draw(np.random.default_rng(number)) for number in range(200)]
+    assert 70 < sum(policy is None for policy in drawn) < 130
+    with pytest.raises(ValueError, match="earliest <= latest"):
+        Variety(share=1, noise_m=0, delay_frames=0, gripper_delay_frames=(3, -3))
+
+
+def test_a_recording_that_starts_late_says_how_it_ended(recorder):
+    # The arm has not arrived when the pictures end.
+    late = ScriptedPolicy(mistakes=0.0, delay_frames=28)
+    episode = {"episode_id": "e", "split": "train", "family": "press", "entropy": (1, 2), "num_frames": 33}
+    layout, motion, scene, _ = recorder.draw(**episode, policy=late)
+    on_time = recorder.draw(**episode, policy=ScriptedPolicy())
+    assert (layout.target, scene) == (on_time[0].target, on_time[2])
+    assert (on_time[1].outcome, motion.outcome) == ("success", "failure")
 
 
 def test_a_recorded_comparison_of_policies(tmp_path):

@@ -6,8 +6,12 @@ is drawn; whether it went wrong is measured afterwards (``outcomes.outcome``).
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+from pydantic import Field
+
+from worldline_core.config import StrictModel
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import REACH_X, Robot
 from worldline_core.recorder.inverse_kinematics import Waypoint
@@ -36,6 +40,25 @@ _PLACE = {"good": 0.62, "beside": 0.12, "high": 0.04, "relax": 0.05, "release": 
 _CLOSE = {"good": 0.50, "short": 0.26, "beside": 0.14, "high": 0.10}
 _CARRY = {"good": 0.52, "beside": 0.12, "high": 0.07, "open": 0.06, "relax": 0.08, "release": 0.09, "low": 0.06}
 _PRESS = {"good": 0.54, "short": 0.16, "beside": 0.16, "other": 0.14}
+
+
+class ScriptedPolicy(StrictModel):
+    """A controller that knows the right plan and carries it out badly.
+
+    Attributes:
+        mistakes: share of the episodes whose plan is wrong (missed by a hand's width, dropped, wrong place, ..); ``None``:
+            that of the task.
+        noise_m: standard deviation of each episode's error of aim, along x and along y.
+        bias_m: error of aim of all episodes, along x and along y of the robot's base.
+        delay_frames: everything happens this many frames late.
+        gripper_delay_frames: the gripper moves this many frames after the arm; below zero before it.
+    """
+
+    mistakes: float | None = Field(default=0.0, ge=0, le=1)
+    noise_m: float = Field(default=0.0, ge=0, le=0.2)
+    bias_m: tuple[float, float] = (0.0, 0.0)
+    delay_frames: int = Field(default=0, ge=0, le=32)
+    gripper_delay_frames: int = Field(default=0, ge=-32, le=32)
 
 
 def _draw(plans: dict[str, float], random: np.random.Generator, mistakes: float | None) -> str:
@@ -267,3 +290,18 @@ def _go_on(
                 x, y, z, yaw = free_tool(robot, arm, random) + np.array([0.0, 0.0, 0.03, 0.0])
                 xy = np.array([x, y])
             plans[arm].append(_at(time, xy, z, yaw, plans[arm][-1].opening))
+
+
+def shifted(points: list[Waypoint], offset: np.ndarray) -> list[Waypoint]:
+    """The waypoints moved by (x, y), but for the first, where the arm stands."""
+    first, *others = points
+    return [
+        first,
+        *(replace(point, position=(*(np.array(point.position[:2]) + offset), point.position[2])) for point in others),
+    ]
+
+
+def late(action: np.ndarray, frames: int) -> np.ndarray:
+    """Rows of (N, J) that many frames later (or earlier); the first and the last one stay."""
+    index = np.clip(np.arange(len(action)) - frames, 0, len(action) - 1)
+    return action[index]

@@ -20,8 +20,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.progress import Progress
 from worldline_core.recorder.banks import BankGrid, BankSpec
-from worldline_core.recorder.controllers import plan_waypoints
-from worldline_core.recorder.inverse_kinematics import Waypoint
+from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.record import (
     EMBODIMENT_STREAM,
     SPLIT_STREAM,
@@ -36,24 +35,6 @@ from worldline_core.recorder.things import Layout, sample_layout
 from worldline_core.store.atomic import write_json_atomic
 
 PolicyName = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
-
-
-class ScriptedPolicy(StrictModel):
-    """A controller that knows the right plan and carries it out badly.
-
-    Attributes:
-        mistakes: share of the episodes whose plan is wrong (missed by a hand's width, dropped, wrong place, ..).
-        noise_m: standard deviation of each episode's error of aim, along x and along y.
-        bias_m: error of aim of all episodes, along x and along y of the robot's base.
-        delay_frames: everything happens this many frames late.
-        gripper_delay_frames: the gripper moves this many frames after the arm; below zero before it.
-    """
-
-    mistakes: float = Field(default=0.0, ge=0, le=1)
-    noise_m: float = Field(default=0.0, ge=0, le=0.2)
-    bias_m: tuple[float, float] = (0.0, 0.0)
-    delay_frames: int = Field(default=0, ge=0, le=32)
-    gripper_delay_frames: int = Field(default=0, ge=-32, le=32)
 
 
 class RecordPoliciesConfig(StrictModel):
@@ -73,38 +54,6 @@ class RecordPoliciesConfig(StrictModel):
     video_crf: int = Field(default=18, ge=0, le=51)
 
 
-def attempt(
-    recorder: EpisodeRecorder, layout: Layout, policy: ScriptedPolicy, random: np.random.Generator, num_frames: int
-) -> Motion | None:
-    """One attempt of a policy at a start; None when it leaves what the arms can reach."""
-    scene, duration = recorder.scene, (num_frames - 1) / FRAME_RATE
-    plans = plan_waypoints(scene.robot, layout, random, duration, mistakes=policy.mistakes)
-    for arm in layout.acting():
-        plans[arm] = _shifted(plans[arm], np.array(policy.bias_m) + random.normal(0, policy.noise_m, 2))
-    action = recorder.follow(plans, num_frames)
-    if action is None:
-        return None
-    action = _late(action, policy.delay_frames)
-    grippers = [number for number, name in enumerate(scene.state_names) if name.endswith("/gripper")]
-    action[:, grippers] = _late(action, policy.gripper_delay_frames)[:, grippers]
-    return recorder.replay(layout, action)
-
-
-def _shifted(points: list[Waypoint], offset: np.ndarray) -> list[Waypoint]:
-    """The waypoints moved by (x, y), but for the first, where the arm stands."""
-    first, *others = points
-    return [
-        first,
-        *(replace(point, position=(*(np.array(point.position[:2]) + offset), point.position[2])) for point in others),
-    ]
-
-
-def _late(action: np.ndarray, frames: int) -> np.ndarray:
-    """Rows of (N, J) that many frames later (or earlier); the first and the last one stay."""
-    index = np.clip(np.arange(len(action)) - frames, 0, len(action) - 1)
-    return action[index]
-
-
 def draw_start(
     recorder: EpisodeRecorder, start: BankSpec, config: RecordPoliciesConfig
 ) -> tuple[Layout, dict[str, Motion]]:
@@ -119,7 +68,7 @@ def draw_start(
         for number, (name, policy) in enumerate(config.policies.items()):
             for draw in range(5):
                 random = np.random.default_rng((*entropy, number, draw))
-                motion = attempt(recorder, layout, policy, random, config.num_frames)
+                motion = recorder.move(layout, random, config.num_frames, policy)
                 if motion is not None:
                     motions[name] = motion
                     break

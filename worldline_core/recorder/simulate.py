@@ -19,7 +19,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import BODIES, CENTRE, Robot
-from worldline_core.recorder.controllers import plan_waypoints
+from worldline_core.recorder.controllers import ScriptedPolicy, late, plan_waypoints, shifted
 from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoint, plan_actions
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
@@ -157,11 +157,23 @@ class EpisodeRecorder:
             self._renderer.close()
             self._renderer = None
 
-    def move(self, layout: Layout, random: np.random.Generator, num_frames: int) -> Motion | None:
-        """Plan and execute; None when the plan leaves what the arms can reach."""
-        plans = plan_waypoints(self.scene.robot, layout, random, (num_frames - 1) / FRAME_RATE)
+    def move(
+        self, layout: Layout, random: np.random.Generator, num_frames: int, policy: ScriptedPolicy | None = None
+    ) -> Motion | None:
+        """Plan and execute, as well or badly as ``policy`` does; None when the plan leaves what the arms can reach."""
+        duration, mistakes = (num_frames - 1) / FRAME_RATE, None if policy is None else policy.mistakes
+        plans = plan_waypoints(self.scene.robot, layout, random, duration, mistakes=mistakes)
+        if policy is not None:
+            for arm in layout.acting():
+                plans[arm] = shifted(plans[arm], np.array(policy.bias_m) + random.normal(0, policy.noise_m, 2))
         action = self.follow(plans, num_frames)
-        return None if action is None else self.replay(layout, action)
+        if action is None:
+            return None
+        if policy is not None:
+            action = late(action, policy.delay_frames)
+            grippers = [number for number, name in enumerate(self.scene.state_names) if name.endswith("/gripper")]
+            action[:, grippers] = late(action, policy.gripper_delay_frames)[:, grippers]
+        return self.replay(layout, action)
 
     def follow(self, plans: list[list[Waypoint]], num_frames: int) -> np.ndarray | None:
         """Actions (N, J) that lead every arm along its waypoints; None when these leave what the arms can reach."""
@@ -218,7 +230,14 @@ class EpisodeRecorder:
         return Recording(episode, frames, masks, motion.failure, things)
 
     def draw(
-        self, *, episode_id: str, split: str, family: str, entropy: tuple[int, ...], num_frames: int
+        self,
+        *,
+        episode_id: str,
+        split: str,
+        family: str,
+        entropy: tuple[int, ...],
+        num_frames: int,
+        policy: ScriptedPolicy | None = None,
     ) -> tuple[Layout, Motion, str, np.random.Generator]:
         """Layout, executed motion and scene id of one episode, and the generator that goes on to its cameras.
 
@@ -229,20 +248,32 @@ class EpisodeRecorder:
         scene_id = str(random.choice(scenes))
         for _ in range(50):
             layout = sample_layout(self.scene.robot, family, random)
-            motion = self.move(layout, random, num_frames)
+            motion = self.move(layout, random, num_frames, policy)
             if motion is not None:
                 return layout, motion, scene_id, random
         raise DataError("No reachable plan found", where=f"episode {episode_id}", next_step="check the robot's reach")
 
     def record(
-        self, *, episode_id: str, split: str, family: str, entropy: tuple[int, ...], num_frames: int
+        self,
+        *,
+        episode_id: str,
+        split: str,
+        family: str,
+        entropy: tuple[int, ...],
+        num_frames: int,
+        policy: ScriptedPolicy | None = None,
     ) -> Recording:
         """Draw, execute and film one episode; the same ``entropy`` gives the same episode.
 
         Raises: DataError when no reachable plan is found in 50 draws.
         """
         layout, motion, scene_id, random = self.draw(
-            episode_id=episode_id, split=split, family=family, entropy=entropy, num_frames=num_frames
+            episode_id=episode_id,
+            split=split,
+            family=family,
+            entropy=entropy,
+            num_frames=num_frames,
+            policy=policy,
         )
         return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
 
