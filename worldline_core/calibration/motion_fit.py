@@ -286,6 +286,8 @@ class WristView:
 def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.ndarray]:
     """Turns (n, 3, 3) and moves (n, 3) [m] of a camera from each of its poses (n + 1, 4, 4) to the next, so late."""
     relative = rigid_inverse(poses[1:]) @ poses[:-1]
+    if frames == 0.0:
+        return relative[:, :3, :3], relative[:, :3, 3]
     vectors = np.stack([cv2.Rodrigues(pose[:3, :3])[0][:, 0] for pose in relative])
     turns = np.stack([cv2.Rodrigues(vector)[0] for vector in _delayed(vectors, frames)])
     return turns, _delayed(relative[:, :3, 3], frames)

@@ -247,9 +247,10 @@ def _write_copy(
         packets = islice(every, selection.first, selection.first + clip.num_frames)
     size = stream.height, stream.width  # as the container says it: a damaged packet may change the stream's
     found = 0
+    tick = 1 / rate
     with new_mp4(target) as out:
         written = out.add_stream_from_template(stream, opaque=True)
-        written.time_base = 1 / rate
+        written.time_base = tick
         for number, packet in enumerate(chain(packets, (None,))):  # None: what the decoder still holds
             for frame in stream.codec_context.decode(packet):
                 picture = Picture(frame)
@@ -259,7 +260,7 @@ def _write_copy(
                 found += 1
             if packet is not None:
                 packet = length_prefixed(packet, stream)
-                packet.time_base = 1 / rate
+                packet.time_base = tick
                 packet.pts = int(selection.shown_at[number])
                 packet.dts = number - delay
                 packet.duration = 1
@@ -284,11 +285,12 @@ def _select(clip: VideoClip, container: InputContainer, stream: VideoStream) -> 
     held: list[Packet] | None = []
     held_bytes = 0
     time_base = stream.time_base or Fraction(1, 1000)
+    seconds = float(time_base)
     until = math.inf if clip.from_time is None else clip.start_time + (clip.num_frames + _REORDERED) / clip.fps
     for packet in _packets_from(clip, container, stream):
         if packet.pts is None or packet.is_discard or packet.is_corrupt:
             return None
-        if float(packet.pts * time_base) > until:
+        if packet.pts * seconds > until:
             break
         times.append(packet.pts)
         keys.append(packet.is_keyframe)
