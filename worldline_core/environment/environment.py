@@ -23,9 +23,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worldline_core.environment.episodes import RunningEpisode, Success, Together, measured_success, tool_points
+from worldline_core.environment.episodes import RunningEpisode, Success, Together, measured_success
 from worldline_core.environment.starts import EpisodeStarts, Start
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.recordings import simulated_points
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.rollout.robot import Response
@@ -230,7 +231,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         for index, slot in enumerate(slots):
             picture = simulation.pictures[index]
             video = {view: [frame[None]] for view, frame in picture.items()}
-            points = [tool_points(simulation, index)]
+            points = [simulated_points(simulation, index)]
             episodes[slot] = RunningEpisode(starts[index], video, points, picture, simulation.state[index])
             self._done[slot] = False
         if len(episodes) < self.num_envs:
@@ -256,7 +257,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             if full or last:
                 for view, video in clips[index].items():
                     episode.video[view].append(video[:count])
-                episode.points.append(tool_points(simulation, index)[:count])
+                episode.points.append(simulated_points(simulation, index)[:count])
             if self._succeeds is not None and (last or (full and self._stop_at_success)):
                 episode.success = self._succeeds(episode.trajectory(self.world.contract.fps)) is True
         if full:

@@ -12,7 +12,7 @@ import numpy as np
 from worldline_core.environment.starts import Start
 from worldline_core.evaluation.policy.judge import judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.recordings import HEAD, Trajectory
+from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.rollout.simulation import Simulation
 
@@ -59,13 +59,3 @@ class Together:
             return self if kept else None
         commands = [rows[kept] for rows in self.commands]
         return Together(self.simulation.select(kept), [self.slots[index] for index in kept], self.age, commands)
-
-
-def tool_points(simulation: Simulation, clip: int) -> np.ndarray:
-    """Tools in the head view of the last step ``(n, arms, 2)`` [px of the simulated picture], NaN where not seen."""
-    tracks = simulation.tracks[clip]
-    column = tracks.views.index(HEAD)
-    scale = np.array(simulation.image_size[::-1]) / np.array(tracks.image_size[::-1])
-    points = (tracks.uv[:, column] + 0.5) * scale - 0.5
-    points[~tracks.valid[:, column]] = np.nan
-    return points

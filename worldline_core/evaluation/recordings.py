@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frame_decoder import decode_frames
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.rollout.rollout_set import RolloutSet
+
+if TYPE_CHECKING:
+    from worldline_core.rollout.simulation import Simulation
 
 ROLLOUT_PREFIX = "rollouts."
 TRUE_METHOD = "true"
@@ -177,3 +180,13 @@ def open_rollouts(inputs: Mapping[str, Path]) -> dict[str, RolloutSet]:
             f"A method cannot be called {TRUE_METHOD!r}", next_step="that name stands for the recordings"
         )
     return sets
+
+
+def simulated_points(simulation: Simulation, clip: int) -> np.ndarray:
+    """Tools in the head view of the last step ``(n, arms, 2)`` [px of the simulated picture], NaN where not seen."""
+    tracks = simulation.tracks[clip]
+    column = tracks.views.index(HEAD)
+    scale = np.array(simulation.image_size[::-1]) / np.array(tracks.image_size[::-1])
+    points = (tracks.uv[:, column] + 0.5) * scale - 0.5
+    points[~tracks.valid[:, column]] = np.nan
+    return points

@@ -17,6 +17,7 @@ from pydantic import StrictBool, StrictInt
 
 from worldline_core.evaluation.policy.evidence import route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure, score
+from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.vlm import (
     PROMPTS,
@@ -99,6 +100,14 @@ def planning_indices(num_frames: int) -> tuple[int, ...]:
         if free:
             chosen.add(min(free, key=lambda index: (abs(index - position), index)))
     return tuple(sorted(chosen))
+
+
+def shown_video(video: Trajectory) -> CandidateVideo:
+    """What a selector is shown of a whole video."""
+    indices = planning_indices(video.num_frames)
+    frames = {view: shown[list(indices)] for view, shown in video.frames.items()}
+    points = None if video.points is None else video.points[list(indices)]
+    return CandidateVideo(frames, indices, video.fps, video.num_frames, points)
 
 
 class MeasuredSelector:
