@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import gc
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -48,6 +49,20 @@ def unchecked_shapes() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def project_root() -> Path:
     return PROJECT_ROOT
+
+
+@pytest.fixture(scope="session")
+def uv(project_root: Path) -> str:
+    """The uv that builds wheels."""
+    for candidate in (shutil.which("uv"), str(project_root / ".bootstrap" / "bin" / "uv")):
+        # A version manager may leave a uv that only says that it is not there.
+        if (
+            candidate
+            and Path(candidate).is_file()
+            and subprocess.run([candidate, "--version"], capture_output=True, check=False).returncode == 0
+        ):
+            return candidate
+    pytest.skip("uv builds the wheels and is not here")
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,5 @@
-"""LeRobot's own commands, unmodified: a policy trained on the shipped recordings, evaluated inside the simulator."""
+"""LeRobot's own commands, unmodified, inside the simulator: a policy is trained on the shipped recordings, evaluated, and driven as
+on a robot; episodes are recorded by teleoperation."""
 
 from __future__ import annotations
 
@@ -7,9 +8,22 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
+
+from worldline_core import WorldLine
+from worldline_core.config import read_yaml, validate
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.environment.starts import EpisodeStarts
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 
 pytest.importorskip("lerobot")
 
@@ -20,36 +34,41 @@ POLICY = (
 )  # fmt: skip
 
 
-def lerobot(project_root: Path, folder: Path, command: str, *arguments: str) -> None:
-    """Run a command of LeRobot as a user would, with the plug-in installed and no hub."""
-    plugin = project_root / "packaging" / "lerobot_env_worldline"
-    # What an installation leaves for LeRobot to find the plug-in by.
-    installed = folder / "site" / "lerobot_env_worldline-0.1.0.dist-info"
-    installed.mkdir(parents=True, exist_ok=True)
-    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_env_worldline\nVersion: 0.1.0\n")
-    paths = [str(project_root), str(plugin), str(installed.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+@pytest.fixture(scope="module")
+def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+    """Runs a command of LeRobot in a folder as a user would, with the wheels of both plug-ins installed and no hub; what it said."""
+    built, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
+    for name in ("lerobot_env_worldline", "lerobot_robot_worldline"):
+        subprocess.run([uv, "build", "-q", "--wheel", "-o", built, f"packaging/{name}"], cwd=project_root, check=True)
+    installing = (uv, "pip", "install", "-q", "--no-deps", "--python", sys.executable, "--target", site)
+    subprocess.run([*installing, *sorted(built.glob("*.whl"))], check=True)
     settings = {
-        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONPATH": os.pathsep.join([str(project_root), str(site), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "HF_HUB_OFFLINE": "1",
-        "HF_HOME": str(folder / "hf"),
+        "HF_HOME": str(tmp_path_factory.mktemp("hf")),
         "OMP_NUM_THREADS": "1",
     }
-    result = subprocess.run(
-        [sys.executable, "-m", f"lerobot.scripts.{command}", *arguments],
-        cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=170,
-    )  # fmt: skip
-    assert result.returncode == 0, (result.stdout + result.stderr)[-4000:]
+
+    def run(folder: Path, command: str, *arguments: str) -> str:
+        result = subprocess.run(
+            [sys.executable, "-P", "-m", f"lerobot.scripts.{command}", *arguments],
+            cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=170,
+        )  # fmt: skip
+        assert result.returncode == 0, (result.stdout + result.stderr)[-4000:]
+        return result.stdout + result.stderr
+
+    return run
 
 
 @pytest.fixture(scope="module")
-def policy(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policy(lerobot: Callable[..., str], project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small ACT policy, trained by LeRobot's training command."""
     if importlib.util.find_spec("accelerate") is None:
         pytest.skip("lerobot-train needs accelerate (the group dev has it)")
     folder = tmp_path_factory.mktemp("act")
     recordings = project_root / "artifacts" / "shipped" / "recordings" / "datasets" / "ur5e_silver"
     lerobot(
-        project_root, folder, "lerobot_train", "--dataset.repo_id=local/ur5e_silver", f"--dataset.root={recordings}", *POLICY,
+        folder, "lerobot_train", "--dataset.repo_id=local/ur5e_silver", f"--dataset.root={recordings}", *POLICY,
         "--steps=20", "--batch_size=4", "--num_workers=0", "--save_freq=20", "--log_freq=10", "--output_dir=out",
     )  # fmt: skip
     return folder / "out" / "checkpoints" / "last" / "pretrained_model"
@@ -58,10 +77,10 @@ def policy(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.mark.slow
 @pytest.mark.parametrize("recording", [False, True])
 def test_lerobot_eval_runs_a_policy_inside_the_simulator(
-    project_root: Path, policy: Path, tmp_path: Path, recording: bool
+    lerobot: Callable[..., str], policy: Path, tmp_path: Path, recording: bool
 ) -> None:
     lerobot(
-        project_root, tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline",
+        tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline",
         "--env.embodiment=ur5e_silver", "--env.episode_length=16",
         "--eval.n_episodes=2", "--eval.batch_size=2", f"--eval.recording={str(recording).lower()}", "--output_dir=out", "--seed=0",
     )  # fmt: skip
@@ -78,3 +97,97 @@ def test_lerobot_eval_runs_a_policy_inside_the_simulator(
         written = LeRobotDataset("eval", root=root)
         assert (written.num_episodes, written.num_frames, written.fps) == (1, 16, 8)
         assert {"action", "observation.state", "observation.images.head", "next.success"} <= set(written.features)
+
+
+RECORDED = (
+    "--dataset.fps=8", "--dataset.num_episodes=2", "--dataset.episode_time_s=3.5", "--dataset.reset_time_s=0",
+    "--dataset.single_task=Lift.", "--dataset.push_to_hub=false", "--play_sounds=false", "--dataset.root=out",
+)  # fmt: skip
+
+
+def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lossless: bool) -> list[np.ndarray]:
+    """Each of two recorded episodes is a simulation under its commands, which are returned."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    shipped, driven = project_root / "artifacts" / "shipped", []
+    written = LeRobotDataset("local/any", root=root)
+    assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
+    starts = EpisodeStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], views=views, fps=8)
+    names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]
+    assert written.features["action"]["names"] == written.features["observation.state"]["names"] == names
+    world, threads = WorldLine.from_pretrained(shipped / "models" / "causal"), torch.get_num_threads()
+    torch.set_num_threads(1)  # as the command
+    try:
+        for number in range(2):
+            first, end = (written.meta.episodes[number][f"dataset_{name}_index"] for name in ("from", "to"))
+            rows = [written[index] for index in range(first, end)]
+            assert len(rows) > 16
+            commands = torch.stack([row["action"] for row in rows]).double().numpy()
+            start = starts[number]
+            simulation = world.start(
+                start.images, start.cameras, embodiment="ur5e_silver", state=start.state, seed=number
+            )
+            states = np.concatenate(([simulation.state[0]], simulation.follow(commands[None])[1][0]))[: len(rows)]
+            np.testing.assert_allclose(torch.stack([row["observation.state"] for row in rows]), states, atol=1e-6)
+            seen: list[dict[str, Any]] = [simulation.pictures[0]] * 16
+            simulation.step(commands[:16])
+            seen += [simulation.pictures[0]]
+            for row, pictures in zip(rows, seen, strict=False):
+                for view in views:
+                    shown = 255 * row[f"observation.images.{view}"].permute(1, 2, 0).double().numpy()
+                    if lossless:
+                        np.testing.assert_array_equal(shown.round(), pictures[view])
+                    else:
+                        assert np.abs(shown - pictures[view]).mean() < 6
+            driven.append(commands)
+    finally:
+        torch.set_num_threads(threads)
+    return driven
+
+
+@pytest.mark.slow
+def test_lerobot_record_writes_what_recorded_commands_lead_to(
+    lerobot: Callable[..., str], project_root: Path, tmp_path: Path
+) -> None:
+    said = lerobot(
+        tmp_path, "lerobot_record", "--robot.type=worldline", "--robot.views=[head]", "--teleop.type=worldline_replay",
+        "--teleop.views=[head]", "--dataset.repo_id=local/simulated", "--dataset.video=false", *RECORDED,
+    )  # fmt: skip
+    assert "Commands come at" not in said
+    recordings = project_root / "artifacts" / "shipped" / "recordings"
+    starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
+    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
+        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+
+
+@pytest.mark.slow
+def test_lerobot_rollout_drives_a_policy_as_on_a_robot(
+    lerobot: Callable[..., str], project_root: Path, policy: Path, tmp_path: Path
+) -> None:
+    lerobot(
+        tmp_path, "lerobot_rollout", "--strategy.type=episodic", f"--policy.path={policy}", "--policy.device=cpu",
+        "--robot.type=worldline", "--robot.dataset_root=out", "--fps=8", "--dataset.repo_id=local/rollout_act", *RECORDED,
+    )  # fmt: skip
+    views = ("head", "left_wrist", "right_wrist")
+    check_recorded(project_root, tmp_path / "out", views, lossless=False)
+    # It is curated by the file that lies in it; the cameras are where the robot carried them.
+    config = validate(CurateConfig, read_yaml(tmp_path / "out" / "curate.yaml")["curate"], where="curate.yaml")
+    counts = curate(config, {}, tmp_path / "curated")
+    assert (counts["kept"], counts["quarantined"]) == (2, 0), counts
+    episodes = EpisodeSet.open(tmp_path / "curated")
+    assert all(row.stage2_ok and row.embodiment == "ur5e_silver" and row.views == views for row in episodes.rows)
+    episode = episodes.episode(0)
+    kinematics = ArmKinematics(load_embodiment("ur5e_silver"))
+    for view, carried in kinematics.wrist_cameras_of(kinematics.link_poses(episode.state)).items():
+        np.testing.assert_allclose(episode.cameras[view].T_base_camera, carried, atol=2e-3)
+    assert not episode.cameras["head"].moving
+
+
+@pytest.mark.slow
+def test_lerobot_teleoperate_drives_the_simulator(lerobot: Callable[..., str], tmp_path: Path) -> None:
+    said = lerobot(
+        tmp_path, "lerobot_teleoperate", "--robot.type=worldline", "--robot.views=[head]", "--teleop.type=worldline_replay",
+        "--teleop.views=[head]", "--fps=60", "--teleop_time_s=2",
+    )  # fmt: skip
+    assert "Teleop loop time" in said
+    assert "Commands come at" in said

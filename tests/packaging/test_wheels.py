@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -13,24 +12,12 @@ from pathlib import Path
 import pytest
 
 
-def _uv(project_root: Path) -> str:
-    for candidate in (shutil.which("uv"), str(project_root / ".bootstrap" / "bin" / "uv")):
-        # A version manager may leave a uv that only says that it is not there.
-        if (
-            candidate
-            and Path(candidate).is_file()
-            and subprocess.run([candidate, "--version"], capture_output=True, check=False).returncode == 0
-        ):
-            return candidate
-    pytest.skip("uv builds the wheels and is not here")
-
-
 @pytest.fixture(scope="module")
-def installed(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with both wheels unpacked, as an installation would have them."""
     built = tmp_path_factory.mktemp("wheels")
     for source in (".", "packaging/assets"):
-        subprocess.run([_uv(project_root), "build", "-q", "--wheel", "-o", built, source], cwd=project_root, check=True)
+        subprocess.run([uv, "build", "-q", "--wheel", "-o", built, source], cwd=project_root, check=True)
     wheels = sorted(built.glob("*.whl"))
     assert [wheel.name.split("-")[0] for wheel in wheels] == ["worldline", "worldline_assets"]
     site = tmp_path_factory.mktemp("site")

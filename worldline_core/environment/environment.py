@@ -240,28 +240,22 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
     def _advance(self, group: Together, commands: np.ndarray) -> None:
         """Take one command for each episode of a group; predict and judge when it is time."""
-        group.commands.append(commands)
-        group.age += 1
-        block, count = np.stack(group.commands, axis=1), len(group.commands)
-        for slot, state in zip(group.slots, group.simulation.follow(block)[:, -1], strict=True):
+        for slot, state in zip(group.slots, group.take(commands)[1], strict=True):
             self._episodes[slot].state = state
-        full, last = count == self.frames_per_step, group.age == self.episode_frames
+        count, last = len(group.commands), group.age == self.episode_frames
+        full = count == self.frames_per_step
         if not (full or last or count % self.observe_every == 0):
             return
-        simulation = group.simulation if full else group.simulation.copy()
-        held = np.repeat(block[:, -1:], self.frames_per_step - count, axis=1)
-        clips = simulation.step(np.concatenate((block, held), axis=1))
+        simulation, clips = group.predict()
         for index, slot in enumerate(group.slots):
             episode = self._episodes[slot]
-            episode.picture = {view: video[count - 1] for view, video in clips[index].items()}
+            episode.picture = {view: video[-1] for view, video in clips[index].items()}
             if full or last:
                 for view, video in clips[index].items():
-                    episode.video[view].append(video[:count])
+                    episode.video[view].append(video)
                 episode.points.append(simulated_points(simulation, index)[:count])
             if self._succeeds is not None and (last or (full and self._stop_at_success)):
                 episode.success = self._succeeds(episode.trajectory(self.world.contract.fps)) is True
-        if full:
-            group.commands = []
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         commands = np.asarray(actions, dtype=np.float64)

@@ -14,6 +14,7 @@ from worldline_core.evaluation.policy.judge import judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.rollout.session import Frames
 from worldline_core.rollout.simulation import Simulation
 
 Success = Callable[[Trajectory], bool | None]
@@ -51,6 +52,29 @@ class Together:
     slots: list[int]
     age: int = 0
     commands: list[np.ndarray] = field(default_factory=list)
+
+    def take(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One more command for each episode ``(b, j)``: what is executed of it, and where the robots then are."""
+        self.commands.append(commands)
+        self.age += 1
+        executed, states = self.simulation.follow(np.stack(self.commands, axis=1))
+        return executed[:, -1], states[:, -1]
+
+    def predict(self) -> tuple[Simulation, Frames]:
+        """The simulation after the commands that are not behind it yet, at most a block of them, and their videos.
+
+        An unfinished block is predicted with the last command held, by a copy: it is predicted again when there are more
+        commands. A full one is behind the simulation then.
+        """
+        frames = self.simulation.frames_per_step
+        block = np.stack(self.commands[:frames], axis=1)
+        count = block.shape[1]
+        simulation = self.simulation if count == frames else self.simulation.copy()
+        held = np.repeat(block[:, -1:], frames - count, axis=1)
+        clips = simulation.step(np.concatenate((block, held), axis=1))
+        if count == frames:
+            self.commands = self.commands[frames:]
+        return simulation, [{view: video[:count] for view, video in clip.items()} for clip in clips]
 
     def without(self, slots: Sequence[int]) -> Together | None:
         """The others."""

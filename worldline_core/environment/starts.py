@@ -1,4 +1,4 @@
-"""Where simulated episodes begin: the first observation of recorded ones."""
+"""Where simulated episodes begin: the first observation of recorded ones, or one that is given as files."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from worldline_core.config import read_yaml
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.recorded_poses import RecordedCameras
+from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
 from worldline_core.errors import DataError
+from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.rollout.observation import Camera
 
 
@@ -83,6 +88,10 @@ class EpisodeStarts:
     def __getitem__(self, number: int) -> Start:
         return self._read(self._positions[number])
 
+    def commands(self, number: int) -> np.ndarray:
+        """``(n, state size)``: what was commanded after the first frame of the recording of a start."""
+        return np.asarray(self._episodes.episode(self._positions[number]).action[1:], np.float64)
+
     def _start(self, position: int) -> Start:
         episode = self._episodes.episode(position)
         cameras = {
@@ -92,3 +101,44 @@ class EpisodeStarts:
         return Start(
             episode.episode_id, episode.instruction, images, cameras, np.asarray(episode.action[0], np.float64)
         )
+
+
+def read_start(folder: Path, embodiment: Embodiment, views: Sequence[str]) -> Start:
+    """An observation as files: ``<view>.png`` of each view, ``calibration.yaml`` (docs/sources.md), and ``state.yaml``, the
+    command that belongs to the pictures: a number for each name of the embodiment's state, in its units.
+
+    Raises:
+        DataError: a file, view or number is missing, or cannot be used.
+    """
+    calibration, cameras = read_calibration(folder / "calibration.yaml").views, RecordedCameras()
+    images: dict[str, np.ndarray] = {}
+    for view in views:
+        try:
+            images[view] = np.asarray(Image.open(folder / f"{view}.png").convert("RGB"))
+        except (OSError, ValueError) as error:
+            raise DataError("Not a picture to start from", where=folder / f"{view}.png", got=str(error)) from error
+        entry = calibration.get(view)
+        if entry is None or entry.T is None or entry.distortion is not None:
+            raise DataError(
+                "A start needs the pinhole camera of each view", where=f"{folder / 'calibration.yaml'}, view {view}",
+                expected="K, T and no distortion", got="nothing" if entry is None else "T_feature or distortion",
+                next_step="write K and T; undistort the picture",
+            )  # fmt: skip
+        height, width = images[view].shape[:2]
+        add_calibrated_view(
+            cameras, view, entry, image_size=(height, width), num_frames=1, read_feature=lambda _: np.empty(0),
+            where=str(folder),
+        )  # fmt: skip
+    state = read_yaml(folder / "state.yaml")
+    names = embodiment.state_names
+    if set(state) != set(names) or not all(isinstance(value, int | float) for value in state.values()):
+        raise DataError(
+            "Not the robot's state",
+            where=folder / "state.yaml",
+            expected=f"a number each: {', '.join(names)}",
+            got=state,
+        )
+    return Start(
+        folder.name, "", images, {view: Camera(track.K, track.T_base_camera[0]) for view, track in cameras.tracks.items()},
+        np.array([state[name] for name in names], np.float64),
+    )  # fmt: skip

@@ -202,9 +202,9 @@ class Simulation:
         self.pictures = [{view: video[-1] for view, video in clip.items()} for clip in frames]
         return frames
 
-    def follow(self, controls: Float[np.ndarray, "b n j"]) -> np.ndarray:
-        """States ``(b, n, j)`` of the robot under commands from here on, however many; no picture is predicted."""
-        return self._robot.follow(np.asarray(controls, dtype=np.float64))[2]
+    def follow(self, controls: Float[np.ndarray, "b n j"]) -> tuple[np.ndarray, np.ndarray]:
+        """Executed commands and states ``(b, n, j)`` under commands from here on, however many; no picture is predicted."""
+        return self._robot.follow(np.asarray(controls, dtype=np.float64))[1:]
 
     def fork(self, n: int, seeds: Sequence[int] | None = None) -> Simulation:
         """``n`` branches of every clip (those of a clip follow each other), to be driven separately from here on; this

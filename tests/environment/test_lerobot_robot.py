@@ -1,0 +1,270 @@
+"""The simulator as a robot of LeRobot, and recorded commands as its teleoperator, without LeRobot's commands."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+pytest.importorskip("lerobot")
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from worldline_core import WorldLine
+from worldline_core.config import read_yaml
+from worldline_core.data.sources.calibration_file import read_calibration
+from worldline_core.environment.starts import EpisodeStarts, read_start
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.rollout.simulation import Simulation
+
+ROBOT = "ur5e_silver"
+
+
+@pytest.fixture(scope="module")
+def plugin(project_root: Path) -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(project_root / "packaging" / "lerobot_robot_worldline")
+        yield importlib.import_module("lerobot_robot_worldline")
+
+
+@pytest.fixture(scope="module")
+def world(project_root: Path) -> WorldLine:
+    return WorldLine.from_pretrained(project_root / "artifacts" / "shipped" / "models" / "causal")
+
+
+@pytest.fixture(scope="module")
+def starts(project_root: Path) -> EpisodeStarts:
+    recordings = project_root / "artifacts" / "shipped" / "recordings"
+    return EpisodeStarts(recordings, embodiment=ROBOT, splits=("test",), views=("head",), fps=8.0)
+
+
+@pytest.fixture
+def robot(plugin: ModuleType, world: WorldLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setattr(plugin.robot.WorldLine, "from_pretrained", lambda *_, **__: world)
+    made = plugin.WorldLineRobot(plugin.WorldLineRobotConfig(views=["head"], calibration_dir=tmp_path))
+    yield made
+    if made.is_connected:
+        made.disconnect()
+
+
+@pytest.fixture
+def replay(plugin: ModuleType, tmp_path: Path) -> Iterator[Any]:
+    made = plugin.WorldLineReplay(plugin.WorldLineReplayConfig(views=["head"], calibration_dir=tmp_path))
+    made.connect()
+    yield made
+    made.disconnect()
+
+
+def begun(world: WorldLine, starts: EpisodeStarts, seed: int) -> Simulation:
+    start = starts[seed]
+    return world.start(start.images, start.cameras, embodiment=ROBOT, state=start.state, seed=seed)
+
+
+def test_a_robot_is_driven_as_a_simulation(robot: Any, replay: Any, world: WorldLine, starts: EpisodeStarts) -> None:
+    assert robot.action_features == replay.action_features
+    assert list(robot.action_features)[:2] == ["left_shoulder_pan_joint.pos", "left_shoulder_lift_joint.pos"]
+    assert robot.observation_features == {**dict.fromkeys(robot.action_features, float), "head": (64, 96, 3)}
+    robot.connect()
+    simulation = begun(world, starts, 0)
+    before, block = simulation.pictures[0]["head"], starts.commands(0)[:16]
+    pictures = simulation.step(block)[0]["head"]
+    for number, command in enumerate(block):
+        observation = robot.get_observation()
+        assert list(observation) == list(robot.observation_features)
+        assert np.array_equal(observation["head"], before)
+        assert all(type(observation[name]) is float for name in robot.action_features)
+        action = replay.get_action()
+        np.testing.assert_array_equal(list(action.values()), command)
+        sent = robot.send_action(action)
+        np.testing.assert_array_equal(list(sent.values()), simulation.commands[0, number])
+        state = [robot.get_observation()[name] for name in robot.action_features]
+        np.testing.assert_array_equal(state, simulation.states[0, number])
+    assert np.array_equal(robot.get_observation()["head"], pictures[-1])
+
+
+def test_a_robot_is_connected_or_not(robot: Any) -> None:
+    for call in (robot.get_observation, robot.disconnect, lambda: robot.send_action({})):
+        with pytest.raises(DeviceNotConnectedError, match="not connected"):
+            call()
+    assert not robot.is_connected
+    robot.connect()
+    assert robot.is_connected
+    assert robot.is_calibrated
+    with pytest.raises(DeviceAlreadyConnectedError, match="already connected"):
+        robot.connect()
+    handlers = len(logging.getLogger().handlers)
+    robot.disconnect()
+    assert not robot.is_connected
+    assert len(logging.getLogger().handlers) == handlers - 1
+    robot.connect()
+    assert robot.get_observation()["head"].shape == (64, 96, 3)
+
+
+def test_pictures_are_predicted_when_they_are_looked_at(robot: Any, replay: Any) -> None:
+    """LeRobot sends robots home by hundreds of commands, whose pictures nobody sees."""
+    robot.connect()
+    for _ in range(40):
+        robot.send_action(replay.get_action())
+    assert robot._running.simulation.num_frames == 1
+    robot.get_observation()
+    assert robot._running.simulation.num_frames == 33
+    assert len(robot._running.commands) == 8
+
+
+def test_pictures_may_be_observed_more_often(
+    plugin: ModuleType, robot: Any, world: WorldLine, starts: EpisodeStarts
+) -> None:
+    robot.config.observe_every = 8
+    robot.connect()
+    commands = starts.commands(0)
+    for command in commands[:8]:
+        robot.send_action(robot._columns.named(command))
+    held = np.concatenate((commands[:8], np.repeat(commands[7:8], 8, axis=0)))
+    assert np.array_equal(robot.get_observation()["head"], begun(world, starts, 0).step(held)[0]["head"][7])
+    robot.disconnect()
+    robot.config.observe_every = 5
+    with pytest.raises(ConfigError, match=r"(?s)observe_every.*divisor of the model's 16.*got: 5"):
+        robot.connect()
+    assert not robot.is_connected
+
+
+def test_actions_of_other_robots_are_refused(robot: Any, replay: Any) -> None:
+    robot.connect()
+    action = replay.get_action()
+    with pytest.raises(DataError, match=r"missing: left_elbow_joint.pos; unknown: shoulder_pan.pos"):
+        robot.send_action({k: v for k, v in action.items() if k != "left_elbow_joint.pos"} | {"shoulder_pan.pos": 0.0})
+    with pytest.raises(DataError, match=r"(?s)not finite.*left_gripper.pos.*nan"):
+        robot.send_action(action | {"left_gripper.pos": float("nan")})
+    # A command beyond what a joint reaches in a frame is executed as far as it can be.
+    was = robot.get_observation()["left_elbow_joint.pos"]
+    sent = robot.send_action(action | {"left_elbow_joint.pos": was + 3.0, "left_gripper.pos": 7.0})
+    assert sent["left_elbow_joint.pos"] == pytest.approx(was + np.pi / 8)
+    assert sent["left_gripper.pos"] == 1.0
+    assert robot.get_observation()["left_elbow_joint.pos"] == sent["left_elbow_joint.pos"]
+
+
+def test_episodes_begin_where_lerobot_announces_them(
+    robot: Any, replay: Any, world: WorldLine, starts: EpisodeStarts
+) -> None:
+    root = logging.getLogger()
+    level = root.level
+    root.setLevel(logging.NOTSET)  # as LeRobot's commands do
+    try:
+        robot.connect()
+        assert starts.commands(0)[0].tolist() != starts.commands(1)[0].tolist()
+        for episode in (0, 1, 1, 0):
+            simulation = begun(world, starts, episode)
+            logging.info("Recording episode %d", episode)
+            observation = robot.get_observation()
+            assert np.array_equal(observation["head"], simulation.pictures[0]["head"])
+            assert observation["left_elbow_joint.pos"] == simulation.state[0, 2]
+            assert list(replay.get_action().values()) == starts.commands(episode)[0].tolist()
+            robot.send_action(replay.get_action())
+            logging.info("Reset the environment")
+            assert robot._running.age == 1
+        # After its last command a recording stays there.
+        last = [replay.get_action() for _ in range(len(starts.commands(0)))][-1]
+        assert list(last.values()) == starts.commands(0)[-1].tolist()
+    finally:
+        root.setLevel(level)
+
+
+def test_cameras_of_an_episode_are_written_into_its_dataset(
+    robot: Any, replay: Any, starts: EpisodeStarts, tmp_path: Path
+) -> None:
+    root = logging.getLogger()
+    level = root.level
+    root.setLevel(logging.NOTSET)
+    robot.config.dataset_root = str(tmp_path / "recorded")
+    try:
+        robot.connect()
+        for episode, frames in ((0, 5), (1, 3)):
+            logging.info("Recording episode %d", episode)
+            for _ in range(frames):
+                robot.get_observation()
+                robot.send_action(replay.get_action())
+            logging.info("Reset the environment" if episode == 0 else "Stop recording")
+            if episode == 0:
+                with pytest.raises(DataError, match=r"(?s)No dataset.*folder of --dataset.root"):
+                    robot.get_observation()
+                (tmp_path / "recorded" / "meta").mkdir(parents=True)
+                (tmp_path / "recorded" / "meta" / "info.json").write_text("{}")
+        robot.disconnect()
+    finally:
+        root.setLevel(level)
+    camera = read_calibration(tmp_path / "recorded" / "meta" / "cameras" / "000001.json").views["head"]
+    np.testing.assert_allclose(camera.T, starts[1].cameras["head"].T_base_camera[None], atol=1e-6)
+    np.testing.assert_array_equal(camera.K, starts[1].cameras["head"].K)
+    source = read_yaml(tmp_path / "recorded" / "curate.yaml")["curate"]["sources"][0]
+    assert source["grippers"]["left_gripper.pos"] == {"closed": 0.0, "open": 1.0}
+    assert (source["angle_unit"], source["views"]) == ("rad", {"observation.images.head": "head"})
+
+
+@pytest.mark.parametrize(("interval", "warned"), [(1 / 30, True), (1 / 8, False)])
+def test_commands_at_another_rate_are_told(
+    plugin: ModuleType, robot: Any, replay: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
+    interval: float, warned: bool,
+) -> None:  # fmt: skip
+    robot.connect()
+    clock = iter(np.arange(100) * interval)
+    monkeypatch.setattr(plugin.robot.time, "perf_counter", lambda: next(clock))
+    for _ in range(30):
+        robot.send_action(replay.get_action())
+    found = [record.getMessage() for record in caplog.records if "--dataset.fps=8" in record.getMessage()]
+    assert len(found) == warned
+    assert not warned or "at 30 Hz" in found[0]
+
+
+def test_units_and_names_are_those_of_leader_arms(plugin: ModuleType) -> None:
+    """LeRobot's SO-101 leader sends these names, degrees, and a gripper of 0 to 100."""
+    kinematics = ArmKinematics(load_embodiment("so101"))
+    leader = plugin.device.Columns(kinematics, use_degrees=True)
+    assert leader.names == [
+        f"{name}.pos" for name in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+    ]
+    row = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.25])
+    sent = leader.named(row)
+    np.testing.assert_allclose(list(sent.values()), [*np.degrees(row[:5]), 25.0])
+    np.testing.assert_allclose(leader.values(sent), row)
+    np.testing.assert_array_equal(list(plugin.device.Columns(kinematics, use_degrees=False).named(row).values()), row)
+
+
+def test_a_robot_begins_at_given_pictures(robot: Any, world: WorldLine, starts: EpisodeStarts, tmp_path: Path) -> None:
+    start, folder = starts[1], tmp_path / "observed"
+    folder.mkdir()
+    Image.fromarray(start.images["head"]).save(folder / "head.png")
+    camera, (height, width) = start.cameras["head"], start.images["head"].shape[:2]
+    entry = {"width": width, "height": height, "K": camera.K.tolist(), "T": camera.T_base_camera.tolist()}
+    entry |= {"maps": "camera_to_base", "axes": "opencv"}
+    (folder / "calibration.yaml").write_text(yaml.safe_dump({"views": {"head": entry}}))
+    names = load_embodiment(ROBOT).state_names
+    state = dict(zip(names, start.state.tolist(), strict=True))
+    (folder / "state.yaml").write_text(yaml.safe_dump(state))
+    robot.config.observation, robot.config.seed = str(folder), 1
+    robot.connect()
+    simulation = begun(world, starts, 1)
+    assert np.array_equal(robot.get_observation()["head"], simulation.pictures[0]["head"])
+    for command in starts.commands(1)[:16]:
+        robot.send_action(robot._columns.named(command))
+    assert np.array_equal(robot.get_observation()["head"], simulation.step(starts.commands(1)[:16])[0]["head"][-1])
+
+    def read(views: tuple[str, ...] = ("head",)) -> None:
+        read_start(folder, load_embodiment(ROBOT), views)
+
+    with pytest.raises(DataError, match=r"(?s)Not a picture to start from.*left_wrist.png"):
+        read(("head", "left_wrist"))
+    Image.fromarray(start.images["head"]).save(folder / "left_wrist.png")
+    with pytest.raises(DataError, match=r"(?s)pinhole camera of each view.*view left_wrist.*got: nothing"):
+        read(("head", "left_wrist"))
+    (folder / "state.yaml").write_text(yaml.safe_dump(state | {names[0]: "zero"}))
+    with pytest.raises(DataError, match=r"(?s)Not the robot's state.*left/shoulder_pan_joint"):
+        read()
