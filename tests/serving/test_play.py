@@ -7,7 +7,7 @@ import json
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,13 @@ class Page:
     def key(self, kind: str, key: str) -> None:
         self.call("Input.dispatchKeyEvent", type=kind, key=key)
 
+    def mouse(self, kind: str, view: str, at: Sequence[float]) -> None:
+        """An event of the left button at a place in the picture of a view, in shares of its width and height."""
+        canvas = f"document.querySelector('canvas[data-view={view}]').getBoundingClientRect()"
+        left, top, width, height = self.value(f"(({{x, y, width, height}}) => [x, y, width, height])({canvas})")
+        place = {"x": left + at[0] * width, "y": top + at[1] * height}
+        self.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+
     def screenshot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
@@ -96,6 +103,46 @@ def browser(folder: Path, url: str) -> Iterator[Page]:
         process.wait(20)
 
 
+def drag_and_steer(page: Page, begin: np.ndarray) -> None:
+    """From the start on: one tool by the mouse, the other by a gamepad, each taking over from a policy that was chosen."""
+    page.value("go(0)")
+    page.value("document.getElementById('driver').add(new Option('by a policy', 'policy'))")
+    page.until(f"Math.abs(window.play.position[1][2] - {begin[1, 2]}) < 1e-6")
+    page.value("document.getElementById('driver').value = 'policy'")
+    at = page.value("window.play.marks.head[0].at")
+    goal = [at[0] + 0.04, at[1] - 0.05]
+    page.mouse("mousePressed", "head", at)
+    page.mouse("mouseMoved", "head", goal)
+    away = f"Math.hypot(window.play.marks.head[0].at[0] - {goal[0]}, window.play.marks.head[0].at[1] - {goal[1]})"
+    page.until(f"{away} < 0.01")
+    assert page.value("[document.getElementById('driver').value, document.getElementById('arm').value]") == ["", "0"]
+    page.mouse("mouseReleased", "head", goal)
+    assert page.value("goal === null")
+    assert np.abs(np.array(page.value("window.play.position"))[1] - begin[1]).max() < 1e-3
+
+    idle = "{mapping: 'standard', axes: [0.1, -0.1, 0, 0.1], buttons: Array.from({length: 17}, () => ({pressed: false, value: 0}))}"
+    page.value(f"window.pad = {idle}; navigator.getGamepads = () => [null, window.pad]; 0")
+    assert page.value("wish()") == {"move": [0, 0, 0], "turn": [0, 0, 0], "grip": 0, "goal": None}  # sticks at rest
+    page.value("window.pad.buttons[5].pressed = true")
+    page.until("document.getElementById('arm').value === '1'")
+    page.value(
+        "window.pad.buttons[5].pressed = false; document.getElementById('driver').value = 'policy'; window.pad.axes[3] = -1"
+    )
+    page.until(f"window.play.position[1][2] > {begin[1, 2] + 0.03}")
+    assert page.value("document.getElementById('driver').value") == ""
+    left = np.array(page.value("window.play.position"))[0]
+    page.value("window.pad.axes[3] = 0; window.pad.buttons[6].value = 1")
+    page.until("window.play.marks.head[1].open < 0.3")
+    page.value("window.pad.buttons[6].value = 0; window.pad.buttons[7].value = 1")
+    page.until("window.play.marks.head[1].open > 0.7")
+    assert np.abs(np.array(page.value("window.play.position"))[0] - left).max() < 1e-3
+    page.value("window.pad.buttons[7].value = 0; window.pad.buttons[9].pressed = true")
+    page.until("document.getElementById('run').getAttribute('aria-pressed') === 'false'")
+    # Where a browser has no gamepads for the page, keys go on working.
+    page.value("navigator.getGamepads = undefined")
+    assert page.value("wish().grip") == 0
+
+
 @pytest.mark.slow
 def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, shipped: Path, tmp_path: Path) -> None:
     world = WorldLine.from_pretrained(shipped / "models" / "causal")
@@ -123,6 +170,7 @@ def test_a_script_in_a_browser_drives_to_a_target_and_saves(serving: Callable, s
             page.screenshot(tmp_path / "saved.png")
             latency = page.value("window.play.latency")
             assert len(latency) >= 1
+            drag_and_steer(page, begin)
             assert page.messages == []
     episodes = EpisodeSet.open(Path(saved["paths"][0]))
     episode = episodes.episode(0)

@@ -17,10 +17,12 @@ const bool = (on) => (on ? 1 : 0);
 const down = (more, less) => bool(keys.has(more)) - bool(keys.has(less));
 const dead = (value) => (Math.abs(value || 0) < 0.15 ? 0 : value);
 const limit = (value) => Math.max(-1, Math.min(1, value));
+// A browser has gamepads on secure pages alone: on this machine, or by https.
+const gamepad = () => [...(navigator.getGamepads?.() ?? [])].find((found) => found && found.mapping === "standard");
 function wish() {
   const move = [down("d", "a"), down("w", "s"), down("e", "q")], turn = [down("k", "i"), down("o", "u"), down("j", "l")];
   let grip = down("x", "z");
-  const pad = [...navigator.getGamepads()].find((found) => found && found.mapping === "standard");
+  const pad = gamepad();
   if (pad) {
     const [x, y, yaw, lift] = pad.axes.map(dead);
     move[0] += x; move[1] -= y; move[2] -= lift; turn[2] -= yaw;
@@ -28,9 +30,10 @@ function wish() {
   }
   return { move: move.map(limit), turn: turn.map(limit), grip: limit(grip), goal };
 }
+const wished = ({ move, turn, grip }) => [...move, ...turn, grip].some((value) => value !== 0);
 let held = false;
 function padButtons() {
-  const pad = [...navigator.getGamepads()].find((found) => found && found.mapping === "standard");
+  const pad = gamepad();
   const pressed = pad && (pad.buttons[4].pressed || pad.buttons[5].pressed || pad.buttons[9].pressed);
   if (pressed && !held) pad.buttons[9].pressed ? run(!running) : choose(arm + 1);
   held = Boolean(pressed);
@@ -49,6 +52,7 @@ function frame() {
     seen = seen.filter((time) => time > performance.now() - 3000);
     if (seen.length > 3) $("rate").textContent = `${(1000 * (seen.length - 1) / (seen.at(-1) - seen[0])).toFixed(1)} frames/s of ${started.views.length} views`;
   }
+  if (running && $("driver").value && wished(wish())) { byHand(); run(true); }
   const policy = $("driver").value;
   if (running && policy) {
     if (!asked && queue.length <= started.frames_per_step / 2) { asked = true; due.push(performance.now()); tell({ type: "advance", policy }); }
@@ -146,6 +150,8 @@ function go(number) {
   tree(); draw();
   say(`At ${number === 0 ? "the start" : `block ${number}`}: what follows is a branch of its own.`);
 }
+// A hand at keys, mouse or gamepad takes over from a policy.
+function byHand() { if ($("driver").value) { $("driver").value = ""; go(play.node); } }
 const back = () => { const node = nodes.get(play.node); if (node && node.parent !== null) go(node.parent); };
 
 socket.addEventListener("message", ({ data }) => {
@@ -203,6 +209,7 @@ function pointer(canvas) {
     const nearest = away.indexOf(Math.min(...away));
     if (nearest < 0 || away[nearest] > 0.15) return;
     choose(nearest);
+    byHand();
     goal = { view, u, v };
     canvas.setPointerCapture(event.pointerId);
     run(true);
@@ -218,7 +225,7 @@ document.addEventListener("keydown", (event) => {
   else if (key === "backspace") back();
   else if ("adwseqjlikuoxz".includes(key) && key.length === 1) {
     keys.add(key);
-    if ($("driver").value) { $("driver").value = ""; go(play.node); }  // a hand at the keys takes over
+    byHand();
     run(true);
   } else return;
   event.preventDefault();
