@@ -178,7 +178,7 @@ def test_lerobot_rollout_drives_a_policy_as_on_a_robot(
     assert all(row.stage2_ok and row.embodiment == "ur5e_silver" and row.views == views for row in episodes.rows)
     episode = episodes.episode(0)
     kinematics = ArmKinematics(load_embodiment("ur5e_silver"))
-    for view, carried in kinematics.wrist_cameras_of(kinematics.link_poses(episode.state)).items():
+    for view, carried in kinematics.wrist_cameras_of(kinematics.link_poses(np.array(episode.state))).items():
         np.testing.assert_allclose(episode.cameras[view].T_base_camera, carried, atol=2e-3)
     assert not episode.cameras["head"].moving
 
