@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import multiprocessing
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import jaxtyping
@@ -81,6 +83,17 @@ def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
 
+@pytest.fixture
+def forked_loaders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loader processes are forked from one that has torch: a spawned one imports it again, for three seconds of a core.
+
+    That training spawns them is tested with the ones that end with their training process.
+    """
+    multiprocessing.set_forkserver_preload(["torch", "cv2", "pyarrow.parquet", "pydantic", "scipy.spatial"])
+    contexts = SimpleNamespace(get_context=lambda _: multiprocessing.get_context("forkserver"))
+    monkeypatch.setattr("worldline_core.training.clip_prefetcher.multiprocessing", contexts)
+
+
 @pytest.fixture(scope="session")
 def prefect_server(shared_folder: Path) -> Iterator[None]:
     """One Prefect server for all tests that need one, in all processes: to start it takes ten seconds of a core.
@@ -93,12 +106,15 @@ def prefect_server(shared_folder: Path) -> Iterator[None]:
 
     # What sends task states is one for the process: another server's, where tests before this one had one.
     EventsWorker.drain_all(timeout=10)
-    told, lock = shared_folder / "prefect_server.txt", shared_folder / "prefect_server.lock"
-    with lock.open("w") as users:
-        fcntl.flock(users, fcntl.LOCK_EX)
+    told, names = shared_folder / "prefect_server.txt", ("starting", "users")
+    starting, users = ((shared_folder / f"prefect_server.{name}").open("w") for name in names)
+    # Two locks: with one, the second process would wait for the first to end before it could begin.
+    with starting, users:
+        fcntl.flock(starting, fcntl.LOCK_EX)
         if not told.exists():
             told.write_text(" ".join(map(str, _start_prefect_server(shared_folder))))
         fcntl.flock(users, fcntl.LOCK_SH)
+        fcntl.flock(starting, fcntl.LOCK_UN)
         process, port = map(int, told.read_text().split())
         server = SubprocessASGIServer(port)
         server.running, server.server_process = True, subprocess.Popen(["true"])  # it wants a process to be there
@@ -107,6 +123,7 @@ def prefect_server(shared_folder: Path) -> Iterator[None]:
             patch.setitem(SubprocessASGIServer._instances, None, server)
             yield
             EventsWorker.drain_all(timeout=10)
+        fcntl.flock(starting, fcntl.LOCK_EX)
         try:
             fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -67,6 +67,7 @@ def online(**changes: object) -> DistillConfig:
     return DistillConfig.model_validate({**config().model_dump(), "input": {**FRAME_INPUT, **changes}})
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_frames_on_the_way_are_as_good_as_cached_latents(
     recorded: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

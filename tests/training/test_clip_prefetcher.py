@@ -73,6 +73,7 @@ def gone(prefetcher_processes: list[int]) -> bool:
     return False
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_batches_do_not_depend_on_the_number_of_processes(world: Any) -> None:
     # Two episodes are slow: processes overtake each other.
     plain = reader(world)
@@ -92,6 +93,7 @@ def test_batches_do_not_depend_on_the_number_of_processes(world: Any) -> None:
                 assert torch.equal(read.data, plain.read(index).data)
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_no_more_is_read_ahead_than_there_are_slots(world: Any, tmp_path: Path) -> None:
     log = tmp_path / "read.txt"
     episodes = {f"episode-{number:03d}": f"log:{log}" for number in range(8)}
@@ -104,6 +106,7 @@ def test_no_more_is_read_ahead_than_there_are_slots(world: Any, tmp_path: Path) 
         assert len(log.read_text().splitlines()) == 2 * (3 + 5)
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_errors_name_their_clips_and_end_cleanly(world: Any) -> None:
     first = next(
         index
@@ -125,6 +128,7 @@ def test_errors_name_their_clips_and_end_cleanly(world: Any) -> None:
             ahead.read(first + 1)
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_skipped_clips_come_with_the_batch(world: Any) -> None:
     behaviour = {"episode-004": "damaged"}
     here = reader(world, behaviour, skip=True)

@@ -103,6 +103,7 @@ def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     monkeypatch.setattr(trainer_module, "_step", step)
 
 
+@pytest.mark.usefixtures("forked_loaders")
 def test_stage2_goes_on_in_the_middle_of_an_epoch_with_the_same_bytes(
     world: Any, tokenizer: Path, first_stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
