@@ -14,8 +14,8 @@ PACKAGES = ("worldline_core", "tasks", "flows")
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
-    """The modules that each module imports, also inside of functions."""
-    graph = grimp.build_graph(*PACKAGES)
+    """The modules and libraries that each module imports, also inside of functions."""
+    graph = grimp.build_graph(*PACKAGES, include_external_packages=True)
     return {module: set(graph.find_modules_directly_imported_by(module)) for module in graph.modules}
 
 
@@ -42,6 +42,13 @@ def test_no_two_folders_import_each_other(imports: dict[str, set[str]], project_
 def _folder(module: str, project_root: Path) -> str:
     path = module.replace(".", "/")
     return path if (project_root / path).is_dir() else path.rpartition("/")[0]
+
+
+def test_the_core_needs_neither_prefect_nor_what_is_above_it(imports: dict[str, set[str]]) -> None:
+    above = {"prefect", "tasks", "flows"}
+    assert any("prefect" in libraries for libraries in imports.values())
+    found = {module: {name for name in imported if name.split(".")[0] in above} for module, imported in imports.items()}
+    assert {module: names for module, names in found.items() if names and module.startswith("worldline_core")} == {}
 
 
 def test_the_architecture_names_every_room(project_root: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -188,8 +186,6 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
         WorldLine.from_pretrained(models / "stage2").simulator([42])
 
 
-def test_importing_the_package_imports_no_torch() -> None:
-    code = "import sys, worldline_core; assert 'torch' not in sys.modules; worldline_core.WorldLine"
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_a_name_that_the_package_lacks_is_an_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Simulator'"):
         __import__("worldline_core").Simulator  # noqa: B018
