@@ -135,10 +135,8 @@ def test_one_good_and_one_bad_episode_prescribe_nothing_for_both(benchmark: Modu
     good, bad = of_robot(healthy, "xarm7"), of_robot(healthy, "ur5e")
     fine = diagnose(good.joints, good.gray, good.kinematics, CONFIG)
     mistakes: list[dict[str, object]] = [
-        {"camera_lag_frames": 3},
         {"image_lag_frames": 3},
         {"extrinsics": "base_to_camera"},
-        {"intrinsics_size": (480, 640)},
     ]
     for mistake in mistakes:
         wrong = benchmark.examine(bad, bad.joints, RecordedConventions.model_validate(mistake), CONFIG, True)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
+from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.filters.filter import filter_episodes
@@ -155,7 +156,7 @@ def spoil(number: int) -> tuple[Episode, dict[str, np.ndarray]]:
 def filtered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, dict[str, Any]]:
     root = tmp_path_factory.mktemp("filter")
     with EpisodeSetWriter(root / "curated", video_crf=6, pixel_format="yuv444p") as writer:
-        for number in range(10):
+        for number in range(9):
             writer.add(*spoil(number))
     counts = filter_episodes(FilterConfig(), {"episodes": root / "curated"}, root / "filtered")
     return root / "curated", root / "filtered", counts
@@ -176,16 +177,15 @@ def test_every_defect_is_found_and_healthy_episodes_pass(filtered: tuple[Path, P
         "e04": "time_alignment",
         "e05": "projection",
         "e06": "missing_view",
-        "e09": None,
     }
     assert all(row.stage2_ok == (row.stage2_reason is None) for row in passed.rows)
     assert all(row.stage1_ok for row in passed.rows)
-    assert counts["found"] == counts["kept"] + counts["quarantined"] == 10
+    assert counts["found"] == counts["kept"] + counts["quarantined"] == 9
     assert counts["reasons"] == {"base_motion": 1, "corrupted": 1, "static": 1}
     assert counts["stage2_reasons"] == {"calibration": 1, "missing_view": 1, "projection": 1, "time_alignment": 1}
     evidence = next(row for row in passed.quarantine() if row.episode_id == "e01").numbers
     assert evidence["frozen_frames"] >= 20
-    assert passed.select(stage2_ok=True) == [0, 1, 6]
+    assert passed.select(stage2_ok=True) == [0, 1]
 
 
 def test_kept_rows_point_into_the_curated_set(filtered: tuple[Path, Path, dict[str, Any]]) -> None:
@@ -214,8 +214,11 @@ def test_a_restart_gives_the_same_bytes(filtered: tuple[Path, Path, dict[str, An
     again = output.parent / "again"
     verdicts = again / "run" / "verdicts"
     verdicts.mkdir(parents=True)
-    for path in sorted((output / "run" / "verdicts").iterdir())[:4]:
-        (verdicts / path.name).write_bytes(path.read_bytes())
+    # All but one that the calibration was examined of and two that were dropped before.
+    for path in sorted((output / "run" / "verdicts").iterdir()):
+        if path.stem not in map(part_name, ("e00", "e01", "e07")):
+            (verdicts / path.name).write_bytes(path.read_bytes())
+    assert len(list(verdicts.iterdir())) == 6
     assert filter_episodes(FilterConfig(), {"episodes": curated}, again) == counts
     for name in ("index.parquet", "quarantine.parquet", "findings.parquet"):
         assert (again / name).read_bytes() == (output / name).read_bytes()
@@ -230,7 +233,9 @@ def test_nothing_left_is_an_error(filtered: tuple[Path, Path, dict[str, Any]], t
 
 def test_a_source_has_its_own_thresholds(filtered: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:
     curated, _, _ = filtered
-    overrides = {"synthetic": {"static": {"min_run_s": 60}}, "elsewhere": {"min_segment_frames": 200}}
+    # At one frame in two seconds there is too little to search the calibration for mistakes: that is not what is tested.
+    own = {"static": {"min_run_s": 60}, "doctor": {"rate_hz": 0.5}}
+    overrides = {"synthetic": own, "elsewhere": {"min_segment_frames": 200}}
     config = FilterConfig.model_validate({"sources": overrides})
     assert config.for_source("synthetic").static.min_run_s == 60
     assert config.for_source("synthetic").static.max_image_change == config.static.max_image_change

@@ -55,7 +55,8 @@ def config(recordings: Path) -> CurateConfig:
 def both_digests(recordings: Path, output: Path, mapper: Any) -> tuple[str, str]:
     """Of the curated set and of its filtered index."""
     curate(config(recordings), {}, output / "set", mapper)
-    strict = FilterConfig.model_validate({"min_segment_frames": 2})
+    # Calibration is not what is tested here: at one frame in four seconds there is too little to search it for mistakes.
+    strict = FilterConfig.model_validate({"min_segment_frames": 2, "doctor": {"rate_hz": 0.25}})
     filter_episodes(strict, {"episodes": output / "set"}, output / "index", mapper)
     return digest_folder(output / "set"), digest_folder(output / "index")
 
@@ -83,7 +84,7 @@ def runner(kind: str, **settings: Any) -> RunnerConfig:
     return RunnerConfig.model_validate({"kind": kind, "episodes_per_shard": 3, **settings})
 
 
-@pytest.mark.parametrize("size", [1, 5, 100])
+@pytest.mark.parametrize("size", [1, 5])
 def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, size: int) -> None:
     assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 
@@ -119,7 +120,7 @@ def test_processes_share_the_temporary_server(recordings: Path, tmp_path: Path, 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
-@pytest.mark.parametrize(("kind", "workers"), [("processes", 1), ("processes", 2), ("dask", 2), ("ray", 2)])
+@pytest.mark.parametrize(("kind", "workers"), [("processes", 2), ("dask", 2), ("ray", 2)])
 def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, kind: str, workers: int) -> None:
     # Asked without importing: what Ray reads at its import is set by the mapper.
     if kind in ("dask", "ray") and find_spec(f"prefect_{kind}") is None:

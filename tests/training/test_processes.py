@@ -42,10 +42,10 @@ def run_processes(project: Path, folder: Path, runs: list[dict[str, Any]], count
             )
             for rank in range(count)
         ]
-        last = processes[-1].wait(timeout=200)
+        last = processes[-1].wait(timeout=400)
         try:
-            # Where one process is gone, the others must end by themselves within a minute.
-            return [process.wait(timeout=60 if last else 200) for process in processes[:-1]] + [last]
+            # Where one process is gone, the others must end by themselves.
+            return [process.wait(timeout=200) for process in processes[:-1]] + [last]
         finally:
             for process in processes:
                 process.kill()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -34,8 +35,10 @@ def benchmark() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("size", [0, 1, 2])
-@pytest.mark.parametrize(("precision", "accumulation", "checkpointing"), [("fp32", 1, "none"), ("bf16", 2, "block")])
+@pytest.mark.parametrize(
+    ("size", "precision", "accumulation", "checkpointing"),
+    [(0, "fp32", 1, "none"), (2, "fp32", 1, "none"), (0, "bf16", 2, "block"), (1, "bf16", 2, "block")],
+)
 def test_planned_memory_is_what_the_allocator_hands_out(
     benchmark: ModuleType, size: int, precision: str, accumulation: int, checkpointing: str
 ) -> None:
@@ -66,10 +69,10 @@ def estimate_of(config: WorldModelConfig, trainer: TrainerConfig, frames: int = 
 
 
 def test_deep_models_cost_what_two_shallow_ones_foretell(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = WorldModelConfig(towers="generation", num_layers=12)
+    config = WorldModelConfig(towers="generation", num_layers=8)
     estimate = estimate_of(config, TrainerConfig(steps=1))
     drawn = estimate(Spread()).cost
-    monkeypatch.setattr("worldline_core.model.step_cost._TRACED_LAYERS", (4, 12))
+    monkeypatch.setattr("worldline_core.model.step_cost._TRACED_LAYERS", (4, 8))
     traced = estimate(Spread()).cost
     assert drawn.flops == pytest.approx(traced.flops, rel=1e-9)
     assert drawn.activations == pytest.approx(traced.activations, rel=1e-3)
@@ -87,7 +90,7 @@ def test_operations_are_those_of_the_matrix_products() -> None:
 
 def test_shards_checkpointing_and_shorter_clips_are_proposed_in_this_order() -> None:
     config = WorldModelConfig(towers="generation", num_layers=2)
-    estimate = estimate_of(config, TrainerConfig(steps=1))
+    estimate = cache(estimate_of(config, TrainerConfig(steps=1)))
     plain, block = estimate(Spread()), estimate(Spread(checkpointing="block"))
     assert block.total < 0.9 * plain.total
 
