@@ -72,7 +72,7 @@ def kill_once_there(process: subprocess.Popen[bytes], folder: Path, pattern: str
     assert len(started) == 4  # torchrun starts two commands, in sessions of their own; each works in a child
     process.kill()
     process.wait()
-    until = time.monotonic() + 15
+    until = time.monotonic() + 60
     while any(map(is_running, started)):
         assert time.monotonic() < until, "processes live on without torchrun"
         time.sleep(0.1)

@@ -52,7 +52,7 @@ def lerobot(project_root: Path, uv: str, tmp_path_factory: pytest.TempPathFactor
     def run(folder: Path, command: str, *arguments: str) -> str:
         result = subprocess.run(
             [sys.executable, "-P", "-m", f"lerobot.scripts.{command}", *arguments],
-            cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=170,
+            cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=400,
         )  # fmt: skip
         assert result.returncode == 0, (result.stdout + result.stderr)[-4000:]
         return result.stdout + result.stderr

@@ -51,7 +51,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory, project_root: Path) ->
 
 
 def _wait_until_healthy(url: str, server: subprocess.Popen[bytes]) -> None:
-    deadline = time.time() + 90
+    deadline = time.time() + 180
     while time.time() < deadline and server.poll() is None:
         try:
             with urllib.request.urlopen(url, timeout=2):
@@ -161,7 +161,7 @@ def test_nightly_guards_on_a_real_server_and_worker(
         str(artifacts),
     ]
     third = subprocess.run(
-        [*command, "--night", "third"], env=environment, cwd=project_root, capture_output=True, text=True, check=False, timeout=200
+        [*command, "--night", "third"], env=environment, cwd=project_root, capture_output=True, text=True, check=False, timeout=400
     )  # fmt: skip
     assert third.returncode == 1
     assert metric in third.stderr
