@@ -53,43 +53,58 @@ def make_film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarr
     return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
 
 
-def _tracks(episode_id: str, points: np.ndarray) -> SimpleNamespace:
+def _tracks(episode_id: str, points: np.ndarray, path: np.ndarray) -> SimpleNamespace:
     views = len(VIEWS)
     uv = np.zeros((NUM_FRAMES, views, 1, 2))
     uv[:, 0] = points
     valid = np.zeros((NUM_FRAMES, views, 1), dtype=bool)
     valid[:, 0] = True
+    poses = np.tile(np.eye(4), (NUM_FRAMES, 1, 1, 1))
+    poses[:, 0, 2, 3] = path
     return SimpleNamespace(
         episode_id=episode_id, embodiment="box_arm", num_frames=NUM_FRAMES, views=VIEWS, arms=("right",),
         image_size=(HEIGHT, WIDTH), controls="action", camera_motion=("static",) * views, uv=uv, valid=valid,
         depth=np.ones((NUM_FRAMES, views, 1)), rot6d=np.zeros((NUM_FRAMES, views, 1, 6)),
-        gripper=np.zeros((NUM_FRAMES, views, 1)), T_base_tool=np.tile(np.eye(4), (NUM_FRAMES, 1, 1, 1)),
+        gripper=np.zeros((NUM_FRAMES, views, 1)), T_base_tool=poses,
         T_base_camera=np.tile(np.eye(4), (NUM_FRAMES, views, 1, 1)), K=np.tile(np.eye(3), (views, 1, 1)),
         capsules=np.zeros((NUM_FRAMES, 1, 2, 3)), capsule_radii=np.ones(1),
     )  # fmt: skip
 
 
 def _write(
-    root: Path, cases: dict[str, bool], *, split: str, bank: str | None, sources: dict[str, str] | None = None
+    root: Path,
+    cases: dict[str, bool],
+    *,
+    split: str,
+    bank: str | None,
+    sources: dict[str, str] | None = None,
+    training: int = 0,
+    late: tuple[str, ...] = (),
 ) -> SmallWorld:
+    """With ``training`` further recordings that nobody predicted; the robot of those that are ``late`` stands still at first."""
     episodes, tracks = root / "episodes", root / "tracks"
     methods = {"good": root / "good", "copy": root / "copy"}
     writers = {name: RolloutSetWriter(path, name, FPS) for name, path in methods.items()}
     index = []
     with EpisodeSetWriter(episodes, fps=FPS, image_size=(HEIGHT, WIDTH), pixel_format="yuv444p") as writer:
-        for number, (episode_id, success) in enumerate(cases.items()):
+        learned = {f"train-{number:02d}": bool(number % 2) for number in range(training)}
+        for number, (episode_id, success) in enumerate({**cases, **learned}.items()):
             frames, masks, points = make_film(success, seed=0 if bank else number)
             state = np.zeros((NUM_FRAMES, 2), dtype=np.float32)
             episode = Episode(
                 episode_id=episode_id, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm", scene=f"scene_{number % 2}",
                 task_family="lift", instruction="lift the red cube",
-                outcome="unknown" if bank else ("success" if success else "failure"), split=split, fps=FPS,
+                outcome="unknown" if bank else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
                 state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
                 candidate=number if bank else None,
             )  # fmt: skip
             cube = (frames["head"] == (220, 20, 20)).all(axis=-1).astype(np.uint8)
             writer.add(episode, frames, {"head": masks}, thing_labels={"head": cube})
-            index += write_shard(tracks, number, [_tracks(episode_id, points)])
+            waits = 8 if episode_id in late else 0
+            path = 0.02 * (1 + 0.01 * number) * np.maximum(np.arange(NUM_FRAMES) - waits, 0)
+            index += write_shard(tracks, number, [_tracks(episode_id, points, path if training else 0 * path)])
+            if episode_id in learned:
+                continue
             writers["good"].add(episode_id, 0, frames)
             writers["copy"].add(
                 episode_id, 0, {view: np.repeat(video[:1], NUM_FRAMES, 0) for view, video in frames.items()}
@@ -115,6 +130,13 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     cases = {f"{name}-{start}": start < wins for name, wins in (("a", 3), ("b", 2), ("c", 0)) for start in range(3)}
     root = tmp_path_factory.mktemp("policies")
     return _write(root, cases, split="test", bank=None, sources={name: f"policy_{name[0]}" for name in cases})
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+    """Two attempts beside the recordings that the model knows; the second one begins later than any of these."""
+    root = tmp_path_factory.mktemp("trained")
+    return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=20, late=("late",))
 
 
 @pytest.fixture(scope="session")

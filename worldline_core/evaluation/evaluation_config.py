@@ -144,6 +144,20 @@ class VideoEvaluationConfig(StrictModel):
         }
 
 
+class TrustConfig(StrictModel):
+    """When a verdict on a predicted video is marked "do not trust"."""
+
+    novelty_level: float = Field(
+        default=0.05, gt=0, lt=0.5, description="share of the training recordings that would count as new themselves"
+    )
+    least_trust: float = Field(
+        default=0.6, ge=0, le=1, description="verdicts that are less likely to be right than this are marked"
+    )
+    compare_with: dict[str, str] = Field(
+        default={}, description="of a method, another one: where verdicts on both differ, they are less to be trusted"
+    )
+
+
 class PolicyEvaluationConfig(StrictModel):
     """Who judges, and what."""
 
@@ -159,6 +173,12 @@ class PolicyEvaluationConfig(StrictModel):
         default=False,
         description="a source of the episodes is a policy: compare their recorded and predicted success rates",
         exclude_if=lambda value: not value,
+    )
+    trust: TrustConfig | None = Field(
+        default=None,
+        description="say of each verdict how far it is to be trusted; recordings of the training splits among the episodes "
+        "tell what is new to the model",
+        exclude_if=lambda value: value is None,
     )
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)

@@ -26,7 +26,7 @@ SCORES_FILE = "scores.parquet"
 SUMMARY_FILE = "summary.json"
 _TYPES = {
     **dict.fromkeys(("seed", "run", "budget", "frame", "count", "answers", "malformed_answers"), pa.int32()),
-    **dict.fromkeys(("value", "mean"), pa.float64()),
+    **dict.fromkeys(("value", "mean", "doubt", "disagreement", "new_controls", "new_setup", "trust"), pa.float64()),
 }
 """Columns of the tables that evaluations write; all others are strings."""
 

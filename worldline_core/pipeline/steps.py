@@ -296,7 +296,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        11,
+        12,
         "worldline_core.report.report",
         "report",
         "report.context.ReportConfig",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
 from worldline_core.pages.page import Table, interval, number, percent, words
 from worldline_core.report.context import ReportContext, Section
+from worldline_core.report.verdicts import DECISIONS_FILE, failure_tables, task_confusion, trust_view
 from worldline_core.report.video_scores import SPLIT_LABELS, TRUE_METHOD, in_order
-from worldline_core.store.artifact_files import JsonObject
+from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
 
 ALL = "all"
 
@@ -22,11 +25,18 @@ def policy_section(context: ReportContext) -> Section:
         " succeeded. As many successes as failures are judged in every split and family, so guessing is right in half of the"
         " cases. Accuracy is agreement with the recorded outcome; on the recorded videos themselves it is the judge's own ceiling."
     )
-    return context.section("policy", title, lead, evaluations=[policy_evaluation(summary) for summary in found])
+    folders = [
+        path for path in context.variants("evaluate_policy").values() if read_json(path / "summary.json").get("methods")
+    ]
+    evaluations = [
+        policy_evaluation(summary, read_rows(folder / DECISIONS_FILE))
+        for summary, folder in zip(found, folders, strict=True)
+    ]
+    return context.section("policy", title, lead, evaluations=evaluations)
 
 
-def policy_evaluation(summary: JsonObject) -> dict[str, object]:
-    """What the page shows of one evaluation."""
+def policy_evaluation(summary: JsonObject, verdicts: Sequence[JsonObject] = ()) -> dict[str, object]:
+    """What the page shows of one evaluation; ``verdicts`` are the rows of its decisions.parquet."""
     results = summary["methods"]
     methods = in_order(results)
     dots = [
@@ -43,7 +53,11 @@ def policy_evaluation(summary: JsonObject) -> dict[str, object]:
     short = sorted((summary.get("shorter_than_recording") or {}).items())
     ranking = policy_ranking(summary["policies"]) if summary.get("policies") else None
     groups = group_table(results)
-    return {"chart": chart, "confusions": confusions, "short": short, "groups": groups, "ranking": ranking}
+    trust = trust_view(summary["trust"]) if summary.get("trust") else None
+    return {
+        "chart": chart, "confusions": confusions, "short": short, "groups": groups, "ranking": ranking, "trust": trust,
+        "tasks": task_confusion(verdicts), "failures": failure_tables(verdicts),
+    }  # fmt: skip
 
 
 def policy_ranking(policies: JsonObject) -> dict[str, object]:

@@ -38,13 +38,14 @@ def spearman(a: Float[np.ndarray, "*r p"], b: Float[np.ndarray, "*r p"]) -> Floa
 
 
 def mmrv(recorded: Float[np.ndarray, "*r p"], predicted: Float[np.ndarray, "*r p"]) -> Float[np.ndarray, "*r"]:
-    """``mean_i max_j |R_i - R_j| [(S_i > S_j) != (R_i > R_j)]``, R recorded and S predicted rates."""
+    """``mean_i max_j |R_i - R_j| [(S_i > S_j) != (R_i > R_j)]``, R recorded and S predicted rates; NaN where one is unknown."""
 
     def over(rates: np.ndarray) -> np.ndarray:
         return rates[..., :, None] > rates[..., None, :]
 
     gap = np.abs(recorded[..., :, None] - recorded[..., None, :])
-    return (gap * (over(predicted) != over(recorded))).max(-1).mean(-1)
+    unknown = np.isnan(recorded + predicted).any(-1)
+    return np.where(unknown, np.nan, (gap * (over(predicted) != over(recorded))).max(-1).mean(-1))
 
 
 def _statistics(recorded: np.ndarray, predicted: np.ndarray) -> dict[str, np.ndarray]:
@@ -70,7 +71,8 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
 
     Args:
         rows: verdicts with method, policy, start, task, episode_id, outcome and predicted; several of one episode (seeds of
-            a prediction) are averaged.
+            a prediction) are averaged. Where predicted is None a verdict is left out: the recorded rate counts the
+            attempt, the predicted rate does not, and a policy of which all are left out is not ranked.
 
     Returns:
         {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value", "over_starts":
@@ -85,7 +87,9 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
         of_method = [row for row in rows if row["method"] == method]
         for task in (ALL, *sorted({row["task"] for row in of_method})):
             chosen = [row for row in of_method if task in (ALL, row["task"])]
-            if len({row["policy"] for row in chosen}) > 2:
+            ranked = {row["policy"] for row in chosen if row["predicted"] is not None}
+            chosen = [row for row in chosen if row["policy"] in ranked]
+            if len(ranked) > 2:
                 found[method][task] = _agreement(chosen, resamples=resamples, seed=seed)
     return dict(found)
 
@@ -93,7 +97,7 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
 def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
     policies, recorded, predicted = _tables(rows)
     attempts = np.isfinite(recorded).sum(-1)
-    rates = np.nanmean(recorded, -1), np.nanmean(predicted, -1)
+    rates = _mean(recorded), _mean(predicted)
     values = _statistics(*rates)
     random = np.random.default_rng(seed)
     over_starts = _resampled_rates(recorded, predicted, resamples, random)
@@ -119,13 +123,20 @@ def _tables(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], np.ndarray, n
     """Policies, and recorded and predicted success ``(p, n)`` of each at each start; NaN where it did not try it."""
     cells: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
-        ends = float(row["outcome"] == "success"), float(row["predicted"] == "success")
-        cells[row["policy"], row["start"]].append(ends)
+        predicted = np.nan if row["predicted"] is None else float(row["predicted"] == "success")
+        cells[row["policy"], row["start"]].append((float(row["outcome"] == "success"), predicted))
     policies, starts = (sorted({key[side] for key in cells}) for side in (0, 1))
     table = np.full((2, len(policies), len(starts)), np.nan)
     for (policy, start), ends in cells.items():
-        table[:, policies.index(policy), starts.index(start)] = np.mean(ends, axis=0)
+        table[:, policies.index(policy), starts.index(start)] = _mean(np.array(ends).T)
     return policies, table[0], table[1]
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Mean along the last axis of what is known there; NaN where nothing is."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.where(known, values, 0.0).sum(-1) / known.sum(-1)
 
 
 def _resampled_rates(
@@ -136,12 +147,15 @@ def _resampled_rates(
     if tried.all():
         index = random.integers(0, recorded.shape[1], (resamples, recorded.shape[1]))
         counts = np.stack([np.bincount(row, minlength=recorded.shape[1]) for row in index]) / recorded.shape[1]
-        return counts @ recorded.T, counts @ predicted.T
+        known = np.isfinite(predicted)
+        with np.errstate(invalid="ignore"):
+            judged = np.where(known.all(-1), 1.0, counts @ known.T.astype(np.float64))
+            return counts @ recorded.T, counts @ np.nan_to_num(predicted).T / judged
     rates = np.empty((2, resamples, len(recorded)))
     for policy, own in enumerate(tried):
         index = random.integers(0, own.sum(), (resamples, own.sum()))
         rates[0, :, policy] = recorded[policy, own][index].mean(-1)
-        rates[1, :, policy] = predicted[policy, own][index].mean(-1)
+        rates[1, :, policy] = _mean(predicted[policy, own][index])
     return rates[0], rates[1]
 
 

@@ -23,8 +23,10 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
-from worldline_core.evaluation.policy.judge import Judge, judge_trajectory
+from worldline_core.evaluation.policy.judge import Judge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
+from worldline_core.evaluation.policy.novelty import KnownSetting
+from worldline_core.evaluation.policy.trust import TRUST_COLUMNS, trust_verdicts
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import (
     TRUE_METHOD,
@@ -66,12 +68,14 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
 
     Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
     Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json (with
-    ``compare_policies`` also how success rates of policies agree: ``agreement.py``).
+    ``compare_policies`` also how success rates of policies agree: ``agreement.py``; with ``trust`` how far verdicts are to be
+    trusted: ``trust.py``).
     """
     episodes = EpisodeSet.open(inputs["episodes"])
     rollouts = open_rollouts(inputs)
     tracks = open_tracks(inputs)
     judge = open_judge(config, inputs.get("segmenter"))
+    known = None if config.trust is None else KnownSetting.of(episodes, tracks, config.trust)
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
     times = Counter(name for names in predicted.values() for name in names)
     rows = rows_of(episodes, times)
@@ -112,6 +116,7 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
                 "predicted": "success" if verdict["success"] else "failure",
                 "evidence_family": verdict["family"],
                 "evidence": json.dumps(verdict["statements"], sort_keys=True),
+                "confidence": confidence_of(verdict),
             })  # fmt: skip
     if too_short:
         logger.warning("Predictions shorter than their recordings were not judged: %s", dict(too_short))
@@ -138,17 +143,23 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
             got=f"{len(rows)} predicted episodes: {left_out}",
             next_step="predict recordings with known outcomes, or leave the judgement out: evaluate_policy: null",
         )
-    policies: dict[str, Any] = {}
+    facts: dict[str, Any] = {"shorter_than_recording": dict(too_short)}
+    resampling = {"resamples": config.resamples, "seed": config.seed}
+    attempts = {row.episode_id: {"policy": row.source, "start": row.bank or row.episode_id} for row in chosen}
+    labelled = [
+        {"task": _verb(decision["instruction"]), **attempts[decision["episode_id"]], **decision}
+        for decision in decisions
+    ]
     if config.compare_policies:
-        attempts = {row.episode_id: {"policy": row.source, "start": row.bank or row.episode_id} for row in chosen}
-        labelled = [
-            {"task": _verb(decision["instruction"]), **attempts[decision["episode_id"]], **decision}
-            for decision in decisions
-        ]
-        policies["policies"] = policy_agreement(labelled, resamples=config.resamples, seed=config.seed)
-    return counts | _write(
-        config, decisions, policies | {"shorter_than_recording": dict(too_short)}, judge.name, output
-    )
+        facts["policies"] = policy_agreement(labelled, **resampling)
+    if config.trust is not None and known is not None:
+        news = {name: known.novelties(name) for name in {row["episode_id"] for row in labelled}}
+        of_predictions = [{**row, **news[row["episode_id"]]} for row in labelled if row["method"] != TRUE_METHOD]
+        trusted, methods = trust_verdicts(of_predictions, config.trust, policies=config.compare_policies, **resampling)
+        facts["trust"] = {"settings": config.trust.model_dump(), "training_recordings": known.count, "methods": methods}
+        columns = dict.fromkeys(TRUST_COLUMNS)
+        decisions = [{**columns, **row} for row in labelled if row["method"] == TRUE_METHOD] + trusted
+    return counts | _write(config, decisions, facts, judge.name, output)
 
 
 def _verb(instruction: str) -> str:
@@ -184,7 +195,8 @@ def choose_trajectories(
 def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
     """The judge that the config names."""
     if config.judge == "measured":
-        return MeasuredEvidenceJudge(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
+        opened = open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights)
+        return MeasuredEvidenceJudge(opened, states_confidence=config.trust is not None)
     return VLMJudge(open_vlm(config.judge, config.vlm))
 
 
@@ -192,7 +204,7 @@ def _write(
     config: PolicyEvaluationConfig, rows: list[dict[str, Any]], facts: dict[str, Any], judge: str, output: Path
 ) -> dict[str, Any]:
     rows = sorted(rows, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
-    write_table(output / DECISIONS_FILE, rows, _COLUMNS)
+    write_table(output / DECISIONS_FILE, rows, _COLUMNS if config.trust is None else (*_COLUMNS, *TRUST_COLUMNS))
     write_scores(
         output,
         [

@@ -11,6 +11,7 @@ is never taken for the favourable value, and a wrong object or a drop fails.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, StrictBool
@@ -135,3 +136,23 @@ def reconciliation_establishes_success(reconciliation: Reconciliation, evidence:
 def motion_establishes_success(motion: MotionEvidence, evidence: Evidence) -> bool:
     """P5 may turn an unsuccessful lift or state change, but not against a wrong object or a drop that was seen."""
     return motion.task_effect_completed is True and evidence.wrong_object_or_drop is not True
+
+
+def failure_kind(family: EvidenceFamily, stated: Mapping[str, Any]) -> str:
+    """What the evidence of an unsuccessful video says went wrong.
+
+    ``dropped`` (or the wrong object), ``missed`` (it never left its place, or was never held), ``slipped`` (it was raised
+    and is not held in the end), ``not done`` (the final state of a placing, closing or pressing is not seen), or ``not seen``
+    where the facts are hidden in every view.
+    """
+    if stated.get("wrong_object_or_drop"):
+        return "dropped"
+    held = stated.get("target_held_for_two_late_steps")
+    if family == "state_change":
+        return "not done" if stated.get("required_final_state_visible") is False else "not seen"
+    if family == "grasp":
+        return "missed" if held is False else "not seen"
+    raised = stated.get("head_view_confirms_target_displacement")
+    if raised is False or (raised and stated.get("target_on_original_support_at_end")):
+        return "missed"
+    return "slipped" if held is False else "not seen"

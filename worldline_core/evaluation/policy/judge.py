@@ -7,6 +7,7 @@ reconciliation for state changes; a twelve-frame motion check for lifts and stat
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -84,6 +85,16 @@ def motion_indices(num_frames: int, count: int = MOTION_COUNT) -> tuple[int, ...
 def frames_at(positions: np.ndarray | tuple[float, ...], num_frames: int) -> tuple[int, ...]:
     """Nearest frames of normalised positions, in order; a frame that two positions share is shown once."""
     return tuple(sorted({round(float(position) * (num_frames - 1)) for position in positions}))
+
+
+def confidence_of(judgement: Mapping[str, Any]) -> float | None:
+    """Confidence in a verdict (of a `Judgement` as a dict): that of the evidence which established success, else the least that
+    was stated, for a failure is as sure as the least sure of its passes. None where none was stated."""
+    stated = [float(s["confidence"]) for s in judgement["statements"] if s.get("confidence") is not None]
+    if not stated:
+        return None
+    by_evidence = judgement["decided_by"] in ("first_pass", "verification")
+    return min(1.0, max(0.0, stated[-1] if judgement["success"] and by_evidence else min(stated)))
 
 
 Pass = Literal["first_pass", "verification", "reconciliation", "motion"]

@@ -169,12 +169,17 @@ def _robot_late(segmenter: Segmenter, head: np.ndarray, points: np.ndarray | Non
 
 
 class MeasuredEvidenceJudge:
-    """Colour tracking in the head view, agreement of the wrist views, robot mask by a segmenter."""
+    """Colour tracking in the head view, agreement of the wrist views, robot mask by a segmenter.
+
+    Args:
+        states_confidence: how far what was measured is from the thresholds, as `score` says it.
+    """
 
     name = "measured"
 
-    def __init__(self, segmenter: Segmenter) -> None:
+    def __init__(self, segmenter: Segmenter, *, states_confidence: bool = False) -> None:
         self.segmenter = segmenter
+        self.states_confidence = states_confidence
 
     def extract(
         self, trajectory: Trajectory, family: EvidenceFamily, indices: tuple[int, ...], height_px: int
@@ -201,4 +206,8 @@ class MeasuredEvidenceJudge:
         frames = {view: video[chosen] for view, video in trajectory.frames.items()}
         points = None if trajectory.points is None else trajectory.points[chosen]
         measured = measure(self.segmenter, trajectory.instruction, family, frames, points)
-        return facts(measured, trajectory.instruction, family)
+        evidence = facts(measured, trajectory.instruction, family)
+        if not self.states_confidence or measured is None:
+            return evidence
+        done = score(measured)
+        return evidence.model_copy(update={"confidence": done if establishes_success(evidence) else 1.0 - done})

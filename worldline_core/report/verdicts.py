@@ -1,0 +1,231 @@
+"""What the single verdicts of a policy evaluation tell: confusion by task, what went wrong, and which to trust."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+from markupsafe import Markup
+
+from worldline_core.evaluation.policy.agreement import STATISTICS
+from worldline_core.evaluation.policy.evidence import failure_kind
+from worldline_core.evaluation.policy.trust import SIGNALS
+from worldline_core.pages.charts import Series, line_chart
+from worldline_core.pages.page import Table, noted, number, percent, words
+from worldline_core.report.video_scores import TRUE_METHOD, Method, in_order, predicting
+from worldline_core.store.artifact_files import JsonObject
+
+DECISIONS_FILE = "decisions.parquet"
+MARK = Markup('<strong class="mark">do not trust</strong>')
+
+
+def task_confusion(verdicts: Sequence[JsonObject]) -> Table | None:
+    """Of the recorded successes and failures of every task (the first word of the instruction), those judged rightly."""
+    counts: Counter[tuple[str, str, str, bool]] = Counter()
+    for row in verdicts:
+        counts[row["method"], _task(row), row["outcome"], row["predicted"] == row["outcome"]] += 1
+    tasks = sorted({task for _, task, _, _ in counts})
+    if len(tasks) < 2:
+        return None
+
+    def cell(method: str, task: str, outcome: str) -> str | None:
+        right, wrong = (counts[method, task, outcome, judged] for judged in (True, False))
+        return f"{right} of {right + wrong}" if right + wrong else None
+
+    rows = [
+        [m.long_label, task, *[cell(m.name, task, outcome) for outcome in ("success", "failure")]]
+        for m in in_order({method for method, _, _, _ in counts})
+        for task in tasks
+    ]
+    headings = ["Videos of", "Task", "Successes judged rightly", "Failures judged rightly"]
+    return Table(headings, rows, (2, 3), "Confusion by task", dense=True)
+
+
+def failure_tables(verdicts: Sequence[JsonObject]) -> list[Table]:
+    """Of every method: what its videos say went wrong (columns), beside what the recorded videos say (rows)."""
+    kinds = {(row["method"], row["episode_id"]): _kind(row) for row in verdicts if row["method"] == TRUE_METHOD}
+    counts: dict[str, Counter[tuple[str, str]]] = defaultdict(Counter)
+    for row in verdicts:
+        recorded = kinds.get((TRUE_METHOD, row["episode_id"]))
+        if row["method"] != TRUE_METHOD and recorded is not None:
+            counts[row["method"]][recorded, _kind(row)] += 1
+    tables = []
+    for m in predicting(counts):
+        found = counts[m.name]
+        order = sorted({kind for pair in found for kind in pair}, key=lambda kind: (kind != "success", kind))
+        rows = [[kind, *[found[kind, other] for other in order]] for kind in order]
+        tables.append(
+            Table(
+                ["Recorded video", *order],
+                rows,
+                range(1, len(order) + 1),
+                f"What is seen in videos of {m.long_label}",
+                dense=True,
+            )
+        )
+    return tables
+
+
+def _task(row: JsonObject) -> str:
+    return (row["instruction"].split() or ["none"])[0].lower()
+
+
+def _kind(row: JsonObject) -> str:
+    """``success``, or what the last evidence that was stated says went wrong."""
+    if row["predicted"] == "success":
+        return "success"
+    stated = [s for s in json.loads(row["evidence"]) if s["pass"] in ("first_pass", "verification")]
+    return failure_kind(row["evidence_family"], stated[-1])
+
+
+def trust_view(trust: JsonObject) -> dict[str, object]:
+    """Reliability, risk against coverage, what the signals tell, and the marks."""
+    methods = trust["methods"]
+    known = [m for m in predicting(methods) if methods[m.name]["available"]]
+    reliability = [
+        Series(
+            m.long_label, *[[b[key] for b in methods[m.name]["reliability"]] for key in ("trust", "value", "low", "high")],
+            colour=m.colour, markers=True,
+        )
+        for m in known
+    ]  # fmt: skip
+    lowest = min((x for series in reliability for x in series.x), default=0.0)
+    charts = [
+        line_chart(
+            [*reliability, Series("calibrated", [lowest, 1.0], [lowest, 1.0], colour="c5", dashed=True)],
+            title="Are verdicts right as often as they say?", x_label="stated probability of a right verdict",
+            y_label="share of right verdicts, 95 % interval", in_percent=True,
+        ),
+        line_chart(
+            [_coverage(methods[m.name]["coverage"], m.long_label, m.colour) for m in known],
+            title="What is gained where the least trusted are left out", x_label="share of the verdicts that are kept",
+            y_label="wrong among the kept, 95 % interval", in_percent=True,
+        ),
+    ] if known else []  # fmt: skip
+    return {
+        "recordings": trust["training_recordings"],
+        "level": percent(trust["settings"]["novelty_level"]),
+        "least": percent(trust["settings"]["least_trust"]),
+        "unavailable": [(m.long_label, methods[m.name]["reason"]) for m in predicting(methods) if m not in known],
+        "charts": charts,
+        "tables": [
+            _detection(methods, known),
+            _rankings(methods, known),
+            _marked_policies(methods),
+            *_least(methods, known),
+        ],
+    }
+
+
+def _coverage(coverage: JsonObject, label: str, colour: str) -> Series:
+    shares = sorted(coverage, key=float)
+    mean, low, high = ([coverage[share][key] for share in shares] for key in ("value", "low", "high"))
+    return Series(label, [float(share) for share in shares], mean, low, high, colour)
+
+
+def _told(found: JsonObject, bounds: tuple[str, str] = ("low", "high")) -> object:
+    """A value with its interval; None where it is not defined."""
+    if found["value"] is None:
+        return None
+    low, high = (found[key] for key in bounds)
+    return noted(number(found["value"]), "" if low is None else f"[{number(low)}, {number(high)}]")
+
+
+def _detection(methods: JsonObject, known: Sequence[Method]) -> Table | None:
+    """How well wrong verdicts are told from right ones, by each signal alone and together, and what the marks do."""
+    if not known:
+        return None
+    rows: list[list[object]] = []
+    for m in known:
+        found = methods[m.name]
+        signals = [_told(found["signals"][name]["auroc"]) if name in found["signals"] else None for name in SIGNALS]
+        errors = [_told(found["marked"][name]) for name in ("error", "error_of_others")]
+        rows.append([
+            m.long_label, found["verdicts"], _told(found["error"]), *signals, _told(found["auroc"]),
+            _told(found["calibration_error"]), found["marked"]["count"], *errors,
+        ])  # fmt: skip
+    headings = [
+        "Verdicts on videos of", "Verdicts", "Wrong", *[f"AUROC of {words(name)}" for name in SIGNALS], "AUROC of trust",
+        "Calibration error", "Marked", "Wrong among marked", "Wrong among others",
+    ]  # fmt: skip
+    caption = "How well trust tells wrong verdicts from right ones (AUROC: 0.5 is chance), 95 % interval over starts"
+    return Table(headings, rows, range(1, len(headings)), caption, dense=True)
+
+
+def _rankings(methods: JsonObject, known: Sequence[Method]) -> Table | None:
+    """How policies rank without the least trusted verdicts, against the recorded rates of all attempts."""
+    rows: list[list[object]] = []
+    for m in known:
+        for kept, found in methods[m.name].get("policies", {}).items():
+            what = kept if kept.startswith("not") else f"{percent(float(kept))} most trusted"
+            cells = [_told({**found[s], **_both(found[s])}) if s in found else None for s in STATISTICS]
+            same = found.get("with_all_verdicts", {}).get("pearson")
+            rows.append(
+                [m.long_label, what, found["ranked"], *cells, None if same is None else _told({**same, **_both(same)})]
+            )
+    if not rows:
+        return None
+    headings = [
+        "Videos of",
+        "Verdicts",
+        "Policies",
+        "Pearson r",
+        "Spearman rho",
+        "MMRV",
+        "Error of rates",
+        "r with all their verdicts",
+    ]
+    caption = "Agreement of the policies' success rates where other verdicts are left out, 95 % interval over starts and policies"
+    return Table(headings, rows, range(2, 8), caption, dense=True)
+
+
+def _both(found: JsonObject) -> JsonObject:
+    low, high = found["over_starts_and_policies"] or (None, None)
+    return {"low": low, "high": high}
+
+
+def _marked_policies(methods: JsonObject) -> Table | None:
+    """Share of the marked verdicts of every source of episodes; one most of whose verdicts are marked bears the mark itself."""
+    shown = predicting(methods)
+    shares = {m.name: methods[m.name]["marked"]["policies"] for m in shown}
+    names = sorted({name for found in shares.values() for name in found})
+    if len(names) < 2:
+        return None
+    rows: list[list[object]] = []
+    for name in sorted(names, key=lambda name: -max(found.get(name, 0.0) for found in shares.values())):
+        found = [shares[m.name].get(name) for m in shown]
+        rows.append(
+            [
+                name,
+                *[None if x is None else percent(x) for x in found],
+                MARK if max(x or 0.0 for x in found) > 0.5 else "",
+            ]
+        )
+    headings = ["Policy", *[m.long_label for m in shown], ""]
+    return Table(headings, rows, range(1, len(shown) + 1), "Marked verdicts by policy", dense=True)
+
+
+def _least(methods: JsonObject, known: Sequence[Method]) -> list[Table]:
+    """The least trusted verdicts of every method."""
+    headings = ["Episode", "Judged", "Recorded", "Trust", "Why", ""]
+    return [
+        Table(
+            headings,
+            [
+                [
+                    v["episode_id"],
+                    v["predicted"],
+                    v["outcome"],
+                    number(v["trust"]),
+                    v["do_not_trust"],
+                    MARK if v["do_not_trust"] else "",
+                ]
+                for v in methods[m.name]["least_trusted"]
+            ],
+            (3,),
+            f"The least trusted verdicts on videos of {m.long_label}",
+            dense=True,
+        )
+        for m in known
+    ]
