@@ -184,7 +184,7 @@ def test_the_confidence_in_a_verdict_is_that_of_its_evidence(success, decided_by
     assert confidence_of({"success": success, "decided_by": decided_by, "statements": statements}) == expected
 
 
-def path(random, *, waits=0, arms=1, body="arm", camera=0.0, frames=33):
+def path(random: np.random.Generator, *, waits=0, arms=1, body="arm", camera=0.0, frames=33):
     """Tracks of a tool that moves 3 cm a frame or so along x, after it has waited."""
     poses = np.tile(np.eye(4), (frames, arms, 1, 1))
     speed = 0.03 * random.uniform(0.8, 1.2)
