@@ -101,7 +101,8 @@ def _write(
             cube = (frames["head"] == (220, 20, 20)).all(axis=-1).astype(np.uint8)
             writer.add(episode, frames, {"head": masks}, thing_labels={"head": cube})
             waits = 8 if episode_id in late else 0
-            path = 0.02 * (1 + 0.01 * number) * np.maximum(np.arange(NUM_FRAMES) - waits, 0)
+            speed = 0.02 + 0.0002 * (number if episode_id in learned else 11.5)
+            path = speed * np.maximum(np.arange(NUM_FRAMES) - waits, 0)
             index += write_shard(tracks, number, [_tracks(episode_id, points, path if training else 0 * path)])
             if episode_id in learned:
                 continue

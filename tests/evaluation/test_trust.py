@@ -326,7 +326,7 @@ def test_the_page_shows_the_mark_the_calibration_and_what_went_wrong(known):
     }
     page = str(render("report/policy.html", evaluations=[policy_evaluation(summary, shown)]))
     assert page.count("do not trust</strong>") >= 5
-    for told in ("Are verdicts right as often", "least trusted are left out", "AUROC of trust", "600 training", "Confusion by task",
+    for told in ("Are verdicts right as often", "least trusted are left out", "AUROC (0.5 is chance)", "Wrong among marked", "600 training", "Confusion by task",
                  "What is seen in videos of model", "new controls"):  # fmt: skip
         assert told in page
     unknown = {

@@ -105,12 +105,13 @@ def trust_view(trust: JsonObject) -> dict[str, object]:
     ] if known else []  # fmt: skip
     return {
         "recordings": trust["training_recordings"],
-        "level": percent(trust["settings"]["novelty_level"]),
+        "within": percent(1.0 - trust["settings"]["novelty_level"]),
         "least": percent(trust["settings"]["least_trust"]),
         "unavailable": [(m.long_label, methods[m.name]["reason"]) for m in predicting(methods) if m not in known],
         "charts": charts,
         "tables": [
             _detection(methods, known),
+            _marks(methods, known),
             _rankings(methods, known),
             _marked_policies(methods),
             *_least(methods, known),
@@ -133,32 +134,38 @@ def _told(found: JsonObject, bounds: tuple[str, str] = ("low", "high")) -> objec
 
 
 def _detection(methods: JsonObject, known: Sequence[Method]) -> Table | None:
-    """How well wrong verdicts are told from right ones, by each signal alone and together, and what the marks do."""
-    if not known:
-        return None
+    """How well wrong verdicts are told from right ones, by each signal alone and together."""
     rows: list[list[object]] = []
     for m in known:
         found = methods[m.name]
         signals = [_told(found["signals"][name]["auroc"]) if name in found["signals"] else None for name in SIGNALS]
-        errors = [_told(found["marked"][name]) for name in ("error", "error_of_others")]
-        rows.append([
-            m.long_label, found["verdicts"], _told(found["error"]), *signals, _told(found["auroc"]),
-            _told(found["calibration_error"]), found["marked"]["count"], *errors,
-        ])  # fmt: skip
-    headings = [
-        "Verdicts on videos of", "Verdicts", "Wrong", *[f"AUROC of {words(name)}" for name in SIGNALS], "AUROC of trust",
-        "Calibration error", "Marked", "Wrong among marked", "Wrong among others",
-    ]  # fmt: skip
-    caption = "How well trust tells wrong verdicts from right ones (AUROC: 0.5 is chance), 95 % interval over starts"
-    return Table(headings, rows, range(1, len(headings)), caption, dense=True)
+        rows.append([m.long_label, *signals, _told(found["auroc"]), _told(found["calibration_error"])])
+    headings = ["Verdicts on videos of", *[words(name).capitalize() for name in SIGNALS], "Trust", "Calibration error"]
+    caption = "How well wrong verdicts are told from right ones: AUROC (0.5 is chance), 95 % interval over starts"
+    return Table(headings, rows, range(1, len(headings)), caption, dense=True) if rows else None
+
+
+def _marks(methods: JsonObject, known: Sequence[Method]) -> Table | None:
+    """How many verdicts are marked, and how often marked ones and others are wrong."""
+    rows: list[list[object]] = []
+    for m in known:
+        found = methods[m.name]
+        errors = [found["error"], found["marked"]["error"], found["marked"]["error_of_others"]]
+        rows.append([m.long_label, found["verdicts"], found["marked"]["count"], *map(_told, errors)])
+    headings = ["Verdicts on videos of", "Verdicts", "Marked", "Wrong", "Wrong among marked", "Wrong among others"]
+    return (
+        Table(headings, rows, range(1, 6), "What the marks leave out, 95 % interval over starts", dense=True)
+        if rows
+        else None
+    )
 
 
 def _rankings(methods: JsonObject, known: Sequence[Method]) -> Table | None:
     """How policies rank without the least trusted verdicts, against the recorded rates of all attempts."""
     rows: list[list[object]] = []
     for m in known:
-        for kept, found in methods[m.name].get("policies", {}).items():
-            what = kept if kept.startswith("not") else f"{percent(float(kept))} most trusted"
+        for kept, found in sorted(methods[m.name].get("policies", {}).items(), key=_leaving_out):
+            what = {"1.00": "all", "not marked": kept}.get(kept) or f"{percent(float(kept))} most trusted"
             cells = [_told({**found[s], **_both(found[s])}) if s in found else None for s in STATISTICS]
             same = found.get("with_all_verdicts", {}).get("pearson")
             rows.append(
@@ -178,6 +185,12 @@ def _rankings(methods: JsonObject, known: Sequence[Method]) -> Table | None:
     ]
     caption = "Agreement of the policies' success rates where other verdicts are left out, 95 % interval over starts and policies"
     return Table(headings, rows, range(2, 8), caption, dense=True)
+
+
+def _leaving_out(choice: tuple[str, JsonObject]) -> tuple[bool, str]:
+    """All verdicts first, then fewer and fewer of the most trusted, then those without a mark."""
+    kept = choice[0]
+    return kept.startswith("not"), "" if kept.startswith("not") else f"{1 - float(kept):.2f}"
 
 
 def _both(found: JsonObject) -> JsonObject:

@@ -1,9 +1,9 @@
 """Which verdicts on predicted videos deserve trust, and what is gained where the others are left out.
 
 Signals of a prediction: how doubtful the judge's verdict is (its stated confidence, averaged over the seeds that an episode was
-predicted with, so that seeds which disagree make doubt), how far verdicts on another model's prediction differ, how new the controls are, and how new the body and its head camera are
-(:mod:`worldline_core.evaluation.policy.novelty`). A logistic model turns them into the probability that the verdict is right.
-Its weights may not be positive: more doubt is never more trust. The starts are halved; verdicts of either half are
+predicted with, so that seeds which disagree make doubt), how far another model's prediction speaks against it, how new the
+controls are, and how new the body and its head camera are (:mod:`worldline_core.evaluation.policy.novelty`). A logistic model
+turns them into the probability that the verdict is right. Its weights may not be positive: more doubt is never more trust. The starts are halved; verdicts of either half are
 calibrated with the other half alone, so every figure is of verdicts that played no part in their own calibration.
 
 Intervals are bootstraps over starts. Axis legend: n verdicts, s signals, k resamples (the first row stands for the sample).
