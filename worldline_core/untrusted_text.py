@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from urllib.parse import quote
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What moves a terminal's cursor or turns the direction of the text around it. Line breaks and tabs stay."""
@@ -46,6 +48,14 @@ def without_credentials(text: str) -> str:
     for name, value in os.environ.items():
         if len(value) >= _SHORTEST_SECRET and _SECRET_VARIABLE.search(name):
             text = text.replace(value, HIDDEN)
+    return text
+
+
+def without_secret(text: str, secret: str) -> str:
+    """A text without a secret, in whatever form a server quotes it."""
+    forms = json.dumps(secret)[1:-1], repr(secret)[1:-1], quote(secret), quote(secret, safe="")
+    for form in {secret, *forms, forms[0].replace("/", "\\/")} - {""}:
+        text = text.replace(form, HIDDEN)
     return text
 
 

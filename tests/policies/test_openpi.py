@@ -18,7 +18,8 @@ msgpack = pytest.importorskip("msgpack")
 
 from websockets.sync.server import ServerConnection, serve
 
-from worldline_core.errors import DataError, UnavailableError
+from tests.robustness.test_hostile_endpoints import Endpoint
+from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.policies.openpi import OpenpiPolicy, is_healthy
 
@@ -67,7 +68,8 @@ def policy_server(
             if isinstance(found, dict):
                 timing = {"infer_ms": 1e3 * (time.monotonic() - begin)}
                 found = msgpack.packb(encode({**found, "server_timing": timing}))
-            connection.send(found)
+            for each in found if isinstance(found, list) else [found]:
+                connection.send(each)
 
     def check(connection: ServerConnection, request: Any) -> Any:
         if request.path == "/healthz":
@@ -125,10 +127,11 @@ def _fails(_: dict[str, Any]) -> Any:
         (_fails, UnavailableError, r"(?s)reports an error.*no such camera: cam_high"),
         (lambda _: None, UnavailableError, r"(?s)closed the connection.*connect again"),
         (lambda _: b"\xc1\xff", DataError, "not understood"),
-        (lambda _: msgpack.packb([1, 2]), DataError, r"(?s)reply is no map.*list"),
+        (lambda _: msgpack.packb([1, 2]), DataError, r"(?s)message is no map.*list"),
         (lambda _: {}, DataError, r"(?s)actions are no chunk.*NoneType"),
         (lambda _: {"actions": np.zeros(8)}, DataError, r"(?s)actions are no chunk.*float64 \(8,\)"),
         (lambda _: {"actions": np.zeros((0, 14))}, DataError, "actions are no chunk"),
+        (lambda _: {"actions": np.zeros((2, 0))}, DataError, "actions are no chunk"),
         (lambda _: {"actions": np.array([["a"]])}, DataError, r"(?s)actions are no chunk.*<U1"),
         (lambda _: {"actions": np.array([[0.0, np.nan]])}, DataError, r"not finite\n.*step 0, column 1"),
         (lambda _: {"actions": np.zeros((1 << 16, 14))}, DataError, r"(?s)too large.*1,000,000 bytes"),
@@ -156,8 +159,63 @@ def test_a_deadline_is_for_the_whole_exchange() -> None:
         stop.set()
         with pytest.raises(UnavailableError, match="closed the connection"):
             policy.infer({})
-    with policy_server(lambda _: {}, metadata=[1]) as url, pytest.raises(DataError, match="metadata is no map"):
+    with policy_server(lambda _: {}, metadata=[1]) as url, pytest.raises(DataError, match="message is no map"):
         OpenpiPolicy(url)
+
+
+def test_a_reply_that_nobody_asked_for_is_not_taken_for_the_next() -> None:
+    twice = [msgpack.packb(encode({"actions": np.full((1, 2), value)})) for value in (0.0, 1.0)]
+    with policy_server(lambda _: twice) as url, OpenpiPolicy(url) as policy:
+        assert policy.infer({})["actions"][0, 0] == 0.0
+        time.sleep(0.1)
+        with pytest.raises(DataError, match="nobody asked for"):
+            policy.infer({})
+
+
+@pytest.mark.parametrize(
+    ("key", "sent"), [("abc\r", "abc"), ("abc\r\nX-Evil: 1", None), ("\0", None), ("schl\u00fcssel", None)]
+)
+def test_a_key_that_no_header_can_carry_is_refused_unseen(
+    key: str, sent: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    with policy_server(_fails_with_the_key, key="abc") as url:
+        if sent is None:
+            with pytest.raises(ConfigError, match="The header Authorization cannot be sent") as caught:
+                OpenpiPolicy(url, api_key=key)
+        else:
+            with (
+                OpenpiPolicy(url, api_key=key) as policy,
+                pytest.raises(UnavailableError, match=r"wrong key \*\*\*") as caught,
+            ):
+                policy.infer({})
+        assert "abc" not in str(caught.value) + caplog.text
+
+
+def _fails_with_the_key(_: dict[str, Any]) -> Any:
+    raise RuntimeError("wrong key abc")
+
+
+@pytest.mark.parametrize("url", ["ws://[half", "ws://127.0.0.1:99999", f"ws://{'a' * 70}", "ws://\ud800", "ws://"])
+def test_an_address_that_is_none_is_named(url: str) -> None:
+    with pytest.raises(UnavailableError, match="No server answers"):
+        OpenpiPolicy(url, deadline_s=2)
+    with pytest.raises(UnavailableError, match="No server answers"):
+        is_healthy(url, deadline_s=2)
+
+
+def test_a_health_that_drips_is_given_up_in_time() -> None:
+    def drip(connection: socket.socket) -> None:
+        connection.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+        for _ in range(100):
+            connection.sendall(b"x")
+            time.sleep(0.05)
+
+    endpoint = Endpoint(drip)
+    begin = time.monotonic()
+    with pytest.raises(UnavailableError, match="No server answers"):
+        is_healthy(endpoint.url.replace("http", "ws"), deadline_s=0.3)
+    assert time.monotonic() - begin < 2
+    endpoint.close()
 
 
 @pytest.mark.parametrize("dtype", ["?", "u1", "<i8", ">i4", "<f2", "<f4", "<f8", "S3", "<U5"])
@@ -185,6 +243,10 @@ def _described(dtype: object = "<f4", shape: object = (2,), data: object = b"\0"
         _described(shape=(1,) * 70, data=b"\0" * 4), _described(shape="2"), _described(shape=(2.0,)), _described(data="text"),
         msgpack.packb({b"__ndarray__": True}), msgpack.packb({b"__npgeneric__": True, b"dtype": "|O", b"data": 1}),
         msgpack.packb({b"__npgeneric__": True, b"dtype": "u1", b"data": 300}),
+        # A number in the place of a text is its length: four gigabytes in 40 bytes.
+        msgpack.packb({b"__npgeneric__": True, b"dtype": "S5", b"data": 1 << 32}),
+        msgpack.packb({b"__npgeneric__": True, b"dtype": "<f8", b"data": None}),
+        _described("(1f4,f4"), _described("(,)f4"), _described("01f4,f4"), _described("(99999999,)f4"), _described("g"),
         b"", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x91" * 3000, b"\x93\x01", b"\x01\x02", msgpack.packb(msgpack.ExtType(4, b"x")),
         msgpack.packb([[]] * 40_000 + [{}] * 30_000), b"\xdc\xff\xff" + b"\xdc\xff\xff" * 9, b"\x81\xa1a\xa2\xff\xfe",
         struct.pack(">BI", 0xC6, 1 << 31),

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from worldline_core.evaluation.vlm import (
     VisionLanguageModel,
 )
 from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
-from worldline_core.untrusted_text import HIDDEN, cut
+from worldline_core.untrusted_text import cut, without_secret
 
 MAX_ANSWER_BYTES = 1 << 20
 """Of a server's whole reply."""
@@ -146,11 +146,8 @@ class OpenAICompatibleModel:
         )
 
     def _hidden(self, reason: str) -> str:
-        """Without the key, in whatever form a server quotes it; hidden first, and cut then."""
-        forms = json.dumps(self._key)[1:-1], repr(self._key)[1:-1], quote(self._key), quote(self._key, safe="")
-        for form in {self._key, *forms, forms[0].replace("/", "\\/")} - {""}:
-            reason = reason.replace(form, HIDDEN)
-        return cut(reason, 500)
+        """Without the key: hidden first, and cut then."""
+        return cut(without_secret(reason, self._key), 500)
 
 
 def _key(variable: str) -> str:

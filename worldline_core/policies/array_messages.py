@@ -9,6 +9,7 @@ bounded before it is built.
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 ARRAY_KINDS = "biufSU"
 """`numpy.dtype.kind` of what may be in a message: booleans, integers, reals, texts of fixed width."""
+_DTYPE = re.compile(rf"[<>|=]?[{ARRAY_KINDS}][1-9][0-9]{{0,7}}")
+_SCALARS = {"b": bool, "i": int, "u": int, "f": int | float, "S": bytes, "U": str}
+"""What a NumPy scalar is packed as; a number in the place of a text would be taken for its length."""
 MAX_MESSAGE_BYTES = 64 << 20
 MAX_AXES = 16
 MAX_ITEMS = 65_536
@@ -113,17 +117,16 @@ def _array(found: dict[Any, Any]) -> Any:
             raise ValueError(f"an array of shape {sizes} and type {dtype} in {len(data)} bytes")
         return np.frombuffer(data, dtype).reshape(sizes).copy() if data else np.empty(sizes, dtype)
     if b"__npgeneric__" in found:
-        return _dtype(found[b"dtype"]).type(found[b"data"])
+        data, dtype = found[b"data"], _dtype(found[b"dtype"])
+        if not isinstance(data, _SCALARS[dtype.kind]):
+            raise ValueError(f"a scalar of type {dtype} that is {type(data).__name__}")
+        return dtype.type(data)
     return found
 
 
 def _dtype(name: object) -> np.dtype[Any]:
     if isinstance(name, bytes):
         name = name.decode("ascii")
-    if not isinstance(name, str) or len(name) > 16:
-        raise ValueError("an array whose type is no text")
-    # A text of fields or a comma makes a structured type, whose kind is V.
-    dtype = np.dtype(name)
-    if dtype.kind not in ARRAY_KINDS or dtype.itemsize == 0:
-        raise ValueError(f"arrays of type {dtype} are refused")
-    return dtype
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
+        raise ValueError(f"arrays of type {name!r:.40} are refused")
+    return np.dtype(name)

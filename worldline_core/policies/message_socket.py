@@ -9,8 +9,9 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES, pack, unpack
+from worldline_core.untrusted_text import without_secret
 
 
 class MessageSocket:
@@ -21,11 +22,13 @@ class MessageSocket:
 
     Args:
         url: ``ws://host:port/path`` or ``wss://...``; reached directly, without a proxy.
-        headers: sent with the connection request.
+        headers: sent with the connection request, without white space around them; the last word of each is a secret, and
+            hidden where the server repeats it.
         deadline_s: for connecting, and for each exchange where it names no other.
         max_bytes: of one reply.
 
     Raises:
+        ConfigError: a header cannot be sent.
         UnavailableError: nobody answers there, or the request is refused.
     """
 
@@ -43,10 +46,17 @@ class MessageSocket:
         self.url = url
         self.deadline_s = deadline_s
         self.max_bytes = max_bytes
+        given = {name: value.strip() for name, value in (headers or {}).items()}
+        if wrong := [name for name, value in given.items() if not (value.isascii() and value.isprintable())]:
+            raise ConfigError(
+                f"The header {wrong[0]} cannot be sent", where=url,
+                expected="a key or token of letters, digits and signs of ASCII on one line",
+            )  # fmt: skip
+        self._secrets = [value.split()[-1] for value in given.values() if value]
         try:
             self._connection = connect(
                 url,
-                additional_headers=dict(headers or {}),
+                additional_headers=given,
                 compression=None,
                 max_size=max_bytes,
                 open_timeout=deadline_s,
@@ -59,27 +69,42 @@ class MessageSocket:
                 "The server refuses the connection", where=url, expected="status 101", got=status,
                 next_step="give its API key or token" if status in (401, 403) else None,
             ) from error  # fmt: skip
-        except (OSError, InvalidHandshake, InvalidURI, EOFError) as error:
+        except (
+            OSError,
+            InvalidHandshake,
+            InvalidURI,
+            EOFError,
+            ValueError,
+        ) as error:  # ValueError: an address that is none
             raise UnavailableError(
                 "No server answers", where=url, got=f"{type(error).__name__}: {error}",
                 next_step="start it, or correct the address (ws://HOST:PORT)",
             ) from error  # fmt: skip
 
-    def request(self, message: object, *, deadline_s: float | None = None) -> Any:
-        """Send one message and return the reply.
+    def request(self, message: object, *, deadline_s: float | None = None) -> dict[str, Any]:
+        """Send one message and return the reply, a map.
 
         Raises:
             UnavailableError: the server is gone, reports an error (a text frame), or does not answer in time.
-            DataError: the request cannot be packed, or the reply is no message or too large.
+            DataError: the request cannot be packed, the reply is no message or too large, or a message is there that
+                nobody asked for, which would be taken for the reply.
         """
+        from websockets.exceptions import ConnectionClosed
+
         content = pack(message)
+        with suppress(TimeoutError, ConnectionClosed):
+            self._connection.recv(timeout=0)
+            self.close()
+            raise DataError(
+                "The server sent a message that nobody asked for", where=self.url, next_step="connect again"
+            )
         return self._exchange(lambda: self._connection.send(content), deadline_s)
 
-    def receive(self, *, deadline_s: float | None = None) -> Any:
+    def receive(self, *, deadline_s: float | None = None) -> dict[str, Any]:
         """A message that the server sends unasked; raises as :meth:`request`."""
         return self._exchange(lambda: None, deadline_s)
 
-    def _exchange(self, send: Callable[[], None], deadline_s: float | None) -> Any:
+    def _exchange(self, send: Callable[[], None], deadline_s: float | None) -> dict[str, Any]:
         from websockets.exceptions import ConnectionClosed
 
         deadline = self.deadline_s if deadline_s is None else deadline_s
@@ -113,12 +138,17 @@ class MessageSocket:
             watch.cancel()
         if isinstance(reply, str):
             self.close()
+            for secret in self._secrets:
+                reply = without_secret(reply, secret)
             raise UnavailableError("The server reports an error", where=self.url, got=reply)
         try:
-            return unpack(reply, self.url, max_bytes=self.max_bytes)
+            found = unpack(reply, self.url, max_bytes=self.max_bytes)
+            if not isinstance(found, dict):
+                raise DataError("A message is no map", where=self.url, expected="a map", got=type(found).__name__)
         except DataError:
             self.close()
             raise
+        return found
 
     def close(self) -> None:
         """End the connection."""

@@ -7,15 +7,16 @@ closes with code 1011. There is no reset message.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
-import httpx
 import numpy as np
 
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
+from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
 
 
 class OpenpiPolicy(MessageSocket):
@@ -33,6 +34,7 @@ class OpenpiPolicy(MessageSocket):
     Raises:
         UnavailableError: nobody answers there, or the key is refused.
         DataError: the metadata are no map.
+        ConfigError: the key cannot be sent.
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class OpenpiPolicy(MessageSocket):
         headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
         super().__init__(url, headers=headers, deadline_s=deadline_s, max_bytes=max_bytes)
         try:
-            self.metadata: Mapping[str, Any] = self._map(self.receive(), "metadata")
+            self.metadata: Mapping[str, Any] = self.receive()
         except BaseException:
             self.close()
             raise
@@ -62,17 +64,20 @@ class OpenpiPolicy(MessageSocket):
             UnavailableError: the policy failed (with its own error text), is gone, or does not answer in time.
             DataError: the observation cannot be sent, or the reply has no finite numbers as actions.
         """
-        reply = self._map(self.request(observation, deadline_s=deadline_s), "reply")
+        reply = self.request(observation, deadline_s=deadline_s)
         actions = reply.get("actions")
         if (
             not isinstance(actions, np.ndarray)
             or actions.ndim != 2
             or actions.dtype.kind not in "fiu"
-            or not len(actions)
+            or not actions.size
         ):
             got = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
             raise DataError(
-                "The policy's actions are no chunk", where=self.url, expected="numbers (horizon >= 1, size)", got=got
+                "The policy's actions are no chunk",
+                where=self.url,
+                expected="numbers (horizon >= 1, size >= 1)",
+                got=got,
             )
         actions = actions.astype(np.float64)
         if not np.isfinite(actions).all():
@@ -80,24 +85,15 @@ class OpenpiPolicy(MessageSocket):
             raise DataError("An action is not finite", where=f"{self.url}, step {step}, column {column}")
         return {**reply, "actions": actions}
 
-    def _map(self, found: object, what: str) -> dict[str, Any]:
-        if not isinstance(found, dict):
-            self.close()
-            raise DataError(
-                f"The policy server's {what} is no map", where=self.url, expected="a map", got=type(found).__name__
-            )
-        return found
-
 
 def is_healthy(url: str, *, deadline_s: float = 5.0) -> bool:
     """Whether the server at a websocket address answers ``GET /healthz`` with status 200.
 
     Raises: UnavailableError: nobody answers there.
     """
-    address = httpx.URL(url)
-    address = address.copy_with(scheme={"ws": "http", "wss": "https"}.get(address.scheme, address.scheme))
+    address = re.sub(r"^ws(s?://[^/?#]*).*", r"http\1/healthz", url)
     try:
-        answer = httpx.get(address.copy_with(path="/healthz"), timeout=deadline_s, trust_env=False)
-    except httpx.HTTPError as error:
+        status, _ = exchange(address, None, headers={}, timeout_s=deadline_s, max_bytes=1 << 16, proxies=False)
+    except (Unreachable, NoAnswer) as error:
         raise UnavailableError("No server answers", where=url, got=str(error)) from error
-    return answer.status_code == 200
+    return status == 200

@@ -10,6 +10,7 @@ import numpy as np
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
+from worldline_core.serving.serve_config import PROTOCOL
 
 
 class SimulatorClient(MessageSocket):
@@ -24,6 +25,7 @@ class SimulatorClient(MessageSocket):
 
     Raises:
         UnavailableError: nobody answers there, or the token is refused.
+        DataError: a server of another kind answers.
     """
 
     def __init__(
@@ -32,6 +34,12 @@ class SimulatorClient(MessageSocket):
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         super().__init__(f"{url.rstrip('/')}/v1", headers=headers, deadline_s=deadline_s, max_bytes=max_bytes)
         self.metadata: dict[str, Any] = self.receive()
+        if self.metadata.get("protocol") != PROTOCOL:
+            self.close()
+            raise DataError(
+                "Not a server of the simulator", where=url, expected=f"protocol {PROTOCOL} of worldline serve",
+                got=", ".join(map(str, self.metadata))[:200] or "no metadata",
+            )  # fmt: skip
 
     def start(
         self,
@@ -71,6 +79,8 @@ class SimulatorClient(MessageSocket):
         reply = self.request(request)
         error = reply.get("error")
         if error is not None:
+            if not isinstance(error, dict) or not {"kind", "what"} <= error.keys():
+                raise DataError("The server's error is not understood", where=self.url, got=error)
             kind = UnavailableError if error["kind"] in ("BusyError", "UnavailableError") else DataError
             details = {name: error.get(name) for name in ("expected", "got", "next_step")}
             raise kind(error["what"], where=error.get("where", self.url), **details)

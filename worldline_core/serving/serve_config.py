@@ -10,6 +10,8 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.shipped import SHIPPED
 
+PROTOCOL = 1
+"""Version of the messages."""
 TOKEN_VARIABLE = "WORLDLINE_TOKEN"  # noqa: S105  # the variable's name
 
 

@@ -24,7 +24,8 @@ from worldline_core.rollout.observation import Camera
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.serving.recorded_starts import RecordedStarts
-from worldline_core.serving.serve_config import ServeConfig
+from worldline_core.serving.serve_config import PROTOCOL, ServeConfig
+from worldline_core.untrusted_text import shown
 
 LARGEST_SEED = 2**63 - 1
 
@@ -116,7 +117,7 @@ class SessionHost:
         """What a client needs to know."""
         world = self.world
         return {
-            "protocol": 1,
+            "protocol": PROTOCOL,
             "views": list(world.views),
             "fps": world.contract.fps,
             "frames_per_step": world.frames_per_unit if world.causal is not None else None,
@@ -168,6 +169,7 @@ class SessionHost:
     async def _act(self, owner: object, running: _Running, request: Request) -> dict[str, Any]:
         simulation = running.simulation
         if isinstance(request, StepRequest):
+            _check_numbers({"controls": request.controls})
             begin = time.monotonic()
             frames = await self.compute(lambda: simulation.step(request.controls))
             seconds = time.monotonic() - begin
@@ -206,9 +208,9 @@ class SessionHost:
             raise DataError(
                 "An image is no picture", where=wrong[0], expected="uint8 (H, W, 3)", got=images[wrong[0]].dtype
             )
-        numbers = {"state": request.state, **{f"K of {view}": camera.K for view, camera in cameras.items()}}
-        if wrong := [what for what, values in numbers.items() if values is None or values.dtype.kind not in "fiu"]:
-            raise DataError("Not an array of numbers", where=wrong[0], expected="reals or integers")
+        arrays = {"state": request.state, **{f"K of {view}": camera.K for view, camera in cameras.items()}}
+        poses = {f"T_base_camera of {view}": camera.T_base_camera for view, camera in cameras.items()}
+        _check_numbers({**arrays, **{what: pose for what, pose in poses.items() if pose is not None}})
         posed = {view: Camera(camera.K, camera.T_base_camera) for view, camera in cameras.items()}
         rows = np.asarray(request.state, np.float64)
         rows = np.repeat(rows[None], len(request.seeds), axis=0) if rows.ndim == 1 else rows
@@ -294,6 +296,11 @@ class SessionHost:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
 
+def _check_numbers(arrays: Mapping[str, np.ndarray | None]) -> None:
+    if wrong := [what for what, values in arrays.items() if values is None or values.dtype.kind not in "fiu"]:
+        raise DataError("Not an array of numbers", where=wrong[0], expected="reals or integers")
+
+
 def _parsed(message: object) -> Request:
     if not isinstance(message, Mapping):
         raise DataError("A request is no map", expected="op and its values", got=type(message).__name__)
@@ -338,4 +345,4 @@ def _pictures_of(simulation: Simulation) -> dict[str, np.ndarray]:
 def error_message(error: WorldLineError) -> dict[str, Any]:
     """An error as a client gets it."""
     said = {name: getattr(error, name) for name in ("what", "where", "expected", "got", "next_step")}
-    return {"kind": type(error).__name__, **{name: str(value) for name, value in said.items() if value is not None}}
+    return {"kind": type(error).__name__, **{name: shown(value) for name, value in said.items() if value is not None}}

@@ -7,6 +7,7 @@ import functools
 import ssl
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import urlsplit
 
 import httpx
 
@@ -20,7 +21,13 @@ class NoAnswer(Exception):  # noqa: N818
 
 
 def exchange(
-    url: str, body: bytes | None, *, headers: Mapping[str, str], timeout_s: float, max_bytes: int
+    url: str,
+    body: bytes | None,
+    *,
+    headers: Mapping[str, str],
+    timeout_s: float,
+    max_bytes: int,
+    proxies: bool = True,
 ) -> tuple[int, bytes]:
     """Status and body of the answer to a POST (without ``body``: a GET), of which little more than ``max_bytes`` is read.
 
@@ -28,6 +35,7 @@ def exchange(
 
     Args:
         timeout_s: from the first byte sent to the last one read.
+        proxies: through those that environment variables name.
 
     Raises:
         Unreachable: nothing listens there.
@@ -38,7 +46,9 @@ def exchange(
         answer = bytearray()
         async with (
             asyncio.timeout(timeout_s),
-            httpx.AsyncClient(timeout=timeout_s, verify=_trusted(), follow_redirects=False) as client,
+            httpx.AsyncClient(
+                timeout=timeout_s, verify=_trusted(), follow_redirects=False, trust_env=proxies
+            ) as client,
             client.stream("GET" if body is None else "POST", url, headers=dict(headers), content=body) as response,
         ):
             async for piece in response.aiter_raw():
@@ -48,6 +58,10 @@ def exchange(
         return response.status_code, bytes(answer)
 
     try:
+        urlsplit(url).port  # noqa: B018  # a number beyond those of ports raises
+    except ValueError as error:
+        raise Unreachable(str(error)) from error
+    try:
         # In a thread: the caller's may have an event loop of its own (a notebook).
         with ThreadPoolExecutor(1, "request") as thread:
             return thread.submit(asyncio.run, answered()).result()
@@ -55,7 +69,7 @@ def exchange(
         raise Unreachable(f"{type(error).__name__}: {error}") from error
     except TimeoutError:
         raise NoAnswer(f"TimeoutError: no whole answer within {timeout_s:g} s") from None
-    except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
+    except (httpx.HTTPError, httpx.InvalidURL, OSError, UnicodeError) as error:  # UnicodeError: of a host's name
         raise NoAnswer(f"{type(error).__name__}: {error}") from error
 
 
