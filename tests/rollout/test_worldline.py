@@ -12,7 +12,7 @@ from worldline_core import Camera, WorldLine
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import CheckpointError, ConfigError, DataError
+from worldline_core.errors import CalibrationError, CheckpointError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
@@ -177,6 +177,12 @@ def test_what_does_not_fit_is_refused(observed: Observation, causal: WorldLine, 
     refused("RGB and of one size", images=observed.images | {"head": observed.images["head"][:8]})
     refused(r"(?s)camera without a pose.*head", cameras=observed.cameras | {"head": Camera(np.eye(3))})
     refused("camera pose has a wrong shape", cameras=observed.cameras | {"head": Camera(np.eye(3), np.eye(3))})
+    head = observed.cameras["head"]
+    for K in (np.full((3, 3), np.nan), np.zeros((3, 3)), np.diag([80.0, -80.0, 1.0])):
+        cameras = observed.cameras | {"head": Camera(K, head.T_base_camera)}
+        refused(r"(?s)camera matrix is not usable.*head", CalibrationError, cameras=cameras)
+    sheared = np.eye(4) + np.eye(4, k=1) * 0.01
+    refused("not a rigid transform", CalibrationError, cameras=observed.cameras | {"head": Camera(head.K, sheared)})
     refused("Unknown embodiment", ConfigError, embodiment="ur55_pair")
     with pytest.raises(CheckpointError, match="tokenizer is not here"):
         WorldLine.from_pretrained(models / "causal", tokenizer=tmp_path / "none")

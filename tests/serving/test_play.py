@@ -228,7 +228,9 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
     with policy_server(act) as policy:
         settings = {"url": policy, "state_key": "state"}
         with serving(output=tmp_path, policies={"mine": settings}, max_blocks=4) as url:
-            assert "Play" in httpx.get(url.replace("ws", "http") + "/play").text
+            given = httpx.get(url.replace("ws", "http") + "/play")
+            assert "Play" in given.text
+            assert given.headers["X-Frame-Options"] == "DENY"  # clicks cannot be made by a page around it
             with connect(url + "/play/session", proxy=None, max_size=None) as connection:
                 page = Driver(connection)
                 assert page.until("hello")["policies"] == ["mine"]
@@ -265,6 +267,10 @@ def test_driving_branches_a_policy_and_saving(serving: Callable, tmp_path: Path)
                 ):
                     page.tell(**wrong)
                     assert page.until_error()["what"], number
+                connection.send(b"no text")
+                assert "not understood" in page.until_error()["what"]
+                page.tell(type="save", formats=["mcap"] * 4)
+                assert "at most 3 items" in page.until_error()["got"]
                 page.tell(type="save", formats=["episodes"])
                 assert "nothing to save" in page.until_error()["what"]
     folder, *others = map(Path, saved["paths"])

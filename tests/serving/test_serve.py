@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -14,10 +15,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from tests.policies.test_openpi import policy_server
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.policies.openpi import is_healthy
+from worldline_core.rollout.observation import Camera
+from worldline_core.serving import app
 from worldline_core.serving.app import server_token
 from worldline_core.serving.client import RemoteSimulation, SimulatorClient
 from worldline_core.serving.recorded_starts import RecordedStarts
@@ -89,6 +93,11 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
         "embodiment": "ur5e_silver",
         "state": start.episode.action[0],
     }
+
+    def posed(**values: np.ndarray) -> dict[str, Camera]:
+        """The cameras with other values of the head's."""
+        return start.cameras | {"head": replace(start.cameras["head"], **values)}
+
     with SimulatorClient(url) as client:
         recorded, sent = client.start(EPISODE, seeds=[1, 2]), client.start(**given, seeds=[1, 2])
         assert drive(recorded, 2, 0) == drive(sent, 2, 0)
@@ -99,6 +108,18 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
             ({"state": np.zeros(3)}, "wrong length"),
             ({"state": np.full(14, np.nan)}, "not finite"),
             ({"state": np.array(["a"] * 14)}, "Not an array of numbers"),
+            ({"state": np.array(0.0)}, "wrong length"),
+            (
+                {"cameras": posed(T_base_camera=np.array([["a"] * 4] * 4))},
+                r"(?s)Not an array of numbers.*T_base_camera",
+            ),
+            (
+                {"cameras": posed(T_base_camera=np.diag([1.0, 1.0, -1.0, 1.0]))},
+                r"(?s)not a rigid transform.*T_base_camera",
+            ),
+            ({"cameras": posed(T_base_camera=np.full((4, 4), np.nan))}, "not a rigid transform"),
+            ({"cameras": posed(K=np.full((3, 3), np.nan))}, "camera matrix is not usable"),
+            ({"cameras": posed(K=np.diag([-80.0, 80.0, 1.0]))}, "camera matrix is not usable"),
             ({"episode": EPISODE}, r"(?s)starts at a recording, or at an observation.*got: images, cameras"),
             ({"cameras": None}, "starts at a recording, or at an observation"),
             ({"seeds": [-1]}, "seed is out of range"),
@@ -111,6 +132,8 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
             client.start("nobody")
         with pytest.raises(DataError, match=r"(?s)Controls of a step have another shape.*\(2, 4, 14\)"):
             sent.step(np.zeros((1, 4, 14)))
+        with pytest.raises(DataError, match=r"(?s)Not an array of numbers.*controls"):
+            client.call({"op": "step", "session": sent.session, "controls": np.full((2, 4, 14), "a")})
         with pytest.raises(DataError, match="No such clips"):
             sent.select([7])
         assert len(sent.step(np.repeat(sent.state[:, None], 4, axis=1))) == 2  # as it was before the errors
@@ -259,3 +282,36 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104
     monkeypatch.setenv(TOKEN_VARIABLE, "abc")
     assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104
+
+
+def test_connections_that_say_nothing_are_closed_and_bounded(
+    serving: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "TAKE_S", 0.3)
+    with serving(max_connections=4) as url:
+        host, _, port = url.removeprefix("ws://").partition(":")
+        slow = [socket.create_connection((host, int(port))) for _ in range(7)]
+        for connection in slow:
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX: ")
+        with SimulatorClient(url) as client:  # the eighth
+            with pytest.raises(httpx.TransportError):  # as many as there may be
+                httpx.get(url.replace("ws", "http") + "/healthz")
+            begin = time.monotonic()
+            for connection in slow:
+                connection.settimeout(5)
+                assert connection.recv(100) == b""
+            assert time.monotonic() - begin < 2
+            assert is_healthy(url)
+            client.start(EPISODE)  # a websocket stays
+
+
+def test_another_server_is_no_simulator() -> None:
+    for metadata, match in (([], "no map"), ({"name": "x"}, r"(?s)Not a server of the simulator.*got: name")):
+        with policy_server(lambda _: {}, metadata=metadata) as url, pytest.raises(DataError, match=match):
+            SimulatorClient(url)
+    with (
+        policy_server(lambda _: {"error": "no"}, metadata={"protocol": 1}) as url,
+        SimulatorClient(url) as client,
+        pytest.raises(DataError, match="error is not understood"),
+    ):
+        client.start(EPISODE)

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.errors import DataError
+from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,8 @@ def project_controls(
     arms = () if kinematics is None else kinematics.embodiment.arms
     known = {arm.camera_view for arm in arms if arm.wrist_camera}
     poses, follow = _poses(cameras, known, frames)
+    for view, pose in poses.items():
+        _check_usable(view, np.asarray(cameras[view].K, np.float64), pose)
     episode = Episode(
         episode_id="prediction",
         source="prediction",
@@ -162,6 +166,20 @@ def project_controls(
         without_mount="first_frame_mount" if follow else "recorded",
     )
     return tracks
+
+
+def _check_usable(view: str, K: np.ndarray, poses: np.ndarray) -> None:
+    """Raises: CalibrationError for a camera that nothing can be drawn into: a prediction would be one without controls."""
+    if K.shape == (3, 3) and not bool(valid_intrinsics(torch.from_numpy(K))):
+        raise CalibrationError(
+            "A camera matrix is not usable", where=view, expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
+            got=K.tolist(),
+        )  # fmt: skip
+    if len(bad := torch.nonzero(~is_rigid(torch.from_numpy(poses)))):
+        raise CalibrationError(
+            "A camera pose is not a rigid transform", where=f"{view}, T_base_camera",
+            expected="R R^T = I, det R = 1, last row 0 0 0 1", got=poses[int(bad[0])].tolist(),
+        )  # fmt: skip
 
 
 def _poses(cameras: Mapping[str, Camera], mounted: set[str], frames: int) -> tuple[dict[str, np.ndarray], bool]:

@@ -62,7 +62,7 @@ class Starts:
         self.seeds = [seeds] * count if isinstance(seeds, int) else list(seeds)
         known = isinstance(embodiment, ArmKinematics)
         self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
-        rows = np.asarray(state, dtype=np.float64)
+        rows = np.atleast_1d(np.asarray(state, dtype=np.float64))
         self.state = np.repeat(rows[None], count, axis=0) if rows.ndim == 1 else rows
         given = {"images": count, "cameras": len(self.cameras), "seeds": len(self.seeds), "state": len(self.state)}
         if count == 0 or len(set(given.values())) > 1:

@@ -24,7 +24,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.pages.page import render
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
-from worldline_core.serving.gate import Gate
+from worldline_core.serving.gate import Gate, patient_http
 from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
 from worldline_core.serving.session_host import SessionHost, error_message
@@ -99,7 +99,8 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
             await send_in_time(websocket, pack(await host.handle(websocket, message)))
 
     async def page(_: Request) -> Response:
-        return HTMLResponse(render("serving/play.html", title="Play", subtitle="", script="serving/play.js"))
+        html = render("serving/play.html", title="Play", subtitle="", script="serving/play.js")
+        return HTMLResponse(html, headers={"X-Frame-Options": "DENY"})  # a page around it could have clicks made in it
 
     async def played(websocket: WebSocket) -> None:
         async def send(content: str | bytes) -> None:
@@ -111,8 +112,10 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
             await session.greet()
             while True:
                 async with asyncio.timeout(config.idle_s):
-                    text = await websocket.receive_text()
-                await session.receive(text)
+                    found = await websocket.receive()
+                if found["type"] == "websocket.disconnect":
+                    return
+                await session.receive(found.get("text") or "")
         finally:
             await session.close()
 
@@ -154,7 +157,7 @@ def server_token(config: ServeConfig) -> str | None:
 
     Raises: ConfigError when others can reach the server, and there is none.
     """
-    token = os.environ.get(TOKEN_VARIABLE) or None
+    token = os.environ.get(TOKEN_VARIABLE, "").strip() or None
     if token is None and not config.on_loopback:
         raise ConfigError(
             "A server that others can reach needs a token", where=f"host {config.host}",
@@ -169,7 +172,7 @@ def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvi
     host = SessionHost(world, config)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, ws="websockets-sansio",
+        make_app(host, token), config.host, config.port, ws="websockets-sansio", http=patient_http(2 * config.max_connections, TAKE_S),
         ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
         timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
     )  # fmt: skip

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import hmac
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
 from worldline_core.serving.serve_config import ServeConfig, is_loopback
+
+if TYPE_CHECKING:
+    from asyncio import Transport
 
 OPEN_PATHS = ("/healthz", "/play")
 """Need no token: they say nothing of sessions. The page connects with the token that its own address carries."""
@@ -57,3 +62,30 @@ class Gate:
         if not hmac.compare_digest(given.encode(), self._token.encode()):
             return 401, "a token is needed: Authorization: Bearer ..."
         return None
+
+
+def patient_http(most: int, patience_s: float) -> type[Any]:
+    """Uvicorn's HTTP protocol with bounds that it lacks, so that nobody takes all of the process's sockets.
+
+    Args:
+        most: connections at a time, websockets too; others are closed at once.
+        patience_s: a connection whose next request has not come whole, head by head, is closed after this to twice this time.
+    """
+
+    class PatientHttp(AutoHTTPProtocol):  # type: ignore[misc, valid-type]
+        def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            if len(self.connections) > most:
+                transport.abort()
+            else:
+                self.loop.call_later(patience_s, self._give_up, self.cycle)
+
+        def _give_up(self, before: object) -> None:
+            if self.transport.is_closing() or self.transport.get_protocol() is not self:
+                return  # gone, or a websocket by now
+            if self.cycle is before and (before is None or self.cycle.response_complete):
+                self.transport.close()
+            else:
+                self.loop.call_later(patience_s, self._give_up, self.cycle)
+
+    return PatientHttp

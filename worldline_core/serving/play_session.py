@@ -70,7 +70,7 @@ class Save(_Message):
     """Save the way from the start to the current node."""
 
     type: Literal["save"]
-    formats: tuple[Literal["episodes", "mcap", "rrd"], ...]
+    formats: tuple[Literal["episodes", "mcap", "rrd"], ...] = Field(max_length=3)
 
 
 Message = Annotated[Start | Tick | Go | Advance | Save, Field(discriminator="type")]
