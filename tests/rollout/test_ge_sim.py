@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from pydantic import ValidationError
 
 from tests.rollout.conftest import SIZE, recorded, track, write_recordings
@@ -187,6 +187,16 @@ def _smaller(answer: bytes) -> bytes:
     return _packed([meta, _jpeg(np.zeros((H, W, 3))), *others])
 
 
+def _turned(answer: bytes) -> bytes:
+    """Frames whose EXIF says that they lie on their side."""
+    meta, *pictures, state = _sections(answer)
+    written = io.BytesIO()
+    turn = Image.Exif()
+    turn[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (3 * W, H)).save(written, "JPEG", exif=turn)
+    return _packed([meta, *[written.getvalue()] * len(pictures), state])
+
+
 BAD_ANSWERS = {
     "frame_count": (lambda a: (200, _changed(a, frame_shape=[7, 3, 3, H, W])), r"frames of \[7, 3, 3"),
     "frame_size": (lambda a: (200, _smaller(a)), rf"a frame of {H} x {W} pixels, not of {H} x {3 * W}"),
@@ -195,6 +205,7 @@ BAD_ANSWERS = {
     "no_meta": (lambda a: (200, _packed([b"\xff"])), "ValueError|UnicodeDecodeError"),
     "no_shape": (lambda a: (200, _changed(a, state_shape="x")), "a state of 512 bytes"),
     "no_jpeg": (lambda a: (200, a.replace(b"\xff\xd8\xff", b"\0\0\0")), "no known format"),
+    "turned": (lambda a: (200, _turned(a)), "its EXIF turns"),
     "too_large": (lambda a: (200, a + bytes(1 << 20)), r"more than 951,\d{3} bytes"),
     "refused": (lambda a: (400, b'{"error": "no such robot"}'), "HTTP 400: .*no such robot"),
 }

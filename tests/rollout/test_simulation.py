@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -288,5 +289,13 @@ def test_misuse_is_refused_and_changes_nothing(causal: WorldLine, starts: list[S
         start.begin(causal, response=Response.model_validate({"embodiment": "so101", "columns": columns}))
     with pytest.raises(ArtifactError, match=r"(?s)Not a robot's response.*nothing.json"):
         Response.load(tmp_path / "nothing.json")
+    for change in (
+        {"delay_s": 1e8},
+        {"delay_s": 1e300},
+        {"lag_s": 1e300},
+    ):  # gigabytes of past commands; a robot that stands
+        (tmp_path / "slow.json").write_text(json.dumps({"embodiment": "so101", "columns": [columns[0] | change]}))
+        with pytest.raises(ArtifactError, match=r"(?s)Not a robot's response.*less than or equal"):
+            Response.load(tmp_path / "slow.json")
     with pytest.raises(DataError, match="recordings of one rate"):
         fit_response([], load_embodiment(ROBOT))

@@ -211,7 +211,10 @@ def decode_frame(content: bytes, size: tuple[int, int], views: int) -> np.ndarra
     expected = (size[0], views * size[1])
     if (found := image_size(content, "a frame")) != expected:
         raise ValueError(f"a frame of {found[0]} x {found[1]} pixels, not of {expected[0]} x {expected[1]}")
-    return np.stack(np.split(decode_image(content, "a frame"), views, axis=1))
+    picture = decode_image(content, "a frame")
+    if picture.shape[:2] != expected:
+        raise ValueError("a frame that its EXIF turns")
+    return np.stack(np.split(picture, views, axis=1))
 
 
 def _floats(values: np.ndarray) -> bytes:

@@ -40,8 +40,8 @@ class ColumnResponse(StrictModel):
     """
 
     name: str
-    delay_s: float = Field(ge=0)
-    lag_s: float = Field(ge=0)
+    delay_s: float = Field(ge=0, le=10)
+    lag_s: float = Field(ge=0, le=1000)
     rmse: float = Field(ge=0)
 
 
