@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -12,7 +13,9 @@ from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEv
 from worldline_core.evaluation.planning import evaluate_planning as outcomes
 from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.policy.evidence import SCHEMAS, MotionEvidence, Reconciliation
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
+from worldline_core.evaluation.vlm import Part, Text
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 VIDEO = VideoEvaluationConfig(segmenters=("colour",), resamples=100)
@@ -222,3 +225,47 @@ def test_ordinary_recordings_are_no_bank(recordings, tmp_path):
     inputs = {name: path for name, path in recordings.inputs.items() if name != "episodes"}
     with pytest.raises(DataError, match="no candidate"):
         evaluate_planning(PLANNING, inputs | {"banks": recordings.inputs["episodes"]}, tmp_path)
+
+
+ODD = {
+    "half character": '"observations": "\\ud800 \\u001b[2J", "reason": "\\udfff"',
+    "endless confidence": '"confidence": 1e999',
+    "no number": '"confidence": NaN',
+    "4,000 digits": '"confidence": ' + "9" * 4000,
+}
+
+
+class OddJudge:
+    """States failures (and middling scores) with something odd beside them."""
+
+    name = "odd"
+
+    def __init__(self, odd: str) -> None:
+        self._facts = ", ".join(
+            f'"{key}": false'
+            for schema in (*SCHEMAS.values(), Reconciliation, MotionEvidence)
+            for key in schema.REQUIRED
+        )
+        self._odd, self.asked = odd, ""
+
+    def answer(self, parts: Sequence[Part]) -> str:
+        self.asked += "".join(part.text for part in parts if isinstance(part, Text))
+        return f'{{{self._facts}, "wrong_object_or_drop": null, "selected_labels": ["A", "B", "\\ud800"], "score": 50, {self._odd}}}'
+
+
+@pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
+def test_odd_values_of_a_judge_go_through_the_whole_step(recordings, tmp_path, monkeypatch, odd):
+    judge = OddJudge(odd)
+    monkeypatch.setattr("worldline_core.evaluation.policy.evaluate_policy.open_vlm", lambda kind, config: judge)
+    evaluate_policy(POLICY.model_copy(update={"judge": "openai"}), recordings.inputs, tmp_path)
+    judge.asked.encode()  # a tokenizer takes nothing else
+    for row in pq.read_table(tmp_path / "decisions.parquet").to_pylist():
+        json.dumps(json.loads(row["evidence"]), allow_nan=False, ensure_ascii=False).encode()
+
+
+@pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
+def test_odd_values_of_a_selector_go_through_the_whole_step(sealed, tmp_path, monkeypatch, odd):
+    monkeypatch.setattr(outcomes, "open_vlm", lambda kind, config: OddJudge(odd))
+    evaluate_planning(PLANNING.model_copy(update={"selector": "openai"}), sealed, tmp_path / "out")
+    for row in pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist():
+        assert json.loads(row["trace"])["malformed_answers"] == 0, row

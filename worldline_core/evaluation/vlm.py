@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from worldline_core.errors import UnavailableError
+from worldline_core.untrusted_text import visible
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +72,12 @@ class Answer(BaseModel):
     REQUIRED: ClassVar[tuple[str, ...]] = ()
 
 
-AnswerText = Annotated[str, BeforeValidator(lambda value: "" if value is None else value)]
+def _text(value: Any) -> Any:
+    # Half characters can be neither stored as UTF-8 nor shown to a tokenizer again.
+    return visible(value) if isinstance(value, str) else "" if value is None else value
+
+
+AnswerText = Annotated[str, BeforeValidator(_text)]
 
 
 class NoAnswerError(UnavailableError):

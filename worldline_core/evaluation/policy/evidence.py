@@ -24,7 +24,8 @@ Fact = StrictBool | None
 
 def _number(value: Any) -> Any:
     # Confidence decides nothing, so an odd one does not spoil the facts beside it.
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else 0.0
+    known = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9  # NaN is not
+    return value if known else 0.0
 
 
 class _Evidence(Answer):
