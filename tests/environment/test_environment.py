@@ -156,7 +156,7 @@ def test_a_batch_is_its_environments_side_by_side(world: WorldLine, starts: Epis
 
 
 def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: EpisodeStarts) -> None:
-    for verdict, rewarded in ((None, False), (True, True), (False, False)):
+    for verdict, rewarded in ((None, False), (True, True), (False, False), (np.True_, True)):
         environment = WorldLineVectorEnv(
             1,
             model=world,
@@ -169,6 +169,10 @@ def test_what_cannot_be_seen_is_no_success(world: WorldLine, starts: EpisodeStar
         _, reward, terminated, truncated, infos = environment.step(commands(starts, [0], 1)[0])
         assert (bool(reward[0]), bool(terminated[0])) == (rewarded, rewarded)
         assert (bool(truncated[0]), bool(infos["is_success"][0])) == (not rewarded, rewarded)
+    environment = WorldLineEnv(model=world, episode_frames=1, **SHORT | {"success": lambda _: "no"})
+    environment.reset(seed=0)
+    with pytest.raises(DataError, match=r"(?s)Not a judgement.*got: no"):
+        environment.step(commands(starts, [0], 1)[0][0])
 
 
 @pytest.mark.slow
@@ -194,6 +198,23 @@ def test_misuse_is_refused(world: WorldLine, shipped: Path, starts: EpisodeStart
         environment.step(np.zeros((1, 14)))
     with pytest.raises(DataError, match="not finite"):
         environment.step(np.full((2, 14), np.nan))
+    texts, unknown, complex_ones = np.full((2, 14), "1"), np.full((2, 14), None), np.zeros((2, 14), complex)
+    wrong = texts, unknown, complex_ones, np.ones((2, 14), bool), [[1], [1, 2]], "x"
+    for commands in wrong:  # the imaginary part of complex ones was dropped
+        with pytest.raises(DataError, match="Not the commands of one step"):
+            environment.step(commands)  # type: ignore[arg-type]
+    for seed in (-1, 2**63, 1.5, "ab", [1], [1, 2, 3], []):
+        with pytest.raises(DataError, match="Not the seeds"):
+            environment.reset(seed=seed)  # type: ignore[arg-type]
+    for seed in (np.int64(0), np.array([0, 1]), [0, np.int64(1)]):  # a zero of NumPy counted as no seed
+        _, infos = environment.reset(seed=seed)  # type: ignore[arg-type]
+        assert infos["episode_id"].tolist() == [starts[number].episode_id for number in (0, 1)]
+    for mask in (np.zeros(2, bool), np.ones(3, bool), [1, 0], "ab"):
+        with pytest.raises(DataError, match="Not a mask"):
+            environment.reset(options={"reset_mask": mask})
+    for change in ({"num_envs": -1}, {"episode_frames": 2.5}, {"success": "measurd"}):
+        with pytest.raises(ConfigError, match="Not an environment"):
+            WorldLineVectorEnv(**{"num_envs": 2, "model": world, **SHORT, **change})
     with pytest.raises(DataError, match=r"(?s)of one robot.*left out.*of another split"):
         EpisodeStarts(shipped / "recordings", embodiment=None, splits=("test",), views=("head",), fps=8.0)
     with pytest.raises(DataError, match=r"(?s)of one robot.*of another rate"):

@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worldline_core.environment.episodes import RunningEpisode, Success, Together, measured_success
+from worldline_core.environment.episodes import RunningEpisode, Success, Together, each_seed, measured_success
 from worldline_core.environment.starts import EpisodeStarts, Start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.recordings import simulated_points
@@ -75,6 +75,12 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         render_mode: Literal["rgb_array"] | None = "rgb_array",
         **options: Any,
     ) -> None:
+        counted = all(isinstance(number, int) and number > 0 for number in (num_envs, episode_frames))
+        if not counted or not (success in ("measured", None) or callable(success)):
+            raise ConfigError(
+                "Not an environment", got=f"num_envs {num_envs}, episode_frames {episode_frames}, success {success}",
+                expected="at least one environment and frame; success: measured, a function, or None",
+            )  # fmt: skip
         shipped = shipped_folder()
         self.world = (
             model
@@ -101,12 +107,11 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self._episodes: list[RunningEpisode] = []
         self.frames_per_step = self._begun([self.starts[0]], [0]).frames_per_step
         self.observe_every = observe_every or self.frames_per_step
-        if min(num_envs, episode_frames, self.observe_every) < 1 or self.frames_per_step % self.observe_every:
+        if self.observe_every < 1 or self.frames_per_step % self.observe_every:
             raise ConfigError(
                 "An environment cannot be stepped so",
-                expected=f"at least one environment and frame, observe_every a divisor of {self.frames_per_step}",
-                got=f"num_envs {num_envs}, episode_frames {episode_frames}, observe_every {self.observe_every}",
-            )
+                expected=f"observe_every a divisor of {self.frames_per_step}", got=f"observe_every {self.observe_every}",
+            )  # fmt: skip
         self._spaces()
 
     def _spaces(self) -> None:
@@ -134,10 +139,14 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
 
         Args:
             options: ``reset_mask``, bool ``(num_envs)``: which ones begin anew.
+
+        Raises:
+            DataError: other seeds than one, or one for each; a mask that names none, or is of another shape.
         """
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
-        self._begin([slot for slot in range(self.num_envs) if mask[slot]], seeds)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
+            raise DataError("Not a mask of episodes", where="reset_mask", expected=f"bool ({self.num_envs},)", got=mask)
+        self._begin(np.flatnonzero(mask).tolist(), each_seed(seed, self.num_envs))
         return self._observation(), self._infos([self._info(slot) for slot in range(self.num_envs)])
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -151,11 +160,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         if self._autoreset == AutoresetMode.NEXT_STEP and self._episodes:
             restarted = [slot for slot in range(self.num_envs) if self._done[slot]]
         elif self._done.any():
-            raise DataError(
-                "An episode has ended or not begun",
-                got=np.flatnonzero(self._done).tolist(),
-                next_step="call reset first",
-            )
+            ended = np.flatnonzero(self._done).tolist()
+            raise DataError("An episode has ended or not begun", got=ended, next_step="call reset first")
         if not self._episodes:
             raise DataError("The environment was not reset", next_step="call reset first")
         going_on = [rest for group in self._together if (rest := group.without(restarted)) is not None]
@@ -255,15 +261,22 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                     episode.video[view].append(video)
                 episode.points.append(simulated_points(simulation, index)[:count])
             if self._succeeds is not None and (last or (full and self._stop_at_success)):
-                episode.success = self._succeeds(episode.trajectory(self.world.contract.fps)) is True
+                found = self._succeeds(episode.trajectory(self.world.contract.fps))
+                if not isinstance(found, bool | np.bool_ | None):
+                    raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
+                episode.success = bool(found)
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
-        commands = np.asarray(actions, dtype=np.float64)
-        if commands.shape != self.action_space.shape or not np.isfinite(commands).all():
+        try:
+            given = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            given = np.empty(0)
+        numbers = given.dtype.kind in "fiu" and given.shape == self.action_space.shape
+        if not numbers or not np.isfinite(commands := given.astype(np.float64)).all():
             raise DataError(
                 "Not the commands of one step",
                 expected=f"finite {self.action_space.shape}: {', '.join(self.kinematics.embodiment.state_names)}",
-                got=commands.shape if commands.shape != self.action_space.shape else "numbers that are not finite",
+                got="numbers that are not finite" if numbers else f"{given.dtype} {given.shape}",
             )
         return commands
 

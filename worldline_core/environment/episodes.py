@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from worldline_core.environment.starts import Start
+from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.judge import judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.recordings import Trajectory
@@ -83,3 +84,17 @@ class Together:
             return self if kept else None
         commands = [rows[kept] for rows in self.commands]
         return Together(self.simulation.select(kept), [self.slots[index] for index in kept], self.age, commands)
+
+
+def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """Seeds of so many episodes: those given, or counted up from one, or none.
+
+    Raises: DataError for another number of them, or what is no seed.
+    """
+    if isinstance(given, int | np.integer):
+        given = [int(given) + number for number in range(count)]
+    seeds = [None] * count if given is None else list(given) if isinstance(given, Sequence | np.ndarray) else [given]
+    known = [seed for seed in seeds if seed is not None]
+    if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
+        raise DataError("Not the seeds of the episodes", expected=f"{count}, from 0 to 2^63 - 1, or one", got=seeds)
+    return seeds
