@@ -161,10 +161,32 @@ def test_a_night_without_scores_is_refused(tmp_path: Path) -> None:
         record_night(tmp_path, "2026-11-20", {})
 
 
-def test_a_damaged_history_is_named(tmp_path: Path) -> None:
-    (tmp_path / "history.jsonl").write_text('{"night": "2026-11-20"}\n')
-    with pytest.raises(ArtifactError, match=r"(?s)not a night.*history\.jsonl"):
-        read_history(tmp_path)
+NIGHT = '{"good": true, "metrics": {"x": {"count": 9, "high": 0.6, "low": 0.4, "mean": 0.5}}, "night": "2026-11-20"}\n'
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ('{"night": "2026-11-20"}\n', "not a night"),
+        (NIGHT + NIGHT, "a second time"),
+        # The file is written as a whole: what is cut is damage, and would be lost with the next night.
+        (NIGHT + NIGHT[:40], "not JSON"),
+        (NIGHT.replace("0.5", "NaN"), "a number that is none"),
+        (NIGHT.replace("0.5", "1e999"), "a number that is none"),
+        (NIGHT.replace("0.5", '"0.5"'), "not a night"),
+        (NIGHT.replace("0.5", "null"), "not a night"),
+        (NIGHT.replace("0.5", "true"), "a number that is none"),
+        (NIGHT.replace("true", '"false"'), "good or not"),
+        (NIGHT.replace('"2026-11-20"', "null"), "name is text"),
+    ],
+)
+def test_a_damaged_history_is_named(tmp_path: Path, line: str, match: str) -> None:
+    (tmp_path / "history.jsonl").write_text(line)
+    for use in (read_history, lambda folder: record_night(folder, "later", scores(tmp_path / "a", 0.6))):
+        with pytest.raises(ArtifactError, match=rf"(?s){match}") as caught:
+            use(tmp_path)
+        assert "history.jsonl" in str(caught.value)
+    assert (tmp_path / "history.jsonl").read_text() == line
 
 
 def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifacts: dict[str, Path]) -> None:

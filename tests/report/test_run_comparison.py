@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from flows.command_line import main
 from worldline_core.errors import ArtifactError, ConfigError
-from worldline_core.evaluation.scores import Score, summarise, write_scores
+from worldline_core.evaluation.scores import SCORES_FILE, Score, summarise, write_scores
 from worldline_core.report.nightly import record_night
-from worldline_core.report.run_comparison import compare_runs
+from worldline_core.report.run_comparison import as_table, compare_runs
 
 NUMBER = 24
 
@@ -99,3 +103,53 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         compare_runs(f"{tmp_path}", f"{a}")
     with pytest.raises(ArtifactError, match="No such night"):
         compare_runs(f"{tmp_path}:friday", f"{a}")
+
+
+def _value(table: pa.Table, value: object) -> pa.Table:
+    """The table with another value in its first row."""
+    values = [value, *table["value"].to_pylist()[1:]]
+    return table.set_column(table.column_names.index("value"), "value", pa.array(values))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        # One NaN made every test of the same run significant: "first" was better in all metrics.
+        (lambda table: _value(table, math.nan), "values that are none"),
+        (lambda table: _value(table, -math.inf), "values that are none"),
+        (lambda table: _value(table, None), "values that are none"),
+        (lambda table: table.set_column(6, "metric", pa.nulls(len(table), pa.string())), "values that are none"),
+        (lambda table: table.drop(["value"]), "Not a table of scores"),
+        (lambda table: table.set_column(7, "value", pa.array(["a"] * len(table))), "Not a table of scores"),
+        (lambda _: b"PAR1 and no more", "Parquet file is damaged"),
+        (lambda _: b"", "Parquet file is damaged"),
+    ],
+)
+def test_scores_that_are_none_are_refused(tmp_path: Path, change: Callable[[pa.Table], Any], match: str) -> None:
+    a, b = evaluation(tmp_path / "a", 0.05), evaluation(tmp_path / "b", 0.0)
+    record_night(tmp_path / "history", "monday", {"evaluate_video": b})
+    kept = next((tmp_path / "history" / "scores").iterdir())
+    for path, place in ((b / SCORES_FILE, f"{b}"), (kept, f"{tmp_path / 'history'}:monday")):
+        if path == kept and match != "Parquet file is damaged":
+            continue  # other columns
+        changed = change(pq.read_table(path))
+        path.write_bytes(changed) if isinstance(changed, bytes) else pq.write_table(changed, path)
+        with pytest.raises(ArtifactError, match=match):
+            compare_runs(f"{a}", place)
+        with pytest.raises(ArtifactError, match=match):
+            record_night(tmp_path / "history", "tuesday", {"evaluate_video": b if path != kept else a})
+
+
+@pytest.mark.parametrize("inputs", [None, [], "x", {"evaluate_video": 1}, {"evaluate_video": {"path": 5}}, {"evaluate_video": {"path": "x"}}])  # fmt: skip
+def test_a_manifest_of_another_form_is_no_run(tmp_path: Path, inputs: object) -> None:
+    a = evaluation(tmp_path / "a", 0.0)
+    (tmp_path / "manifest.json").write_text(json.dumps({"inputs": inputs}))
+    with pytest.raises(ArtifactError, match="Nothing to compare here"):
+        compare_runs(f"{tmp_path}", f"{a}")
+
+
+def test_odd_names_of_methods_stay_names(tmp_path: Path) -> None:
+    a, b = evaluation(tmp_path / "a", 0.05, "a/b\x1b[2J"), evaluation(tmp_path / "b", 0.0, "a/b\x1b[2J")
+    rows = compare_runs(f"{a}", f"{b}")
+    assert {row.method for row in rows} == {"a|b\x1b[2J"}  # not the method "a" and a metric "b/ssim"
+    assert "\x1b" not in as_table(rows)

@@ -11,16 +11,19 @@ Many series are compared at once, and some of them always look bad by chance. `p
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
+import pyarrow as pa
 
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metric_registry import METRICS, metric_of
 from worldline_core.evaluation.recordings import TRUE_METHOD
-from worldline_core.evaluation.scores import SCORES_FILE, Score, write_table
+from worldline_core.evaluation.scores import SCORES_FILE, Score, table_schema, write_table
+from worldline_core.store.artifact_files import read_table
 
 Series = dict[str, dict[str, float]]
 """By name of the series, the value of each recording."""
@@ -30,6 +33,7 @@ LEAST_RECORDINGS = 8
 DECISION_MARGIN = 0.01
 """Of shares of right verdicts and successful plans: a smaller loss is no regression."""
 _COLUMNS = ("series", "recording", "value")
+_OPTIONAL = {field.name for field in fields(Score) if field.default == ""}
 _RESAMPLES = 2000
 
 
@@ -58,7 +62,7 @@ def read_scores(folder: Path, *, subgroups: bool = False) -> Series:
     Args:
         subgroups: embodiments and outcomes as well, as ``test|ur5e_pair``.
 
-    Raises: ArtifactError where the folder has no table of scores.
+    Raises: ArtifactError where the folder has no table of scores, or a damaged one.
     """
     path = folder / SCORES_FILE
     if not path.is_file():
@@ -66,7 +70,7 @@ def read_scores(folder: Path, *, subgroups: bool = False) -> Series:
             "Not a finished evaluation", where=folder, expected=SCORES_FILE, next_step="run an evaluation"
         )
     cells: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in pq.read_table(path).to_pylist():
+    for row in _read(path, [field.name for field in fields(Score)]):
         score = Score(**row)
         for name in _names(score, subgroups):
             cells[name][score.episode_id].append(score.value)
@@ -82,11 +86,36 @@ def _names(score: Score, subgroups: bool) -> list[str]:
         groups, what, metrics = [f"N={score.metric.partition('@')[2]}"], "planning", ["success"]
         groups += [f"{groups[0]}|{score.embodiment}", f"{groups[0]}|{score.task_family}"] if subgroups else []
     elif metric_of(score.metric) is not None and score.method != TRUE_METHOD:
-        groups = [group.replace("/", "|") for group in score.groups if subgroups or "/" not in group]
+        groups = [group for group in score.groups if subgroups or "/" not in group]
         what, metrics = "video", [score.metric, *([f"{score.metric}@{score.view}"] if score.view else [])]
     else:
         return []
-    return [f"{what}/{group}/{score.method}/{metric}" for group in dict.fromkeys(groups) for metric in metrics]
+    method = score.method.replace("/", "|")
+    return [
+        f"{what}/{group.replace('/', '|')}/{method}/{metric}" for group in dict.fromkeys(groups) for metric in metrics
+    ]
+
+
+def _read(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows of a table that `write_table` wrote.
+
+    Raises: ArtifactError where it is damaged, lacks a column or a value, or holds one that is no finite number: of those
+        every test would be wrong, also that of other series.
+    """
+    table = read_table(path)
+    if table is None:
+        return []
+    try:
+        found = table.select([name for name in columns if name in table.column_names or name not in _OPTIONAL])
+        found = found.cast(table_schema(found.column_names))
+    except (KeyError, pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise ArtifactError("Not a table of scores", where=path, expected=", ".join(columns), got=str(error)) from error
+    if any(column.null_count for column in found.columns) or not np.isfinite(found["value"].to_numpy()).all():
+        raise ArtifactError(
+            "A table of scores holds values that are none", where=path, expected="finite numbers, nothing empty",
+            next_step="rebuild the artifact",
+        )  # fmt: skip
+    return found.to_pylist()
 
 
 def write_series(path: Path, series: Series) -> None:
@@ -100,9 +129,12 @@ def write_series(path: Path, series: Series) -> None:
 
 
 def read_series(path: Path) -> Series:
-    """Series that `write_series` wrote; none where there is no such file."""
+    """Series that `write_series` wrote; none where there is no such file.
+
+    Raises: ArtifactError where it is damaged.
+    """
     found: Series = defaultdict(dict)
-    for row in pq.read_table(path).to_pylist() if path.is_file() else ():
+    for row in _read(path, _COLUMNS):
         found[row["series"]][row["recording"]] = row["value"]
     return dict(found)
 

@@ -139,11 +139,15 @@ def write_scores(folder: Path, scores: Iterable[Score]) -> None:
     write_table(folder / SCORES_FILE, rows, [field.name for field in fields(Score)])
 
 
+def table_schema(columns: Sequence[str]) -> pa.Schema:
+    """Columns of a table that evaluations write."""
+    return pa.schema([(name, _TYPES.get(name, pa.string())) for name in columns])
+
+
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as Parquet, whole or not at all."""
-    schema = pa.schema([(name, _TYPES.get(name, pa.string())) for name in columns])
     with atomic_path(path) as temporary:
-        pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema), temporary)
+        pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=table_schema(columns)), temporary)
 
 
 def part_file(folder: Path, *of: str | int) -> Path:

@@ -185,11 +185,12 @@ def read_history(history: Path) -> list[Night]:
     """
     path = history / HISTORY_FILE
     nights: list[Night] = []
-    for row in read_json_lines(path) if path.is_file() else ():
+    for row in read_json_lines(path, atomic=True):
         try:
-            metrics = {name: Interval(**value) for name, value in row["metrics"].items()}
-            nights.append(Night(str(row["night"]), metrics, bool(row.get("good", True))))
-        except (KeyError, TypeError, AttributeError) as error:
+            nights.append(_night(row))
+            if any(nights[-1].night == other.night for other in nights[:-1]):
+                raise ValueError(f"the night {nights[-1].night} a second time")
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ArtifactError(
                 "A line of the history is not a night",
                 where=path,
@@ -197,6 +198,16 @@ def read_history(history: Path) -> list[Night]:
                 got=str(error),
             ) from error
     return nights
+
+
+def _night(row: JsonObject) -> Night:
+    night = Night(row["night"], {name: Interval(**v) for name, v in row["metrics"].items()}, row.get("good", True))
+    numbers = [number for value in night.metrics.values() for number in asdict(value).values()]
+    if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+        raise ValueError("a number that is none")
+    if not isinstance(night.night, str) or not isinstance(night.good, bool):
+        raise TypeError("a night's name is text, and it is good or not")
+    return night
 
 
 def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:

@@ -16,7 +16,8 @@ from worldline_core.evaluation.metric_registry import metric_of
 from worldline_core.evaluation.paired import EVALUATIONS, Series, differences, paired_tests, read_scores, read_series
 from worldline_core.evaluation.scores import SCORES_FILE, write_table
 from worldline_core.report.nightly import read_history, scores_file
-from worldline_core.store.artifact_files import MANIFEST_NAME, read_json
+from worldline_core.store.artifact_files import MANIFEST_NAME, linked_folder, read_json
+from worldline_core.untrusted_text import visible
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,13 @@ def read_run(place: str) -> Series:
     path = Path(place)
     if (path / SCORES_FILE).is_file():
         return read_scores(path, subgroups=True)
-    inputs = read_json(path / MANIFEST_NAME).get("inputs", {})
-    # Artifacts lie at <store>/<step>/<key>, and a manifest names its inputs from the store's root.
-    folders = [path.resolve().parents[1] / i["path"] for n, i in inputs.items() if n.partition(".")[0] in EVALUATIONS]
-    if not folders:
+    inputs = read_json(path / MANIFEST_NAME).get("inputs")
+    names = [name for name in inputs if name.partition(".")[0] in EVALUATIONS] if isinstance(inputs, dict) else []
+    folders = [folder for name in names if (folder := linked_folder(path, name)) is not None]
+    if not folders or len(folders) < len(names):
         raise ArtifactError(
-            "Nothing to compare here", where=place, got="neither scores nor a report's manifest",
+            "Nothing to compare here", where=place,
+            got=f"{len(folders)} of the evaluations {names}" if names else "neither scores nor a report's manifest",
             expected="the folder of an evaluation, of a report, or HISTORY:NIGHT (artifacts/nightly:2026-11-21)",
         )  # fmt: skip
     return {name: values for folder in folders for name, values in read_scores(folder, subgroups=True).items()}
@@ -129,6 +131,7 @@ def as_table(rows: Sequence[Difference]) -> str:
         )
         for r in rows
     ]  # fmt: skip
+    lines = [tuple(map(visible, line)) for line in lines]
     widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
     return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in lines)
 

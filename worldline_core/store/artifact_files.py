@@ -41,8 +41,9 @@ def read_json(path: Path) -> JsonObject:
     return value
 
 
-def read_json_lines(path: Path) -> list[JsonObject]:
-    """The objects of a `.jsonl` file; none of an absent one. A last line that a kill cut short is left out.
+def read_json_lines(path: Path, *, atomic: bool = False) -> list[JsonObject]:
+    """The objects of a `.jsonl` file; none of an absent one. A last line that a kill cut short is left out, but of a file
+    that is written as a whole (``atomic``).
 
     Raises:
         ArtifactError: a line before the last is not a JSON object.
@@ -55,7 +56,7 @@ def read_json_lines(path: Path) -> list[JsonObject]:
         try:
             value = json.loads(line)
         except (ValueError, RecursionError) as error:
-            if index == len(lines) - 1:
+            if index == len(lines) - 1 and not atomic:
                 break
             raise ArtifactError("A line is not JSON", where=f"{path}:{index + 1}", got=line[:80]) from error
         if not isinstance(value, dict):
@@ -140,7 +141,8 @@ def linked_folder(folder: Path, name: str) -> Path | None:
 
     Manifests name inputs relative to the root of the artifacts, two folders up.
     """
-    entry = read_json(folder / "manifest.json").get("inputs", {}).get(name)
+    inputs = read_json(folder / "manifest.json").get("inputs")
+    entry = inputs.get(name) if isinstance(inputs, dict) else None
     if not isinstance(entry, dict) or not isinstance(entry.get("path"), str):
         return None
     path = folder.resolve().parent.parent / entry["path"]
