@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -185,10 +186,22 @@ def test_data_that_is_gone_is_no_verdict_on_an_episode(linked, tmp_path, mode):
     assert read_json(tracks.path / "manifest.json")["metrics"]["kept"] == 3
 
 
-@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:-9])])
-def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage):
+DAMAGE = {
+    "gone": Path.unlink,
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-9]),
+    "empty": lambda path: path.write_bytes(b""),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+    "a link to nothing": lambda path: (path.unlink(), path.symlink_to("/nowhere")),
+    "a pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+    "something else": lambda path: path.write_bytes(b"PAR1" + bytes(200) + b"PAR1"),
+}
+
+
+@pytest.mark.parametrize("file", ["cameras.parquet", "file-000.parquet"])
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage, file):
     filtered, curated = linked
-    damage(sorted(curated.rglob("cameras.parquet"))[0])
+    damage(next(path for path in sorted(curated.rglob(file)) if "episodes" not in path.parts))
     with pytest.raises(ArtifactError, match="An input of this step is missing or damaged"):
         run_step(ArtifactStore(tmp_path / "store", "off"), "render_actions", CONFIG, {"episodes": filtered})
     assert not list((tmp_path / "store" / "render_actions").glob("*/manifest.json"))
@@ -206,16 +219,19 @@ def test_previews_have_names_of_their_own_however_long_or_alike_ids_are(tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {"set", "tracks"}
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value):
+NUMBERS = ("uv", "depth", "rot6d", "gripper", "T_base_tool", "T_base_camera", "capsules", "capsule_radii")
+
+
+@pytest.mark.parametrize(("value", "name"), [*((np.nan, name) for name in NUMBERS), (np.inf, "uv"), (-np.inf, "depth")])
+def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value, name):
     """Whoever reads them (a rollout, a training): they never become maps, nor a video."""
     shutil.copytree(rendered[0], tmp_path / "tracks")
     shards = sorted((tmp_path / "tracks").glob("tracks-*.safetensors"))
     path, arrays = next((path, found) for path in shards if "ur5e_pair-0/uv" in (found := load_file(path)))
-    arrays["ur5e_pair-0/uv"][2, 0, 0] = value
+    arrays[f"ur5e_pair-0/{name}"].flat[-1] = value
     save_file(arrays, path)
     tracks = ActionTracks.open(tmp_path / "tracks")
-    with pytest.raises(ArtifactError, match=r"not finite[\s\S]*ur5e_pair-0[\s\S]*uv"):
+    with pytest.raises(ArtifactError, match=rf"not finite[\s\S]*ur5e_pair-0[\s\S]*{name}"):
         tracks.tracks("ur5e_pair-0")
     assert tracks.tracks("ur5e_pair-1").num_frames == N
 

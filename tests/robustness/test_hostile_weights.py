@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -18,9 +20,13 @@ from worldline_core.distillation.trajectory_store import TrajectoryStore
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet, save_segmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
+from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.publishing.content import check_manifest
 from worldline_core.store.artifact_files import read_json, read_json_lines
+from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.video_teacher import load_teacher
 
 
 @pytest.fixture
@@ -233,3 +239,24 @@ def test_an_index_of_trajectories_that_is_none_is_refused(index: str, trajectori
     (trajectories / "trajectories.json").write_text(index)
     with pytest.raises(ArtifactError, match=r"damaged|wrong form|lists no shards"):
         TrajectoryStore.open(trajectories)
+
+
+DAMAGED = {
+    "nothing": b"",
+    "a brace": b"{",
+    "deep": b"[" * 100_000,
+    "5,000 digits": b"9" * 5000,
+    "a list": b"[]",
+    "no text": b"\xff\xfe",
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_small_descriptions_that_are_none_are_named(tmp_path: Path, content: bytes) -> None:
+    for name in ("config.json", "manifest.json", "store.json"):
+        (tmp_path / name).write_bytes(content)
+    pq.write_table(pa.table({"episode_id": ["a"]}), tmp_path / "index.parquet")
+    for read in (load_teacher, LatentStore.open, load_tokenizer, lambda folder: check_manifest(folder, "a store")):
+        with pytest.raises(ArtifactError) as caught:
+            read(tmp_path)
+        assert str(tmp_path) in str(caught.value)

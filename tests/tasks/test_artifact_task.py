@@ -115,10 +115,13 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
     return {
         "pickle": lambda r: {"metadata": r["metadata"] | {"serializer": {"type": "pickle"}}, "result": pickled},
         "a decoder": change(object_decoder="trap_door.anything"), "another place": change(lie), "a class": change(made), "no record": lambda r: {},
+        "half a character": change('"\\ud800"'),
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["pickle", "a decoder", "another place", "a class", "no record"])
+@pytest.mark.parametrize(
+    "kind", ["pickle", "a decoder", "another place", "a class", "no record", "half a character", "a folder"]
+)
 def test_prefects_records_are_not_believed(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
@@ -128,9 +131,11 @@ def test_prefects_records_are_not_believed(
     monkeypatch.syspath_prepend(tmp_path)
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
         one, two = _run(tmp_path, "a", "b")
-        change = _records(tmp_path / "trap", tmp_path / "elsewhere")[kind]
+        change = _records(tmp_path / "trap", tmp_path / "elsewhere").get(kind)
         for path in (tmp_path / "prefect").iterdir():
-            path.write_text(json.dumps(change(json.loads(path.read_text()))))
+            record = json.loads(path.read_text())
+            path.unlink()
+            path.mkdir() if change is None else path.write_text(json.dumps(change(record)))
         assert _run(tmp_path, "a", "b") == (one, two)
     assert not (tmp_path / "trap").exists()
 

@@ -97,8 +97,9 @@ def test_a_loss_that_is_not_finite_keeps_its_batch_and_the_state_before(tmp_path
     assert torch.equal(run(tmp_path).average["weight"], run(tmp_path / "whole").average["weight"])
 
 
-def test_a_held_out_loss_that_is_not_finite_ends_the_run_with_valid_json(tmp_path: Path) -> None:
-    scores = iter([0.5, float("nan")])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_held_out_loss_that_is_not_finite_ends_the_run_with_valid_json(tmp_path: Path, value: float) -> None:
+    scores = iter([0.5, value])
     with pytest.raises(TrainingError, match="held-out loss is not finite") as ended:
         run(tmp_path, validate=lambda: {"loss": next(scores)}, validate_every=4)
     assert "step 8, validation/loss" in str(ended.value)

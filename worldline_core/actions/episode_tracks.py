@@ -317,8 +317,8 @@ class ActionTracks:
                 arrays = {name: shard.get_tensor(f"{episode_id}/{name}") for name in ARRAYS}
         except (OSError, SafetensorError) as error:
             raise ArtifactError("Shard of action tracks cannot be read", where=path, got=str(error)) from error
-        # Of a view without calibration K says so by not being finite; what maps are drawn from is, valid or not.
-        if unusable := [name for name in SAMPLES if not np.isfinite(arrays[name]).all()]:
+        # Of a view without calibration K says so by not being finite; all others are, valid or not.
+        if unusable := [name for name in ARRAYS if name != "K" and not np.isfinite(arrays[name]).all()]:
             raise ArtifactError(
                 "Action tracks are not finite", where=f"{path}, episode {episode_id}", got=", ".join(unusable),
                 next_step=how_to_rebuild(self.root),

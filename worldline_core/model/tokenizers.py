@@ -165,7 +165,7 @@ def _wan_shape(root: Path) -> dict[str, Any]:
     try:
         shape = json.loads((root / "config.json").read_text(encoding="utf-8"))
         name = shape.get("_class_name")
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise CheckpointError("The autoencoder's config is not a JSON object", where=root, got=str(error)) from error
     if name != "AutoencoderKLWan":
         raise CheckpointError("Not a Wan autoencoder", where=root, expected="AutoencoderKLWan", got=name)

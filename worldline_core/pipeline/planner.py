@@ -6,7 +6,6 @@ folder of weights is not here yet, its published shapes stand for it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -29,6 +28,7 @@ from worldline_core.pipeline.rollout_cost import decoding_cost, rollout_cost
 from worldline_core.pipeline.sheet import Machine, Row
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.shipped import project_path
+from worldline_core.store.artifact_files import read_json
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_source import latent_frame_count
 from worldline_core.training.stage1 import is_trained
@@ -237,7 +237,7 @@ class Planner:
             folder = policy.vlm.weights
             place = None if folder is None else project_path(self.project, folder) / "config.json"
             here = place is not None and place.is_file()
-            shape = json.loads(place.read_text(encoding="utf-8")) if place is not None and here else QWEN3_VL_8B
+            shape = read_json(place) if place is not None and here else QWEN3_VL_8B
             yield self._weights("evaluate_policy: Qwen3-VL", Qwen3VLForConditionalGeneration, Qwen3VLConfig(**shape))
 
     def _weights(self, title: str, kind: Any, config: Any) -> Row:

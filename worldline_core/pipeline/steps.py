@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import ConfigError
+from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.store.store import Artifact, ArtifactStore
@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 
 _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # malloc.h
 _NEVER = 2**31 - 1
+_MOST_THREADS = 1024
 
 
 def keep_freed_memory() -> bool:
@@ -65,7 +66,9 @@ def same_threads(output: Path) -> Iterator[None]:
         return
     path, now = output / "run" / "threads.json", torch.get_num_threads()
     begun = read_json(path).get("threads")
-    if isinstance(begun, int) and 0 < begun != now:
+    if not (begun is None or (type(begun) is int and 0 < begun <= _MOST_THREADS)):
+        raise ArtifactError("Not a number of threads", where=path, got=begun, next_step="delete the unfinished folder")
+    if begun not in (None, now):
         logger.info("continuing on %d threads, as it began, instead of %d", begun, now)
         torch.set_num_threads(begun)
     elif begun is None:

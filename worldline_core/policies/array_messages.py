@@ -66,19 +66,15 @@ def _packed_array(value: object) -> dict[bytes, Any]:
     return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
 
 
-def unpack(content: bytes, where: object, *, max_bytes: int = MAX_MESSAGE_BYTES) -> Any:
+def unpack(content: bytes, where: object) -> Any:
     """The message that these bytes hold; arrays are copies that may be changed.
 
     Args:
         where: who sent it, for errors.
 
     Raises:
-        DataError: it is no message, too large, or holds an array that does not fit its own description.
+        DataError: it is no message, or holds an array that does not fit its own description.
     """
-    if len(content) > max_bytes:
-        raise DataError(
-            "A message is too large", where=where, expected=f"at most {max_bytes:,} bytes", got=len(content)
-        )
     containers = 0
 
     def counted(found: Any) -> Any:

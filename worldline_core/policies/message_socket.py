@@ -142,7 +142,7 @@ class MessageSocket:
                 reply = without_secret(reply, secret)
             raise UnavailableError("The server reports an error", where=self.url, got=reply)
         try:
-            found = unpack(reply, self.url, max_bytes=self.max_bytes)
+            found = unpack(reply, self.url)
             if not isinstance(found, dict):
                 raise DataError("A message is no map", where=self.url, expected="a map", got=type(found).__name__)
         except DataError:

@@ -17,7 +17,14 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, says_droid
 from worldline_core.data.guards.source_paths import inside
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.store.artifact_files import MANIFEST_NAME, VOLATILE_FOLDER, digest_file, digest_folder, folder_files
+from worldline_core.store.artifact_files import (
+    MANIFEST_NAME,
+    VOLATILE_FOLDER,
+    digest_file,
+    digest_folder,
+    folder_files,
+    read_json,
+)
 from worldline_core.store.atomic import atomic_path
 
 FILE_LIST = "worldline_files.json"
@@ -209,7 +216,7 @@ def check_space(contents: FileList, targets: Mapping[str, Path], folder: Path) -
 def check_manifest(folder: Path, where: str) -> None:
     """Raises: ArtifactError when the content is not that whose digest the step wrote down."""
     manifest = folder / MANIFEST_NAME
-    stated = json.loads(manifest.read_text()).get("digest") if manifest.is_file() else None
+    stated = read_json(manifest).get("digest")
     if stated is not None and stated != (found := digest_folder(folder)):
         raise ArtifactError(
             "Content is not that of the manifest", where=where, expected=f"digest {stated}", got=f"digest {found}"

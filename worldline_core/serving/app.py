@@ -57,7 +57,7 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
         except (TimeoutError, ClientDisconnect):
             return PlainTextResponse("the request did not come in time\n", 408, {"connection": "close"})
         try:
-            reply = await host.handle(over_http, unpack(bytes(body), "request", max_bytes=config.max_message_bytes))
+            reply = await host.handle(over_http, unpack(bytes(body), "request"))
         except DataError as error:
             reply = {"error": error_message(error)}
         status = _STATUS.get(reply["error"]["kind"], 400) if "error" in reply else 200
@@ -90,7 +90,7 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
             if found["type"] == "websocket.disconnect":
                 return
             try:
-                message = unpack(found.get("bytes") or b"", "request", max_bytes=config.max_message_bytes)
+                message = unpack(found.get("bytes") or b"", "request")
             except DataError as error:
                 # What follows a message that is not understood cannot be trusted either.
                 await send_in_time(websocket, pack({"error": error_message(error)}))

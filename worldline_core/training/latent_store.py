@@ -34,6 +34,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.progress import with_progress
+from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_source import Clip, ClipRow, ClipSource, latent_frame_count, longest_clip
@@ -97,9 +98,13 @@ class LatentStore(ClipSource):
                 got=f"no {' and no '.join(missing)}",
                 next_step="run the encode_latents step first",
             )
-        table = pq.read_table(root / _INDEX).to_pylist()
-        rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in table]
-        return cls(root, json.loads((root / _DESCRIPTION).read_text()), rows)
+        try:
+            rows = [LatentRow(**{**row, "views": tuple(row["views"])}) for row in read_rows(root / _INDEX)]
+        except (TypeError, KeyError) as error:
+            raise ArtifactError(
+                "The index of the latents has other columns", where=root / _INDEX, got=str(error)
+            ) from error
+        return cls(root, read_json(root / _DESCRIPTION), rows)
 
     def __getstate__(self) -> dict[str, Any]:
         # Open shards stay in the process that opened them.

@@ -7,7 +7,6 @@ four blocks, concatenated.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -22,6 +21,7 @@ from torch.nn import functional
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
 from worldline_core.model.checkpoint import fill, read_description
 from worldline_core.model.weight_files import read_weights
+from worldline_core.store.artifact_files import read_json
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], 
 
     shape: dict[str, Any] = VJEPA2_GIANT | {"crop_size": 384}
     if folder is not None and (folder / "config.json").is_file():
-        shape = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        shape = read_json(folder / "config.json")
     model = VJEPA2Model(VJEPA2Config(**shape))
     return model, VJepa2Teacher.of(model).features
 
@@ -242,7 +242,7 @@ def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
         fill(teacher, read_weights(folder / WEIGHTS, None), where=folder / WEIGHTS, dtype=torch.float32)
         return teacher.eval().requires_grad_(False).to(device)
     config = folder / "config.json"
-    if config.is_file() and json.loads(config.read_text()).get("model_type") == "vjepa2":
+    if read_json(config).get("model_type") == "vjepa2":
         return VJepa2Teacher(folder, device)
     raise CheckpointError(
         "This folder holds no relational teacher.",
