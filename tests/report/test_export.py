@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import decode_video
+from worldline_core.errors import DataError
 from worldline_core.exports.export import export
 from worldline_core.exports.rollout import export_rollout
+from worldline_core.exports.worldarena import export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet
 
 
@@ -45,3 +51,19 @@ def test_predictions_are_exported_in_the_layout_of_worldarena(run_artifacts: dic
         assert Path(entry["image"]).read_bytes().startswith(b"\x89PNG")
         assert list(entry) == ["gt_path", "image", "prompt"]
     assert set(written) == {path for path in tmp_path.rglob("*") if path.is_file() and not path.name.startswith(".")}
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "match"), [("fps", 1e6, "Another rate"), ("num_frames", 10**9, "Longer than its recording")]
+)
+def test_predictions_that_do_not_fit_their_recordings_are_refused(
+    run_artifacts: dict[str, Path], tmp_path: Path, column: str, value: float, match: str
+) -> None:
+    """A rate a million times the recording's showed its first frame again and again."""
+    folder = shutil.copytree(run_artifacts["rollout.shipped_causal"], tmp_path / "rollout")
+    rows = [{**row, column: value} for row in pq.read_table(folder / "index.parquet").to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows), folder / "index.parquet")
+    rollouts, episodes = RolloutSet.open(folder), EpisodeSet.open(run_artifacts["curate"])
+    with pytest.raises(DataError, match=match):
+        export_worldarena(rollouts, episodes, rollouts.episode_ids[:1], tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("*.mp4"))

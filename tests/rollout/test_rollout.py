@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -246,4 +249,31 @@ def test_sets_of_rollouts_are_read_strictly(tmp_path: Path) -> None:
         RolloutSet.open(tmp_path).frames("e", "head", 0)
     pq.write_table(table.set_column(1, "method", [["m", "n"]]), tmp_path / "index.parquet")
     with pytest.raises(ArtifactError, match="holds one method"):
+        RolloutSet.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows: [*rows, {**rows[0], "path": "another.mp4"}],  # the last one was taken
+        lambda rows: [{**row, "fps": float(number + 1)} for number, row in enumerate(rows)],
+        *(lambda rows, fps=fps: [{**row, "fps": fps} for row in rows] for fps in (0.0, -8.0, math.nan, math.inf, None)),
+        *(lambda rows, count=count: [{**row, "num_frames": count} for row in rows] for count in (0, -1, "many")),
+        lambda rows: [{**row, "episode_id": None} for row in rows],
+        lambda rows: [{**row, "method": f"m{number}"} for number, row in enumerate(rows)],
+        lambda rows: [{"episode_id": row["episode_id"]} for row in rows],
+        lambda rows: [],
+        lambda rows: None,
+    ],
+)
+def test_an_index_that_lies_is_refused(tmp_path: Path, change: Callable[[list[dict]], list[dict] | None]) -> None:
+    writer = RolloutSetWriter(tmp_path, "m", 8.0)
+    for name in ("a", "b"):
+        writer.register(name, 0, "head", 9, (16, 16))
+    writer.close()
+    assert len(RolloutSet.open(tmp_path).rows) == 2
+    path = tmp_path / "index.parquet"
+    rows = change(pq.read_table(path).to_pylist())
+    path.write_bytes(b"PAR1") if rows is None else pq.write_table(pa.Table.from_pylist(rows), path)
+    with pytest.raises(ArtifactError, match=r"index of the rollouts|holds one method|Parquet file is damaged"):
         RolloutSet.open(tmp_path)

@@ -36,7 +36,7 @@ _TRUTH = Encoding(8, "veryfast", "yuv444p")
 def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequence[str], output: Path) -> list[Path]:
     """Write the predictions (of the smallest seed) of some episodes; returns the files.
 
-    Raises: DataError for an episode without a predicted head view, or whose rate is no whole part of the recording's.
+    Raises: DataError for an episode without a predicted head view, whose rate is no whole part of the recording's, or that is longer.
     """
     written: list[Path] = []
     summary, ids = [], {}
@@ -45,9 +45,11 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
             raise DataError("WorldArena looks at the head view", where=name, got=", ".join(rollouts.views(name)))
         position = episodes.position(name)
         row, clip = episodes.rows[position], rollouts.clip(name, HEAD)
-        stride = row.fps / rollouts.fps
-        if abs(stride - round(stride)) > 1e-3:
+        stride = round(row.fps / rollouts.fps)
+        if stride < 1 or abs(row.fps / rollouts.fps - stride) > 1e-3:
             raise DataError("Another rate than the recording's", where=name, expected=row.fps, got=rollouts.fps)
+        if stride * (clip.num_frames - 1) >= row.video_frames:
+            raise DataError("Longer than its recording", where=name, expected=row.video_frames, got=clip.num_frames)
         stem = f"{safe_stem(row.task_family or 'task')}_episode_{number}"
         predicted, true, first = (
             output / folder / f"{stem}.{suffix}"
@@ -59,7 +61,7 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
         )
         with atomic_path(predicted) as temporary:
             shutil.copyfile(clip.path, temporary)
-        frames = np.asarray(episodes.frames(position, HEAD, [round(stride) * n for n in range(clip.num_frames)]))
+        frames = np.asarray(episodes.frames(position, HEAD, [stride * n for n in range(clip.num_frames)]))
         size = (int(frames.shape[1]), int(frames.shape[2]))
         with atomic_path(true) as temporary, VideoEncoder(temporary, size, rollouts.fps, _TRUTH) as encoder:
             for frame in frames:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -16,7 +17,7 @@ from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.encoder import Encoding, VideoEncoder
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.store.artifact_files import row_schema
+from worldline_core.store.artifact_files import read_table, row_schema
 from worldline_core.store.atomic import atomic_path
 
 INDEX_FILE = "index.parquet"
@@ -123,21 +124,31 @@ class RolloutSet:
         """Open a set.
 
         Raises:
-            ArtifactError: the index is missing, lacks a column, is empty, or mixes methods.
+            ArtifactError: the index is missing or damaged, lacks a column, is empty, mixes methods or rates, or names a
+                video twice.
         """
         root = Path(root)
         path = root / INDEX_FILE
-        if not path.is_file():
+        table = read_table(path)
+        if table is None:
             raise ArtifactError("Not a set of rollouts", where=root, expected=INDEX_FILE, next_step="run rollout")
-        table = pq.read_table(path)
-        if not set(_SCHEMA.names) <= set(table.column_names):
+        try:
+            table = table.select(_SCHEMA.names).cast(_SCHEMA)
+        except (KeyError, pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise ArtifactError(
-                "The index of the rollouts lacks columns", where=path, expected=_SCHEMA.names, got=table.column_names
-            )
-        rows = [RolloutRow(**row) for row in table.select(_SCHEMA.names).to_pylist()]
-        methods = sorted({row.method for row in rows})
+                "The index of the rollouts has other columns", where=path, expected=_SCHEMA.names, got=str(error)
+            ) from error
+        rows = [RolloutRow(**row) for row in table.to_pylist()]
+        methods = sorted({str(row.method) for row in rows})
         if len(methods) != 1:
             raise ArtifactError("A set of rollouts holds one method", where=path, expected="one", got=methods)
+        videos, rates = {(row.episode_id, row.view, row.seed) for row in rows}, {row.fps for row in rows}
+        known = not any(column.null_count for column in table.columns) and min(row.num_frames for row in rows) > 0
+        if len(videos) < len(rows) or len(rates) > 1 or not known or not 0 < rows[0].fps < math.inf:
+            raise ArtifactError(
+                "The index of the rollouts is damaged", where=path, expected="each video once, with its frames, at one rate",
+                got=f"{len(rows)} rows of {len(videos)} videos at {sorted(rates)[:3]} fps",
+            )  # fmt: skip
         return cls(root, rows)
 
     @property
