@@ -15,7 +15,7 @@ import pytest
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import decode_video
-from worldline_core.errors import DataError
+from worldline_core.errors import ArtifactError, DataError
 from worldline_core.exports.export import export
 from worldline_core.exports.rollout import export_rollout
 from worldline_core.exports.worldarena import export_worldarena
@@ -67,3 +67,23 @@ def test_predictions_that_do_not_fit_their_recordings_are_refused(
     with pytest.raises(DataError, match=match):
         export_worldarena(rollouts, episodes, rollouts.episode_ids[:1], tmp_path / "out")
     assert not list((tmp_path / "out").rglob("*.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("path", "match"),
+    [
+        ("gone.mp4", "is missing"),
+        ("videos", "no regular file"),
+        ("index.parquet", "no video container"),
+        ("a\0b", "lies outside"),
+    ],
+)
+def test_predictions_that_are_no_videos_are_refused(
+    run_artifacts: dict[str, Path], tmp_path: Path, path: str, match: str
+) -> None:
+    folder = shutil.copytree(run_artifacts["rollout.shipped_causal"], tmp_path / "rollout")
+    rows = [{**row, "path": path} for row in pq.read_table(folder / "index.parquet").to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows), folder / "index.parquet")
+    rollouts, episodes = RolloutSet.open(folder), EpisodeSet.open(run_artifacts["curate"])
+    with pytest.raises((DataError, ArtifactError), match=match):
+        export_worldarena(rollouts, episodes, rollouts.episode_ids[:1], tmp_path / "out")

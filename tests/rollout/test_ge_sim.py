@@ -205,7 +205,7 @@ BAD_ANSWERS = {
     "no_meta": (lambda a: (200, _packed([b"\xff"])), "ValueError|UnicodeDecodeError"),
     "no_shape": (lambda a: (200, _changed(a, state_shape="x")), "a state of 512 bytes"),
     "no_jpeg": (lambda a: (200, a.replace(b"\xff\xd8\xff", b"\0\0\0")), "no known format"),
-    "turned": (lambda a: (200, _turned(a)), "its EXIF turns"),
+    "turned": (lambda a: (200, _turned(a)), rf"a frame of {3 * W} x {H} pixels, not of {H} x {3 * W}"),
     "too_large": (lambda a: (200, a + bytes(1 << 20)), r"more than 951,\d{3} bytes"),
     "refused": (lambda a: (400, b'{"error": "no such robot"}'), "HTTP 400: .*no such robot"),
 }

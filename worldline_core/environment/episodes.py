@@ -93,8 +93,10 @@ def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int 
     """
     if isinstance(given, int | np.integer):
         given = [int(given) + number for number in range(count)]
-    seeds = [None] * count if given is None else list(given) if isinstance(given, Sequence | np.ndarray) else [given]
+    seeds: list[int | None] = [None] * count if given is None else []
+    if isinstance(given, Sequence | np.ndarray):
+        seeds = [*given]
     known = [seed for seed in seeds if seed is not None]
     if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
-        raise DataError("Not the seeds of the episodes", expected=f"{count}, from 0 to 2^63 - 1, or one", got=seeds)
+        raise DataError("Not the seeds of the episodes", expected=f"{count}, from 0 to 2^63 - 1, or one", got=given)
     return seeds

@@ -24,6 +24,7 @@ import numpy as np
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.encoder import Encoding, VideoEncoder
+from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import DataError
 from worldline_core.pictures.labels import png_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -60,7 +61,7 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
             )
         )
         with atomic_path(predicted) as temporary:
-            shutil.copyfile(clip.path, temporary)
+            shutil.copyfile(check_video_header(clip.path), temporary)
         frames = np.asarray(episodes.frames(position, HEAD, [stride * n for n in range(clip.num_frames)]))
         size = (int(frames.shape[1]), int(frames.shape[2]))
         with atomic_path(true) as temporary, VideoEncoder(temporary, size, rollouts.fps, _TRUTH) as encoder:

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.images import decode_image, image_size
+from worldline_core.data.guards.images import decode_image
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
@@ -208,12 +208,9 @@ def decode_frame(content: bytes, size: tuple[int, int], views: int) -> np.ndarra
     Raises:
         ValueError: it is of another size; RejectedInputError: it is none.
     """
-    expected = (size[0], views * size[1])
-    if (found := image_size(content, "a frame")) != expected:
+    expected, picture = (size[0], views * size[1]), decode_image(content, "a frame")
+    if (found := picture.shape[:2]) != expected:
         raise ValueError(f"a frame of {found[0]} x {found[1]} pixels, not of {expected[0]} x {expected[1]}")
-    picture = decode_image(content, "a frame")
-    if picture.shape[:2] != expected:
-        raise ValueError("a frame that its EXIF turns")
     return np.stack(np.split(picture, views, axis=1))
 
 

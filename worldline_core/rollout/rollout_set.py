@@ -187,7 +187,6 @@ class RolloutSet:
                 expected=f"seeds {seeds}, views {self.views(episode_id)}",
                 got=f"episode {episode_id}, view {view}, seed {seed}",
             )
-        path = (self.root / row.path).resolve()
-        if not path.is_relative_to(self.root.resolve()):
+        if "\0" in row.path or not (path := (self.root / row.path).resolve()).is_relative_to(self.root.resolve()):
             raise ArtifactError("A video of the set lies outside of it", where=self.root, got=row.path)
         return VideoClip.whole_file(path, row.num_frames, row.fps)

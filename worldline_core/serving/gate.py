@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hmac
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.protocols.http.auto import AutoHTTPProtocol
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from worldline_core.serving.serve_config import ServeConfig, is_loopback
 
@@ -64,15 +64,16 @@ class Gate:
         return None
 
 
-def patient_http(most: int, patience_s: float) -> type[Any]:
+def patient_http(most: int, patience_s: float) -> type[H11Protocol]:
     """Uvicorn's HTTP protocol with bounds that it lacks, so that nobody takes all of the process's sockets.
 
     Args:
         most: connections at a time, websockets too; others are closed at once.
-        patience_s: a connection whose next request has not come whole, head by head, is closed after this to twice this time.
+        patience_s: a connection that is neither answered nor sends the head of a request is closed after this to twice
+            this time.
     """
 
-    class PatientHttp(AutoHTTPProtocol):  # type: ignore[misc, valid-type]
+    class PatientHttp(H11Protocol):
         def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
             if len(self.connections) > most:
