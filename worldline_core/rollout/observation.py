@@ -100,10 +100,11 @@ def given_tracks(
 
 
 def image_size(images: Mapping[str, np.ndarray], cameras: Mapping[str, Camera]) -> tuple[int, int]:
-    """(H, W) of first images that have a camera each.
+    """(H, W) of first images that have a usable camera each.
 
     Raises:
         DataError: a camera is missing, or the images differ in size.
+        CalibrationError: nothing can be drawn into a camera, so that a prediction would be one without controls.
     """
     if set(cameras) != set(images):
         raise DataError("The cameras are not those of the images", expected=list(images), got=list(cameras))
@@ -111,6 +112,8 @@ def image_size(images: Mapping[str, np.ndarray], cameras: Mapping[str, Camera]) 
     height, width = next(iter(shapes.values()), (0, 0))[:2]
     if any(shape != (height, width, 3) for shape in shapes.values()):
         raise DataError("First images are RGB and of one size", expected="(H, W, 3) in every view", got=shapes)
+    for view, camera in cameras.items():
+        _check_usable(view, camera)
     return height, width
 
 
@@ -137,8 +140,6 @@ def project_controls(
     arms = () if kinematics is None else kinematics.embodiment.arms
     known = {arm.camera_view for arm in arms if arm.wrist_camera}
     poses, follow = _poses(cameras, known, frames)
-    for view, pose in poses.items():
-        _check_usable(view, np.asarray(cameras[view].K, np.float64), pose)
     episode = Episode(
         episode_id="prediction",
         source="prediction",
@@ -168,17 +169,19 @@ def project_controls(
     return tracks
 
 
-def _check_usable(view: str, K: np.ndarray, poses: np.ndarray) -> None:
-    """Raises: CalibrationError for a camera that nothing can be drawn into: a prediction would be one without controls."""
+def _check_usable(view: str, camera: Camera) -> None:
+    """Numbers alone; shapes are checked where they are used."""
+    K = np.asarray(camera.K, np.float64)
     if K.shape == (3, 3) and not bool(valid_intrinsics(torch.from_numpy(K))):
         raise CalibrationError(
             "A camera matrix is not usable", where=view, expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
             got=K.tolist(),
         )  # fmt: skip
-    if len(bad := torch.nonzero(~is_rigid(torch.from_numpy(poses)))):
+    poses = np.eye(4) if camera.T_base_camera is None else np.asarray(camera.T_base_camera, np.float64)
+    if poses.shape[-2:] == (4, 4) and not bool(is_rigid(torch.from_numpy(poses)).all()):
         raise CalibrationError(
             "A camera pose is not a rigid transform", where=f"{view}, T_base_camera",
-            expected="R R^T = I, det R = 1, last row 0 0 0 1", got=poses[int(bad[0])].tolist(),
+            expected="R R^T = I, det R = 1, last row 0 0 0 1", got=poses.reshape(-1, 4, 4)[:1].tolist(),
         )  # fmt: skip
 
 
