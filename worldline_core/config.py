@@ -13,7 +13,7 @@ from types import UnionType
 from typing import IO, Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from yaml.constructor import ConstructorError
 
 from worldline_core.errors import ConfigError
@@ -26,6 +26,9 @@ CONFIG_ROOT = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACK
 
 MAX_VALUES = 200_000
 """Of one file, with what its aliases repeat: some lines of aliases can stand for more values than memory holds."""
+Side = Annotated[int, Field(ge=1, le=16_384)]
+ImageSize = tuple[Side, Side]
+"""(height, width) in pixels."""
 _LONGEST_INPUT = 200
 _MOST_MISTAKES = 30
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from worldline_core.config import (
     StrictModel,
@@ -17,8 +17,13 @@ from worldline_core.config import (
     read_yaml,
     validate,
 )
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import ConfigError
+from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.rollout.rollout_config import GeSimConfig
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.training_config import TokenizerConfig
 
 
 class Inner(StrictModel):
@@ -187,3 +192,10 @@ def test_null_takes_away_what_the_file_has() -> None:
         load("rolouts=null")
     with pytest.raises(ConfigError, match="curate: Field required"):
         load("curate=null")
+
+
+@pytest.mark.parametrize("size", [[0, 0], [-64, 96], [1_000_000, 1_000_000], [64]])
+def test_pictures_of_no_size_are_refused_before_anything_is_read(size: list[int]) -> None:
+    for read in (CurateConfig, EncodeLatentsConfig, TokenizerConfig, SegmenterConfig, GeSimConfig):
+        with pytest.raises(ValidationError, match="image_size"):
+            read.model_validate({"image_size": size})

@@ -2,9 +2,11 @@ import json
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 pytest.importorskip("mujoco")
 
@@ -140,3 +142,21 @@ def test_the_shipped_comparison_is_large_enough():
     assert min(families.count(family) for family in set(families)) >= 40
     evaluated = load_config(PipelineConfig, preset="small_world_policies").curate.sources
     assert [(source.name, source.include) for source in evaluated] == [(p, (f"*-{p}",)) for p in config.policies]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"policies": {"../x": {}, "b": {}}}, "match pattern"),
+        ({"policies": {"a": {"bias_m": (1e300, 0)}, "b": {}}}, "less than or equal to 0.5"),
+        ({"policies": {"a": {"mistakes": float("nan")}, "b": {}}}, "finite number"),
+        ({"starts": {"count": 10**9}}, "less than or equal to 10000"),  # a list of as many starts
+        ({"starts": {"embodiments": ("ur5e_silver",) * 2}}, "banks would share their names"),
+        ({"starts": {"families": ("press", "press")}}, "banks would share their names"),
+    ],
+)
+def test_settings_without_meaning_are_refused(change: dict[str, Any], match: str) -> None:
+    given = CONFIG.model_dump()
+    changed = {**given, **change} | ({"starts": given["starts"] | change["starts"]} if "starts" in change else {})
+    with pytest.raises(ValidationError, match=match):
+        RecordPoliciesConfig.model_validate(changed)

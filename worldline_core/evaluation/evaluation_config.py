@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.metric_registry import METRICS, ON_REQUEST, requested
@@ -49,9 +49,7 @@ class SegmenterConfig(StrictModel):
     learning_rate: float = Field(default=3e-3, gt=0)
     weight_decay: float = Field(default=1e-4, ge=0)
     average_decay: float = Field(default=0.995, ge=0, lt=1, description="of the moving average that is kept")
-    image_size: tuple[int, int] | None = Field(
-        default=None, description="(height, width) to resize to; none: as stored"
-    )
+    image_size: ImageSize | None = Field(default=None, description="(height, width) to resize to; none: as stored")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame of a training episode is used")
     checkpoint_every: int = Field(default=200, ge=1)
     evaluate_splits: tuple[str, ...] = ("validation", "test", "ood_test")

@@ -53,7 +53,13 @@ class BankGrid(StrictModel):
     embodiments: tuple[Embodiment, ...] = Field(min_length=1)
     families: tuple[Family, ...] = Field(min_length=1)
     scenes: tuple[str, ...] = Field(min_length=1)
-    count: int = Field(default=5, ge=1)
+    count: int = Field(default=5, ge=1, le=10_000)
+
+    @model_validator(mode="after")
+    def _named_once(self) -> BankGrid:
+        if any(len(set(names)) < len(names) for names in (self.embodiments, self.families)):
+            raise ValueError("an embodiment or a task twice: banks would share their names")
+        return self
 
     def specs(self) -> list[BankSpec]:
         """One spec per bank, named ``bank_<family>_<embodiment>_<number>``."""

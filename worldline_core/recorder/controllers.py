@@ -7,6 +7,7 @@ is drawn; whether it went wrong is measured afterwards (``outcomes.outcome``).
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -42,6 +43,9 @@ _CARRY = {"good": 0.52, "beside": 0.12, "high": 0.07, "open": 0.06, "relax": 0.0
 _PRESS = {"good": 0.54, "short": 0.16, "beside": 0.16, "other": 0.14}
 
 
+Bias = Annotated[float, Field(ge=-0.5, le=0.5)]
+
+
 class ScriptedPolicy(StrictModel):
     """A controller that knows the right plan and carries it out badly.
 
@@ -56,7 +60,7 @@ class ScriptedPolicy(StrictModel):
 
     mistakes: float | None = Field(default=0.0, ge=0, le=1)
     noise_m: float = Field(default=0.0, ge=0, le=0.2)
-    bias_m: tuple[float, float] = (0.0, 0.0)
+    bias_m: tuple[Bias, Bias] = (0.0, 0.0)
     delay_frames: int = Field(default=0, ge=0, le=32)
     gripper_delay_frames: int = Field(default=0, ge=-32, le=32)
 

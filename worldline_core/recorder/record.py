@@ -80,7 +80,7 @@ class RecordGroup(StrictModel):
 
     embodiment: Embodiment
     split: Literal["train", "validation", "test", "ood_test"] = "train"
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=1_000_000)
     families: tuple[Family, ...] = TASKS
     held_out_camera: bool = False
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.model.world_model_config import TextConfig
 
@@ -28,7 +28,7 @@ class GeSimConfig(StrictModel):
     """
 
     url: str = Field(pattern=r"^https?://[^/\s@]+/?$")
-    image_size: tuple[int, int] = (384, 512)
+    image_size: ImageSize = (384, 512)
     timeout_s: float = Field(default=300.0, gt=0)
     tool_offset_m: float = 0.15
 

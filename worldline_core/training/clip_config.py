@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.video.frame_decoder import DecoderChoice
 
 JOINT = "joint"
@@ -112,7 +112,7 @@ class FrameInput(ReadingConfig):
     """
 
     kind: Literal["frames"] = "frames"
-    image_size: tuple[int, int] = (64, 96)
+    image_size: ImageSize = (64, 96)
     start_step: int = Field(default=1, ge=1)
     decoder: DecoderChoice = "auto"
     open_files: int = Field(default=16, ge=1)
@@ -136,7 +136,7 @@ class EncodeLatentsConfig(StrictModel):
     primary_alone: bool = False
     # Left out of dumps at its default: latents made before it existed keep their key in the store.
     optional_views: tuple[str, ...] = Field(default=(), exclude_if=lambda value: not value)
-    image_size: tuple[int, int] = (64, 96)
+    image_size: ImageSize = (64, 96)
     start_step: int = Field(default=4, ge=1)
     strides: tuple[int, ...] = Field(default=(1,), min_length=1)
     layout: Literal["auto", "groups", "clips"] = "auto"

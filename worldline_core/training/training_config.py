@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import WristProjection
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
 
@@ -204,7 +204,7 @@ BLOCKS = 4
 class SmallTeacherShape(StrictModel):
     """Size of the encoder. ``patch`` is the side of a tubelet in pixels of ``image_size`` (height, width)."""
 
-    image_size: tuple[int, int] = (64, 96)
+    image_size: ImageSize = (64, 96)
     patch: int = Field(default=16, ge=2)
     max_groups: int = Field(default=33, ge=2, description="longest clip in latent frames")
     hidden_size: int = Field(default=128, ge=8)
@@ -232,7 +232,7 @@ class TeacherConfig(StrictModel):
 class TokenizerConfig(StrictModel):
     """Everything the shipped tokenizer depends on."""
 
-    image_size: tuple[int, int] = (64, 96)
+    image_size: ImageSize = (64, 96)
     channels: int = Field(default=32, ge=1)
     motion_weight: float = Field(default=4.0, ge=0)
     whitening: float = Field(default=0.5, ge=0, le=1)

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.curation.near_duplicates import NearDuplicateConfig
 from worldline_core.data.curation.scenes import LeakageConfig, Splits
 from worldline_core.data.episodes.instructions import InstructionConfig
@@ -31,7 +31,7 @@ class CurateConfig(StrictModel):
     """What to read and what every kept episode will look like."""
 
     sources: tuple[SourceConfig, ...] = Field(min_length=1)
-    image_size: tuple[int, int] | None = Field(
+    image_size: ImageSize | None = Field(
         default=None, description="(height, width) of all images; null keeps each size"
     )
     fit: Fit = Field(default="stretch", description="how images come to that size; letterbox and crop keep the aspect")

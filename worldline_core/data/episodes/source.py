@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from worldline_core.config import StrictModel
+from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import (
     TRAINING_SPLITS,
@@ -131,7 +131,7 @@ class SourceConfigBase(StrictModel):
     redistribution: Literal["yes", "no", "unknown"] = Field(
         default="unknown", description="whether the licence lets others have these recordings"
     )
-    image_size: tuple[int, int] | None = Field(
+    image_size: ImageSize | None = Field(
         default=None, description="(height, width) of this source's images; null: curate.image_size"
     )
     fit: Fit | None = Field(default=None, description="how they come to that size; null: curate.fit")
