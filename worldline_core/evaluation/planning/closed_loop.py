@@ -110,7 +110,7 @@ class Planner:
         instruction: str,
         propose: Propose,
         score: Score,
-        solver: str | Solver = "icem",
+        solver: str | Solver = "best_of_n",
         candidates: int = 24,
         horizon: int = 2,
         batch: int = 8,
