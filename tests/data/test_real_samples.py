@@ -97,10 +97,11 @@ def test_droid(tmp_path: Path, shared_data: Path) -> None:
     }
     assert {row.stage2_reason for row in curated.rows} == {"missing_calibration"}
     assert all(row.stage1_ok and row.fps == 4.0 for row in curated.rows)
-    source = {"kind": "droid_annotation", "path": str(folder), "name": "droid"}
+    uneven = ["droid-val-0003", "droid-val-0006"]
+    source = {"kind": "droid_annotation", "path": str(folder), "name": "droid", "include": uneven}
     trimming = CurateConfig.model_validate({"sources": [source], "trim": "common", "image_size": (48, 64)})
     counts = curate(trimming, {}, tmp_path / "trimmed")
-    assert (counts["kept"], counts["trimmed"]) == (6, 2)
+    assert (counts["kept"], counts["trimmed"]) == (2, 2)
     trimmed = EpisodeSet.open(tmp_path / "trimmed")
     assert [trimmed.rows[trimmed.position(f"droid-val-{n}")].num_frames for n in ("0003", "0006")] == [205, 41]
 

@@ -95,7 +95,12 @@ def tracks_of(name: str) -> EpisodeTracks:
 
 @pytest.fixture
 def inputs(tmp_path: Path, make_model: Callable, make_contract: Callable) -> dict[str, Path]:
-    folders = {name: tmp_path / name for name in ("latents", "tracks", "episodes", "stage2", "tokenizer", "stage1")}
+    return write_inputs(tmp_path, make_model, make_contract)
+
+
+def write_inputs(root: Path, make_model: Callable, make_contract: Callable) -> dict[str, Path]:
+    """Latents, tracks, an index of episodes and checkpoints of random weights."""
+    folders = {name: root / name for name in ("latents", "tracks", "episodes", "stage2", "tokenizer", "stage1")}
     write_latents(folders["latents"])
     folders["tracks"].mkdir()
     shard = write_shard(folders["tracks"], 0, [tracks_of(name) for name in EPISODES])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from tests.distillation.conftest import write_inputs
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.distillation import trajectory_store
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
@@ -71,9 +73,24 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): digest_file(path) for path in folder_files(folder)}
 
 
-def test_three_steps_give_a_causal_checkpoint(inputs: dict[str, Path], tmp_path: Path) -> None:
-    output = tmp_path / "out"
-    counts = distill(config(), inputs, output)
+@dataclass(frozen=True)
+class Finished:
+    """A distillation that nothing disturbed."""
+
+    inputs: dict[str, Path]
+    output: Path
+    counts: dict[str, object]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, make_model: Callable, make_contract: Callable) -> Finished:
+    inputs = write_inputs(tmp_path_factory.mktemp("inputs"), make_model, make_contract)
+    output = tmp_path_factory.mktemp("finished") / "out"
+    return Finished(inputs, output, distill(config(), inputs, output))
+
+
+def test_three_steps_give_a_causal_checkpoint(finished: Finished) -> None:
+    inputs, output, counts = finished.inputs, finished.output, finished.counts
     model, info = load_checkpoint(output, expect_kind="causal")
     assert info.metadata["distillation"] == "distribution_matching"
     assert info.contract == read_checkpoint_info(inputs["stage2"]).contract
@@ -157,17 +174,12 @@ def test_the_head_alone_is_distilled_and_said(inputs: dict[str, Path], tmp_path:
     assert read_checkpoint_info(tmp_path / "out").views == ("head",)
 
 
-def test_a_finished_run_is_read_not_repeated(
-    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    output = tmp_path / "out"
-    counts = distill(config(), inputs, output)
-
+def test_a_finished_run_is_read_not_repeated(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: object, **kwargs: object) -> None:
         raise RuntimeError("trained again")
 
     monkeypatch.setattr("worldline_core.distillation.distill.train", refuse)
-    assert distill(config(), inputs, output) == counts
+    assert distill(config(), finished.inputs, finished.output) == finished.counts
 
 
 class KilledError(Exception):
@@ -190,10 +202,11 @@ def killing(function: Callable, at_call: int) -> Callable:
 
 @pytest.mark.parametrize("real_score", ["stage2", "causal_teacher"])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
-    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
 ) -> None:
-    settings = config(real_score=real_score)
-    distill(settings, inputs, tmp_path / "whole")
+    settings, inputs, whole = config(real_score=real_score), finished.inputs, finished.output
+    if settings != config():
+        distill(settings, inputs, whole := tmp_path / "whole")
     kills = [
         (TeacherForcingObjective, "loss", 3),
         (trajectory_store, "write_bytes_atomic", 2),
@@ -206,7 +219,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
             with pytest.raises(KilledError, match="killed"):
                 distill(settings, inputs, tmp_path / "killed")
     distill(settings, inputs, tmp_path / "killed")
-    assert digests(tmp_path / "killed") == digests(tmp_path / "whole")
+    assert digests(tmp_path / "killed") == digests(whole)
 
 
 def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model: Callable) -> None:
@@ -217,10 +230,8 @@ def test_exit_steps_do_not_depend_on_the_rank_and_cover_the_schedule(make_model:
     assert set(steps) == {0, 1, 2, 3}
 
 
-def test_an_iteration_changes_one_of_the_two_models(inputs: dict[str, Path], tmp_path: Path) -> None:
-    settings = config()
-    distill(settings, inputs, tmp_path / "out")
-    rows = (tmp_path / "out" / "distribution_matching" / "metrics.jsonl").read_text().splitlines()
+def test_an_iteration_changes_one_of_the_two_models(finished: Finished) -> None:
+    rows = (finished.output / "distribution_matching" / "metrics.jsonl").read_text().splitlines()
     first = json.loads(rows[0])
     # Scaled by their share of the iterations: the mean over a cycle is the mean of the updates that report them.
     assert first["loss"] == pytest.approx(
