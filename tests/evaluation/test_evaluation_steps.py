@@ -31,10 +31,16 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_video_metrics_prefer_the_right_videos(recordings, tmp_path):
-    counts = evaluate_video(VIDEO, recordings.inputs, tmp_path)
-    assert counts["methods"] == ["copy", "good"]
-    summary = json.loads((tmp_path / "summary.json").read_text())
+@pytest.fixture(scope="module")
+def evaluated(recordings, tmp_path_factory):
+    """An evaluation of videos that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    assert evaluate_video(VIDEO, recordings.inputs, folder)["methods"] == ["copy", "good"]
+    return folder
+
+
+def test_video_metrics_prefer_the_right_videos(evaluated):
+    summary = json.loads((evaluated / "summary.json").read_text())
     good, copy = summary["metrics"]["test"]["good"], summary["metrics"]["test"]["copy"]
     assert good["robot_iou_exact"]["mean"] > 0.8 > copy["robot_iou_exact"]["mean"]
     assert good["robot_iou"]["mean"] > 0.9
@@ -54,20 +60,19 @@ def test_video_metrics_prefer_the_right_videos(recordings, tmp_path):
     assert good["object_iou_exact"]["count"] == 2
     assert summary["segmenters"][0]["accuracy_on_true_frames"]["test"]["object_iou_exact"]["mean"] > 0.8
     assert "LPIPS is not available" in summary["unavailable"]["lpips"]
-    assert "lpips" not in pq.read_table(tmp_path / "scores.parquet")["metric"].to_pylist()
-    by_frame = pq.read_table(tmp_path / "by_frame.parquet").to_pylist()
+    assert "lpips" not in pq.read_table(evaluated / "scores.parquet")["metric"].to_pylist()
+    by_frame = pq.read_table(evaluated / "by_frame.parquet").to_pylist()
     first = [row["mean"] for row in by_frame if (row["method"], row["metric"], row["frame"]) == ("copy", "psnr", 0)]
     assert min(first) > 30  # the conditioning frame counts
 
 
-def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, tmp_path):
-    evaluate_video(VIDEO, recordings.inputs, tmp_path / "whole")
-    evaluate_video(VIDEO, recordings.inputs, tmp_path / "again")
+def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, tmp_path):
+    shutil.copytree(evaluated, tmp_path / "again")
     parts = sorted((tmp_path / "again/run/parts").rglob("*.json"))
     for path in [*parts[::2], tmp_path / "again/scores.parquet", tmp_path / "again/summary.json"]:
         path.unlink()
     evaluate_video(VIDEO, recordings.inputs, tmp_path / "again")
-    assert contents(tmp_path / "whole") == contents(tmp_path / "again")
+    assert contents(evaluated) == contents(tmp_path / "again")
 
 
 def test_names_of_episodes_and_banks_never_become_names_of_files(oddly_named, tmp_path):

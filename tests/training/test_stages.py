@@ -147,7 +147,7 @@ def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeC
     base.initialise(torch.Generator().manual_seed(0))
     save_checkpoint(tmp_path / "base", base, kind="base", action_contract=None)
     config = stage2(
-        160, trainer=trainer_values(160, batch_size=8, ema_decay=0.95), weighting={"kind": "sample"}, action_dropout=0.0
+        60, trainer=trainer_values(60, batch_size=8, ema_decay=0.95), weighting={"kind": "sample"}, action_dropout=0.0
     )
     result = train_stage2(config, {**world.inputs, "stage1": tmp_path / "base"}, tmp_path / "run")
     losses = [row["loss"] for row in read_json_lines(tmp_path / "run" / "metrics.jsonl") if "loss" in row]
@@ -155,7 +155,7 @@ def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeC
     assert result["validation/sample_error"] < 0.8 * result["validation/sample_error_shuffled_actions"]
     _, info = load_checkpoint(tmp_path / "run", expect_kind="stage2")
     assert info.contract.sigma_px_ref == 60.0
-    assert info.metadata["step"] == 160
+    assert info.metadata["step"] == 60
 
 
 def test_stage1_trains_both_towers_on_text_and_leaves_the_action_branch(stage1_folder: Path) -> None:
