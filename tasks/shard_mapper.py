@@ -52,20 +52,24 @@ class PrefectMapper:
 
     def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
         config = self.config
-        few = config.kind == "auto" and (sum(map(len, shards)) < config.serial_below or self._workers() == 1)
+        workers = self._workers(shards)
+        few = config.kind == "auto" and (sum(map(len, shards)) < config.serial_below or workers == 1)
         # What killed a worker must not get the chance to kill this process.
         if not shards or (few and not one_at_a_time):
             SerialMapper(config).map(shards, take)
             return
         waiting = deque(shards)
-        limit = 1 if one_at_a_time else config.in_flight or 2 * self._workers()
+        limit = 1 if one_at_a_time else config.in_flight or 2 * workers
         while waiting:  # a process pool that lost a worker is at its end: the next round has a new one
-            self._round(waiting, take, limit)
+            self._round(waiting, take, min(workers, limit), limit)
 
-    def _workers(self) -> int:
-        return self.config.workers or len(os.sched_getaffinity(0))
+    def _workers(self, shards: Sequence[Shard[Any]]) -> int:
+        """As many as are configured, but no more than the work has devices for."""
+        wanted = self.config.workers or len(os.sched_getaffinity(0))
+        most = shards[0].work.processes if shards else None
+        return wanted if most is None else max(1, min(wanted, most))
 
-    def _round(self, waiting: deque[Shard[Any]], take: TakeOutcome, limit: int) -> None:
+    def _round(self, waiting: deque[Shard[Any]], take: TakeOutcome, workers: int, limit: int) -> None:
         """One flow, until no shard waits or the runner has lost a worker."""
         set_up_temporary_server()
         from prefect import Flow, Task
@@ -90,7 +94,7 @@ class PrefectMapper:
             fn=_hand_out_shards,
             name=f"{first.work.step} shards",
             flow_run_name=f"{first.work.step}: {len(waiting)} shards from {first.label}",
-            task_runner=self._task_runner(min(self._workers(), limit)),
+            task_runner=self._task_runner(workers),
             persist_result=False,
         )
         token = _round.set(_Round(waiting, hand_out, take, limit))

@@ -23,8 +23,9 @@ from worldline_core.training.clip_config import (
 from worldline_core.training.clip_loader import ClipLoader, ClipReader, SkipLog
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import Clip, ClipBatch, training_rows
+from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.frame_source import FrameSource, frame_rows
-from worldline_core.training.latent_store import LatentStore, encode_latents
+from worldline_core.training.latent_store import LatentStore
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 

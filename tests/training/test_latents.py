@@ -11,7 +11,8 @@ from safetensors.torch import load_file, save_file
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_source import latent_frame_count, longest_clip
-from worldline_core.training.latent_store import LatentRow, LatentStore, choose_layout, encode_episode
+from worldline_core.training.encode_latents import choose_layout, encode_episode
+from worldline_core.training.latent_store import LatentRow, LatentStore
 
 
 class Memoryless:

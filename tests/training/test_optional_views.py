@@ -29,8 +29,9 @@ from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfi
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import Clip, ClipBatch, ClipRow
+from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.latent_store import LatentStore, encode_latents
+from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage2 import train_stage2
 from worldline_core.training.training_config import Stage2Config
 

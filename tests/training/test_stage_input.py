@@ -19,7 +19,7 @@ from worldline_core.pipeline.plan import plan
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.latent_store import encode_latents
+from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2
 from worldline_core.training.train_teacher import train_teacher

@@ -161,11 +161,12 @@ _STEPS = (
     Step(
         "encode_latents",
         1,
-        "worldline_core.training.latent_store",
+        "worldline_core.training.encode_latents",
         "encode_latents",
         "training.clip_config.EncodeLatentsConfig",
         ("episodes", "tokenizer"),
         summary="cache the video tokenizer's latents",
+        mapped=True,
     ),
     Step(
         "import_backbone",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -94,7 +94,10 @@ def check_account(output: Path, found: int, kept: set[str], quarantined: set[str
 
 
 def _write(path: Path, rows: Iterable[InputRow]) -> None:
-    write_table_atomic(path, pa.Table.from_pylist([asdict(row) for row in rows], schema=_SCHEMA))
+    write_table_atomic(
+        path,
+        pa.Table.from_pylist([{name: getattr(row, name) for name in _SCHEMA.names} for row in rows], schema=_SCHEMA),
+    )
 
 
 def _read(path: Path) -> list[InputRow]:

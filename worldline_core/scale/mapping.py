@@ -60,6 +60,11 @@ class EpisodeWork[E, R: InputRow](ABC):
     def __getstate__(self) -> dict[str, Any]:
         return {own.name: getattr(self, own.name) for own in fields(self)}
 
+    @property
+    def processes(self) -> int | None:
+        """How many processes of a machine can do this at once, one for each device; None: as many as it has cores."""
+        return None
+
     @abstractmethod
     def remaining(self, number: int, episodes: Sequence[E]) -> Sequence[E]:
         """Of the episodes of shard `number` those that are not done yet."""

@@ -1,0 +1,120 @@
+"""The same latents, whatever encodes them, in whatever order, and however often it was killed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tasks.shard_mapper import PrefectMapper, shard_mapper
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.scale.account import read_account
+from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard, TakeOutcome
+from worldline_core.store.artifact_files import digest_folder
+from worldline_core.training import encode_latents as encoding
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.encode_latents import EncodeWork, claim_device, encode_latents, shard_name
+
+CONFIG = EncodeLatentsConfig(image_size=(32, 32), episodes_per_shard=2)
+
+
+@pytest.fixture(scope="module")
+def inputs(world: Any, tokenizer: Path) -> dict[str, Path]:
+    return {"episodes": world.episodes, "tokenizer": tokenizer}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, Any]]:
+    output = tmp_path_factory.mktemp("undisturbed")
+    counts = encode_latents(CONFIG, inputs, output)
+    return digest_folder(output), counts
+
+
+class KilledMapper(SerialMapper):
+    """Begins with the last shard and is killed after two."""
+
+    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+        super().map(list(reversed(shards))[:2], take, one_at_a_time=one_at_a_time)
+        raise KeyboardInterrupt
+
+
+def test_killed_and_resumed_in_another_order_with_other_threads(
+    inputs: dict[str, Path], undisturbed: tuple[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        encode_latents(CONFIG, inputs, tmp_path, KilledMapper())
+    shards = undisturbed[1]["shards"]
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [shard_name(n) for n in range(shards)[-2:]]
+    encoded: list[str] = []
+    whole = encoding.encode_episode
+
+    def counted(tokenizer: Any, episode_id: str, *rest: Any) -> dict[str, torch.Tensor]:
+        encoded.append(episode_id)
+        assert torch.get_num_threads() == 1
+        return whole(tokenizer, episode_id, *rest)
+
+    monkeypatch.setattr(encoding, "encode_episode", counted)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        counts = encode_latents(CONFIG, inputs, tmp_path)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+    assert (digest_folder(tmp_path), counts) == undisturbed
+    assert len(encoded) == 2 * (shards - 2)  # nothing is encoded twice
+    rows = read_account(tmp_path)
+    assert [row.episode_id for row in rows] == [row.episode_id for row in EpisodeSet.open(inputs["episodes"]).rows]
+    assert all(row.status == "kept" and row.seconds and row.stored_bytes > 0 for row in rows)
+    stored = sum(path.stat().st_size for path in tmp_path.glob("*.safetensors"))
+    assert 0.9 * stored < sum(row.stored_bytes for row in rows) < stored
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("prefect_server")
+def test_processes_encode_the_same(
+    inputs: dict[str, Path], undisturbed: tuple[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    mapper = shard_mapper(RunnerConfig(kind="processes", workers=2))
+    assert (encode_latents(CONFIG, inputs, tmp_path, mapper), digest_folder(tmp_path)) == undisturbed[::-1]
+
+
+def test_what_cannot_be_encoded_ends_the_step_at_once(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def full(_tokenizer: Any, episode_id: str, *_rest: Any) -> None:
+        calls.append(episode_id)
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(encoding, "encode_episode", full)
+    with pytest.raises(ArtifactError, match=r"could not be encoded(?s:.)*episode-000(?s:.)*CUDA out of memory"):
+        encode_latents(CONFIG, inputs, tmp_path)
+    assert calls == ["episode-000"]
+
+
+def test_every_process_has_a_device_of_its_own(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    first, second = (claim_device("cuda", tmp_path) for _ in range(2))
+    assert (first[0], second[0]) == ("cuda:0", "cuda:1")
+    with pytest.raises(ConfigError, match=r"device of its own(?s:.)*at most 2 processes(?s:.)*runner.workers"):
+        claim_device("cuda", tmp_path)
+    assert first[1] is not None
+    first[1].close()
+    assert claim_device("cuda", tmp_path)[0] == "cuda:0"
+    assert claim_device("cpu", tmp_path) == ("cpu", None)
+
+    mapper = PrefectMapper(RunnerConfig(kind="processes", workers=16))
+    workers = {}
+    for device in ("cpu", "cuda", "cuda:1"):
+        config = CONFIG.model_copy(update={"device": device})
+        work = EncodeWork(tmp_path, config, inputs["episodes"], inputs["tokenizer"], "groups")
+        workers[device] = mapper._workers([Shard(work, 0, (0,))])
+    assert workers == {"cpu": 16, "cuda": 2, "cuda:1": 1}

@@ -1,0 +1,333 @@
+"""`encode_latents`: the video tokenizer's latents of every selected episode, in safetensors shards."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import batched
+from pathlib import Path
+from typing import IO, Any, ClassVar, NoReturn, Protocol
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor
+
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
+from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
+from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.scale.account import InputRow, check_account, write_account
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
+from worldline_core.store.atomic import atomic_path, write_json_atomic
+from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.latent_store import (
+    DESCRIPTION,
+    INDEX,
+    LatentRow,
+    Layout,
+    clip_key,
+    group_key,
+    single_key,
+)
+
+
+class Encoder(Protocol):
+    """The part of a video tokenizer that is needed here."""
+
+    def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]: ...
+
+
+def encode_clip(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h_l w_l"]:
+    """Latents of one clip (RGB in [-1, 1]), rounded to half precision as they are stored."""
+    with torch.no_grad():
+        return tokenizer.encode(video[None].to(device))[0].to("cpu", torch.float16)
+
+
+def encode_episode(
+    tokenizer: Encoder,
+    episode_id: str,
+    videos: Float[Tensor, "v 3 n h w"],
+    layout: Layout,
+    config: EncodeLatentsConfig,
+) -> dict[str, Float[Tensor, "v c t h_l w_l"]]:
+    """All tensors of one episode, by their names in the shard."""
+    count = videos.shape[2]
+    tensors: dict[str, Tensor] = {}
+
+    def stacked(indices: range) -> Tensor:
+        return torch.stack([encode_clip(tokenizer, video[:, list(indices)], config.device) for video in videos])
+
+    if layout == "groups":
+        singles = [stacked(range(start, start + 1)) for start in range(0, count, config.start_step)]
+        tensors[single_key(episode_id)] = torch.cat(singles, 2)
+    for stride in config.strides:
+        period = TEMPORAL_FACTOR * stride
+        for start in range(0, count, config.start_step):
+            steps = TEMPORAL_FACTOR * ((count - 1 - start) // stride // TEMPORAL_FACTOR)
+            indices = range(start, start + stride * steps + 1, stride)
+            if layout == "clips":
+                tensors[clip_key(episode_id, stride, start)] = stacked(indices)
+                continue
+            # The first clip of each phase yields every group of that phase.
+            key = group_key(episode_id, stride, (start + stride) % period)
+            if key in tensors or steps == 0:
+                continue
+            groups = stacked(indices)[:, :, 1:]
+            missing = (start + stride) // period
+            if missing:
+                groups = torch.cat([torch.zeros_like(groups[:, :, :1]).expand(-1, -1, missing, -1, -1), groups], 2)
+            tensors[key] = groups.contiguous()
+    return tensors
+
+
+def choose_layout(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
+    """``groups`` where a latent frame depends on its own four frames alone, else ``clips``.
+
+    Raises:
+        ConfigError: if ``groups`` is asked for but would not be exact with this tokenizer.
+    """
+    if config.layout == "clips":
+        return "clips"
+    span = 2 * TEMPORAL_FACTOR + 1
+    if video.shape[1] < span:
+        raise DataError("An episode is too short to encode.", expected=f"{span} frames or more", got=video.shape[1])
+    whole = encode_clip(tokenizer, video[:, :span], config.device)[:, 2]
+    later = encode_clip(tokenizer, video[:, TEMPORAL_FACTOR:span], config.device)[:, 1]
+    # One unit of half precision: different batch shapes may round the last bit differently.
+    memoryless = bool(torch.allclose(whole.float(), later.float(), rtol=2e-3, atol=2e-3))
+    if config.layout == "groups" and not memoryless:
+        raise ConfigError(
+            "The tokenizer's latents depend on earlier frames, so cached groups would not be exact.",
+            where="encode_latents.layout",
+            expected="auto or clips",
+            got="groups",
+        )
+    return "groups" if memoryless else "clips"
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums on several threads round differently, and the latents must not depend on how many a process has."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def claim_device(device: str, folder: Path) -> tuple[str, IO[str] | None]:
+    """The device that this process works on, and what it holds as long as it has it.
+
+    `cuda` is the first device of this machine that no other process has claimed in `folder`; others are themselves.
+
+    Raises:
+        ConfigError: there are more processes than devices.
+    """
+    if device != "cuda":
+        return device, None
+    for number in range(torch.cuda.device_count()):
+        held = (folder / f"{platform.node()}-cuda-{number}.lock").open("w")
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            held.close()
+            continue
+        return f"cuda:{number}", held
+    raise ConfigError(
+        "Every process needs a device of its own",
+        where="encode_latents.device",
+        expected=f"at most {torch.cuda.device_count()} processes on this machine",
+        got="one more",
+        next_step="set runner.workers (or the workers of the cluster) to the number of devices",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodedEpisode(InputRow):
+    """One episode's tensors by their names in the shard."""
+
+    tensors: Mapping[str, Float[Tensor, "v c t h_l w_l"]]
+
+
+@dataclass(frozen=True)
+class EncodeWork(EpisodeWork[int, EncodedEpisode]):
+    """Encodes each episode, named by its position in the set; a shard becomes one file of the artifact.
+
+    Attributes:
+        folder: of the set.
+        codec: the tokenizer's folder.
+    """
+
+    step: ClassVar[str] = "encode_latents"
+    doing: ClassVar[str] = "Encoding"
+
+    config: EncodeLatentsConfig
+    folder: Path
+    codec: Path
+    layout: Layout
+
+    @property
+    def processes(self) -> int | None:
+        if self.config.device == "cpu":
+            return None
+        return torch.cuda.device_count() if self.config.device == "cuda" else 1
+
+    @cached_property
+    def episodes(self) -> EpisodeSet:
+        return EpisodeSet.open(self.folder)
+
+    @cached_property
+    def _device(self) -> tuple[str, IO[str] | None]:
+        return claim_device(self.config.device, self.output / "run")
+
+    @cached_property
+    def _tokenizer(self) -> Encoder:
+        return load_tokenizer(self.codec, self._device[0])
+
+    def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
+        done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()
+        return () if done else episodes
+
+    def do(self, episode: int) -> EncodedEpisode:
+        row = self.episodes.rows[episode]
+        with reading_input(f"{self.folder}, episode {row.episode_id}"):
+            videos = read_videos(self.episodes, episode, self.config)
+        config = self.config.model_copy(update={"device": self._device[0]})
+        with _one_thread():
+            tensors = encode_episode(self._tokenizer, row.episode_id, videos, self.layout, config)
+        size = sum(tensor.nbytes for tensor in tensors.values())
+        return EncodedEpisode(
+            episode_id=row.episode_id, source=row.source, status="kept", stored_bytes=size, tensors=tensors
+        )
+
+    def quarantine_crashed(self, episode: int, detail: str, evidence: Mapping[str, Any]) -> NoReturn:
+        """Latents are of every selected episode or of none: what fails here is the tokenizer or the machine."""
+        raise ArtifactError(
+            "An episode could not be encoded",
+            where=self.episodes.rows[episode].episode_id,
+            got=detail,
+            next_step="look at the memory of the device; finished shards are kept when the step is run again",
+        )
+
+    def finish_shard(self, number: int, results: Sequence[EncodedEpisode]) -> None:
+        """Write the latents of a shard into one file, and what is known of its episodes into another."""
+        tensors = {name: tensor for result in results for name, tensor in result.tensors.items()}
+        with atomic_path(self.output / shard_name(number)) as temporary:
+            save_file(dict(sorted(tensors.items())), temporary)
+        shape = next(iter(tensors.values())).shape
+        summary = {
+            "latent_shape": [shape[1], *shape[3:]],
+            "stored_bytes": {result.episode_id: result.stored_bytes for result in results},
+        }
+        write_json_atomic(self._summary_path(number), summary)
+
+    def summary(self, number: int) -> dict[str, Any]:
+        """Shape of the latents (c, h, w) and bytes by episode of a finished shard."""
+        return json.loads(self._summary_path(number).read_text(encoding="utf-8"))
+
+    def _summary_path(self, number: int) -> Path:
+        return self.output / "run" / f"shard-{number:05d}.json"
+
+
+def shard_name(number: int) -> str:
+    """File of a shard."""
+    return f"{number:05d}.safetensors"
+
+
+def encode_latents(
+    config: EncodeLatentsConfig, inputs: Mapping[str, Path], output: Path, mapper: ShardMapper | None = None
+) -> dict[str, Any]:
+    """Encode ``inputs['episodes']`` with ``inputs['tokenizer']``; finished shards are kept when the step is restarted.
+
+    Args:
+        mapper: what does the shards, by default this process. The latents do not depend on it.
+
+    Raises:
+        DataError: if no episode is selected.
+        ArtifactError: if frames and index disagree, or an episode cannot be encoded.
+    """
+    episodes = EpisodeSet.open(inputs["episodes"])
+    selected = _select(episodes, config)
+    tokenizer = load_tokenizer(inputs["tokenizer"], config.device)
+    with _one_thread():
+        layout = choose_layout(tokenizer, read_videos(episodes, selected[0], config)[0], config)
+    fingerprint = tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"]))
+    del tokenizer  # each process that encodes loads its own
+    (output / "run").mkdir(parents=True, exist_ok=True)
+    work = EncodeWork(output, config, inputs["episodes"], inputs["tokenizer"], layout)
+    pieces = list(batched(selected, config.episodes_per_shard))
+    map_episodes(mapper or SerialMapper(), work, pieces)
+    summaries = [work.summary(number) for number in range(len(pieces))]
+    rows: list[LatentRow] = []
+    account: list[InputRow] = []
+    for number, (members, summary) in enumerate(zip(pieces, summaries, strict=True)):
+        for row in (episodes.rows[index] for index in members):
+            rows.append(LatentRow.of(row, _views(row, config), shard=shard_name(number)))
+            size = summary["stored_bytes"][row.episode_id]
+            account.append(InputRow(episode_id=row.episode_id, source=row.source, status="kept", stored_bytes=size))
+    write_account(output, account)
+    check_account(output, len(selected), {row.episode_id for row in rows}, set())
+    columns = [{"episode_id": row.episode_id, "shard": row.shard, **vars(row)} for row in rows]
+    with atomic_path(output / INDEX) as temporary:
+        pq.write_table(pa.Table.from_pylist(columns), temporary, compression="zstd")
+    description = {
+        "layout": layout,
+        "start_step": config.start_step,
+        "strides": list(config.strides),
+        "views": list(config.views),
+        "image_size": list(config.image_size),
+        "temporal_compression": TEMPORAL_FACTOR,
+        "tokenizer": fingerprint,
+        "latent_shape": summaries[0]["latent_shape"],
+    }
+    write_json_atomic(output / DESCRIPTION, description)
+    unfit = [row.split for row in episodes.rows if not _views(row, config)]
+    left_out = {"missing_view": len(unfit), "other_split": len(episodes) - len(rows) - len(unfit)}
+    return {
+        "found": len(episodes),
+        "kept": len(rows),
+        "left_out": {reason: count for reason, count in left_out.items() if count},
+        "frames": sum(row.num_frames for row in rows),
+        "shards": len(pieces),
+        "layout": layout,
+    }
+
+
+def read_videos(episodes: EpisodeSet, position: int, config: EncodeLatentsConfig) -> Float[Tensor, "v 3 n h w"]:
+    """The views of an episode that are encoded, RGB in [-1, 1]."""
+    views = _views(episodes.rows[position], config)
+    return torch.stack([frames_to_video(episodes.frames(position, view), config.image_size) for view in views])
+
+
+def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:
+    """Which views of an episode are encoded: all that are wanted and there, the task-facing one alone, or none."""
+    if all(view in row.views for view in config.views if view not in config.optional_views):
+        return tuple(view for view in config.views if view in row.views)
+    return (row.primary_view,) if config.primary_alone and row.stage1_ok and row.primary_view in row.views else ()
+
+
+def _select(episodes: EpisodeSet, config: EncodeLatentsConfig) -> list[int]:
+    selected = [
+        i
+        for i, row in enumerate(episodes.rows)
+        if (config.splits is None or row.split in config.splits) and _views(row, config)
+    ]
+    if not selected:
+        raise DataError(
+            "No episode is left to encode.",
+            where="encode_latents",
+            expected=f"episodes with the views {config.views} in the splits {config.splits or 'all'}",
+            got=f"{len(episodes)} episodes, none of them fitting",
+        )
+    return selected
