@@ -132,7 +132,8 @@ class DistillationRun:
             )
         found = {"tokenizer": store.description["tokenizer"], "grid_size": store.latent_shape[1:]}
         contract.require(where=store.root, **found)
-        rows = training_rows(store, episodes, stage=2, tracks=tracks)
+        needed = config.clips.needed_views(config.views) if config.clips.optional_views else None
+        rows = training_rows(store, episodes, stage=2, tracks=tracks, views=needed)
         contract.require_tracks((row.episode_id for row in rows), tracks)
         loader = ClipLoader(
             store, views=tuple(config.views), tracks=tracks, wrist_projection=contract.wrist_projection,
@@ -249,6 +250,7 @@ class DistillationRun:
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=batch_plan(trainer, self._work(step)),
+            absent_views=self.config.clips.absent_views,
             generated_history=self.config.trajectory_regression.trajectories.history == "generated",
             kept_latents=isinstance(self.config.input, FrameInput),
         )
@@ -256,7 +258,8 @@ class DistillationRun:
 
     def _trained(self, slots: tuple[str, ...]) -> TrainedClips | None:
         """What the clips show of the model's view slots; None: all, at stride 1."""
-        views = tuple(view for view in slots if view in self.config.views)
+        recorded = {view for row in self.rows if row.split in self.config.splits for view in row.views}
+        views = tuple(view for view in slots if view in self.config.views and view in recorded)
         found = TrainedClips(views=views, strides=tuple(sorted(set(self.config.clips.strides))))
         return None if found == TrainedClips(views=slots, strides=(1,)) else found
 

@@ -133,6 +133,7 @@ class DistillConfig(StrictModel):
     """Stage III. What it trains, the model keeps: ``spec`` is saved with it and read by everything that rolls it out.
 
     ``block_size`` counts latent frames (4 in the paper: 16 video frames). ``sigmas``: nodes of the few-step sampler.
+    ``clips.optional_views``: of ``views``, those that a recording may lack: it is trained on in the others.
     ``input``: ``{kind: latents}`` reads what encode_latents cached; ``{kind: frames, ...}`` the recordings' frames, which
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
     """
@@ -162,11 +163,8 @@ class DistillConfig(StrictModel):
                 "clips.view_weights: distillation clips hold all views; set teacher_forcing.view_weights for the first "
                 "step alone"
             )
-        if self.clips.optional_views:
-            raise ValueError(
-                "clips.optional_views: trajectories hold the same views in every clip; name in `views` those that all "
-                "episodes have"
-            )
+        if not self.clips.needed_views(self.views):
+            raise ValueError("clips.optional_views: one of the `views` must be in every recording")
         span = TEMPORAL_FACTOR * self.block_size
         odd = [length for length in self.clips.lengths if length <= span or (length - 1) % span]
         if odd:

@@ -74,6 +74,10 @@ class ClipSampling(StrictModel):
             )
         return self
 
+    def absent_views(self, recorded: Sequence[str]) -> tuple[str, ...]:
+        """Optional views that a recording lacks."""
+        return tuple(view for view in self.optional_views if view not in recorded)
+
     def needed_views(self, views: Sequence[str]) -> tuple[str, ...]:
         """Views, of a model's, that every episode must have."""
         drawn = (

@@ -88,7 +88,7 @@ class ClipSampler:
             for stride in config.strides:
                 fitting = [row for row in candidates if longest_clip(row.num_frames, 0, stride) >= length]
                 total = sum(config.source_weights.get(row.source, 1.0) for row in fitting)
-                lacking = [tuple(view for view in config.optional_views if view not in row.views) for row in fitting]
+                lacking = [config.absent_views(row.views) for row in fitting]
                 for absent in sorted(set(lacking)):
                     rows_of = [row for row, missing in zip(fitting, lacking, strict=True) if missing == absent]
                     row_weights = [config.source_weights.get(row.source, 1.0) for row in rows_of]
