@@ -77,6 +77,24 @@ def test_stage1_learns_the_same_from_frames_as_from_their_cached_latents(
     assert online.metadata["tokenizer"] == cached.metadata["tokenizer"]
 
 
+def test_held_out_recordings_shorter_than_the_longest_clips_validate_what_fits(
+    world: Any, tokenizer: Path, tiny_model: dict[str, object], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Seventeen frames hold nine at stride 2, but not thirteen."""
+    inputs = {"episodes": world.episodes, "tokenizer": tokenizer}
+    trainer = TRAINER | {"steps": 1}
+    for folder, lengths in (("some", [9, 13]), ("one", [9])):
+        clips = {"lengths": lengths, "strides": [2], "view_weights": {"primary": 1}}
+        train_stage1(stage1(tiny_model, trainer=trainer, clips=clips, input=FRAMES), inputs, tmp_path / folder)
+        assert any(
+            any(key.startswith("validation/") for key in row)
+            for row in read_json_lines(tmp_path / folder / "metrics.jsonl")
+        )
+        warned = "the longest clips span 25: the validation loss is of the lengths and strides that fit" in caplog.text
+        assert warned == (folder == "some")
+        caplog.clear()
+
+
 def stage2(**changes: Any) -> Stage2Config:
     values = {
         "trainer": TRAINER,

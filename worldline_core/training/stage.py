@@ -251,16 +251,27 @@ def validation_function(
 ) -> Callable[[], dict[str, float]] | None:
     """A function that measures the losses on held-out clips: always the same clips, noise and noise levels.
 
-    None (said in the log) where there are no such clips.
+    They are of recordings that hold clips of every length and stride that is trained; where there are none, of all, at the
+    lengths and strides that fit. None where no clip fits. Both are said in the log.
 
     Args:
         reading: what to do with held-out clips that cannot be read (default: stop).
     """
-    longest = max(clips.lengths) - 1
-    held_out = [row for row in rows if row.split in splits and row.num_frames > longest * max(clips.strides)]
-    if not held_out or not trainer.validation_batches:
-        logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", longest + 1, splits)
+    shortest, longest = ((pick(clips.lengths) - 1) * pick(clips.strides) + 1 for pick in (min, max))
+    split_rows = [row for row in rows if row.split in splits and row.num_frames >= shortest]
+    if not split_rows or not trainer.validation_batches:
+        logger.warning("No held-out clips of %d frames in the splits %s: no validation loss.", shortest, splits)
         return None
+    held_out = [row for row in split_rows if row.num_frames >= longest]
+    if not held_out:
+        held_out = split_rows
+        logger.warning(
+            "The longest recording of the splits %s has %d frames, the longest clips span %d: the validation loss is of the "
+            "lengths and strides that fit.",
+            splits,
+            max(row.num_frames for row in held_out),
+            longest,
+        )
     # At least two clips, so that "shuffled actions" are another clip's.
     size = max(2, trainer.batch_size)
     # Where steps on one view are mixed in, it is still the joint prediction that counts.
