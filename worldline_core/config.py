@@ -332,8 +332,8 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        """Files and folders of weights that a step with this configuration reads and that are no input of it: their content counts
-        in its key."""
+        """Files and folders (weights, a text tokenizer) that a step with this configuration reads and that are no input of it:
+        their content counts in its key."""
         return {}
 
 

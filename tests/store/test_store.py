@@ -136,7 +136,7 @@ def test_weights_count_with_their_content_and_are_read_once(tmp_path: Path, monk
     assert store.key("judge", 1, JudgedConfig(), {}) == plain
 
 
-def test_evaluations_and_distillation_name_the_weights_that_they_read(tmp_path: Path) -> None:
+def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) -> None:
     named = {"sam3_weights": "sam3", "vlm": {"weights": "qwen"}}
 
     def read(step: str, values: dict[str, Any]) -> dict[str, Path]:
@@ -154,6 +154,12 @@ def test_evaluations_and_distillation_name_the_weights_that_they_read(tmp_path: 
     assert read("evaluate_video", {"fvd_weights": "i3d.pt"}) == {}
     assert read("evaluate_video", {"fvd_weights": "i3d.pt", "metrics": ["fvd"]}) == {"fvd": Path("i3d.pt")}
     assert read("distill", {"lpips_weights": "alex", "clips": {"lengths": [17]}}) == {"lpips": Path("alex")}
+    trainer = {"trainer": {"steps": 1}}
+    assert read("train_stage1", trainer) == {}
+    assert read("train_stage1", {**trainer, "text": {"kind": "cosmos3", "path": "qwen"}}) == {"text": Path("qwen")}
+    baseline = {"method": "backbone", "sampler": "text_to_video", "num_frames": 17}
+    assert read("rollout", {**baseline, "text": {"kind": "cosmos3", "path": "qwen"}}) == {"text": Path("qwen")}
+    assert read("rollout", baseline) == {}
 
 
 def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:

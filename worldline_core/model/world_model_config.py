@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -136,6 +137,10 @@ class TextConfig(StrictModel):
     kind: Literal["bytes", "cosmos3"] = "bytes"
     path: str | None = None
     max_length: int = Field(default=48, ge=2)
+
+    def files_read(self) -> dict[str, Path | None]:
+        """The tokenizer's folder, whose content counts in the keys of what reads it."""
+        return {"text": None if self.path is None else Path(self.path)}
 
 
 class ImportBackboneConfig(StrictModel):

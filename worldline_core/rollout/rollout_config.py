@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -109,6 +111,9 @@ class RolloutConfig(StrictModel):
                 f"{self.sampler} and {self.clip_frames}"
             )
         return self
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return {} if self.text is None else self.text.files_read()
 
 
 NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -170,6 +172,9 @@ class Stage1Config(StageConfig):
     clips: ClipSampling = ClipSampling(view_weights={"primary": 1.0})
     text: TextConfig = TextConfig()
     text_dropout: float = Field(default=0.1, ge=0, le=1)
+
+    def weights_read(self) -> Mapping[str, Path | None]:
+        return self.text.files_read()
 
 
 class Stage2Config(StageConfig):
