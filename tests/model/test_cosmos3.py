@@ -8,10 +8,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.profiler import ProfilerActivity, profile
 
+from tests.model.test_weight_memory import most_bytes
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.cosmos3 import config_from_diffusers, load_cosmos3
+from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.cosmos3 import config_from_diffusers, import_backbone, load_cosmos3
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import ImportBackboneConfig
 
 SHAPE = {
     "head_dim": 12,
@@ -86,6 +90,31 @@ def test_diffusers_weights_give_the_same_velocity(diffusers_model: torch.nn.Modu
         ).velocity[:, 0]
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=1e-5)
         assert expected[:, :, 1:].abs().mean() > 0.1
+
+
+def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
+    """No model in float32 beside the weights, and the same bytes whatever was drawn before."""
+    from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
+
+    shape = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
+    pretrained = Cosmos3OmniTransformer(**shape).to(torch.bfloat16)
+    pretrained.save_pretrained(tmp_path / "pretrained")
+    inputs = {"diffusers": tmp_path / "pretrained"}
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+        counts = import_backbone(ImportBackboneConfig(dtype="bfloat16"), inputs, tmp_path / "base")
+    stored = (tmp_path / "base" / "model.safetensors").stat().st_size
+    assert counts["parameters"] == pytest.approx(stored / 2, rel=0.01)
+    # The mapped file and its copy in the stored type; a model in float32 would be two more.
+    assert most_bytes(recorded) < 2.2 * stored
+    torch.rand(3)
+    import_backbone(ImportBackboneConfig(dtype="bfloat16"), inputs, tmp_path / "again")
+    assert (tmp_path / "again" / "model.safetensors").read_bytes() == (
+        tmp_path / "base" / "model.safetensors"
+    ).read_bytes()
+    theirs, ours = dict(pretrained.named_parameters()), load_checkpoint(tmp_path / "base", dtype=torch.bfloat16)[0]
+    same = {name for name, weight in ours.named_parameters() if name in theirs}
+    assert len(same) > 80
+    assert all(torch.equal(ours.get_parameter(name), theirs[name].to(ours.get_parameter(name))) for name in same)
 
 
 @torch.no_grad()

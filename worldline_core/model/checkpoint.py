@@ -116,10 +116,8 @@ def save_checkpoint(
         CheckpointError: the kind is unknown or lacks its contract, or a weight is not finite in ``dtype``.
     """
     source = model.state_dict() if state_dict is None else state_dict
-    tensors: dict[str, Tensor] = {}
     for name, tensor in sorted(source.items()):
-        tensors[name] = tensor.detach().to("cpu", dtype).contiguous().clone()
-        if not bool(torch.isfinite(tensors[name]).all()):
+        if not bool(torch.isfinite(tensor.detach().to(dtype)).all()):
             raise CheckpointError(
                 "A weight is not finite", where=name, next_step=f"it may overflow {dtype}; check training"
             )
@@ -137,7 +135,7 @@ def save_checkpoint(
         where=folder,
     )
     # The description goes last: until then the folder is no checkpoint.
-    digest = write_weights(folder / WEIGHTS, tensors, max_shard_bytes)
+    digest = write_weights(folder / WEIGHTS, source, max_shard_bytes, dtype)
     write_description(folder, info.model_copy(update={"weights_sha256": digest}))
 
 

@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 import torch
 from pydantic import ValidationError
+from torch import Tensor
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.checkpoint import fill, save_checkpoint
+from worldline_core.model.action_branch import new_action_branch
+from worldline_core.model.checkpoint import check_fit, fill, save_checkpoint
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.weight_files import read_weights
 from worldline_core.model.world_model import WorldModel
@@ -109,6 +111,15 @@ def load_cosmos3(
         UnavailableError: there is no such folder.
         ArtifactError: the folder is incomplete, damaged, or holds another architecture.
     """
+    model, kept, report = _read_cosmos3(folder, towers=towers, fps=fps, changes=changes)
+    fill(model, kept, where=folder, dtype=dtype)
+    return model, report
+
+
+def _read_cosmos3(
+    folder: Path, *, towers: Literal["both", "generation"], fps: float | None, changes: Mapping[str, object] | None
+) -> tuple[WorldModel, dict[str, Tensor], Cosmos3Report]:
+    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new."""
     root = folder / "transformer" if (folder / "transformer").is_dir() else folder
     if not (root / "config.json").is_file():
         raise UnavailableError(
@@ -126,24 +137,32 @@ def load_cosmos3(
         name for name in tensors if name.startswith(UNUSED_PARAMETERS) or (without_text and is_text_parameter(name))
     }
     kept = {name: tensor for name, tensor in tensors.items() if name not in ignored}
-    model = WorldModel(config)
-    own = model.state_dict()
-    new = sorted(name for name in own if name.startswith("action_encoder.") or name == "view_embedding")
-    fill(model, kept | {name: own[name] for name in new}, where=root, dtype=dtype)
-    return model, Cosmos3Report(tuple(sorted(ignored)), tuple(new))
+    with torch.device("meta"):
+        model = WorldModel(config)
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(0)
+        new = {f"action_encoder.{name}": value for name, value in new_action_branch(config).state_dict().items()}
+    if model.view_embedding is not None:
+        new["view_embedding"] = torch.zeros(model.view_embedding.shape)
+    tensors = kept | new
+    check_fit({name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}, tensors, root)
+    return model, tensors, Cosmos3Report(tuple(sorted(ignored)), tuple(sorted(new)))
 
 
 def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Load ``inputs['diffusers']`` (a Cosmos3 folder in diffusers format) and write a base checkpoint.
 
-    The action branch is new and zero, so the result computes exactly what the pretrained model does.
+    The action branch is new and zero, so the result computes exactly what the pretrained model does. Weights go from file to
+    file: what is held is one file of the result.
 
     Raises:
         UnavailableError: there are no weights in the folder.
         ArtifactError: the folder is damaged, or holds another architecture.
     """
     dtype = {"bfloat16": torch.bfloat16, "float16": torch.float16}[config.dtype]
-    model, report = load_cosmos3(inputs["diffusers"], fps=config.fps, changes=config.changes, dtype=dtype)
+    model, tensors, report = _read_cosmos3(inputs["diffusers"], towers="both", fps=config.fps, changes=config.changes)
     metadata = {"source": "Cosmos3 in diffusers format", "ignored": list(report.ignored), "new": list(report.new)}
-    save_checkpoint(output, model, kind="base", action_contract=None, metadata=metadata, dtype=dtype)
+    save_checkpoint(
+        output, model, kind="base", action_contract=None, metadata=metadata, dtype=dtype, state_dict=tensors
+    )
     return {"parameters": sum(parameter.numel() for parameter in model.parameters()), "ignored": len(report.ignored)}

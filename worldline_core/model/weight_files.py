@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -26,19 +27,22 @@ MAX_SHARD_BYTES = 5_000_000_000
 _AGAIN = "fetch the folder again; what makes a checkpoint here writes its description last"
 
 
-def write_weights(path: Path, tensors: Mapping[str, Tensor], max_shard_bytes: int = MAX_SHARD_BYTES) -> str:
+def write_weights(
+    path: Path, tensors: Mapping[str, Tensor], max_shard_bytes: int = MAX_SHARD_BYTES, dtype: torch.dtype | None = None
+) -> str:
     """Write ``path``, or, above ``max_shard_bytes``, ``NAME-00001-of-0000N.safetensors`` and so on with an index.
 
-    Equal tensors give equal bytes. Files of an earlier, larger or smaller write of the same name are removed.
+    Equal tensors give equal bytes. They are cast to ``dtype`` file by file. Files of an earlier, larger or smaller write of the same name are removed.
 
     Returns:
         SHA-256 of the one file, or of the index.
     """
-    shards = _shards(tensors, max_shard_bytes)
+    sizes = {name: tensors[name].numel() * (dtype or tensors[name].dtype).itemsize for name in sorted(tensors)}
+    shards = _shards(sizes, max_shard_bytes)
     index = path.with_name(path.name + INDEX_SUFFIX)
     kept = {path.name}
     if len(shards) == 1:
-        content = save(dict(tensors))
+        content = _content(tensors, shards[0], dtype)
         write_bytes_atomic(path, content)
         digest = hashlib.sha256(content).hexdigest()
     else:
@@ -46,12 +50,13 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], max_shard_bytes: in
         digests: dict[str, str] = {}
         for number, names in enumerate(shards, start=1):
             name = f"{path.stem}-{number:05d}-of-{len(shards):05d}{path.suffix}"
-            content = save({key: tensors[key] for key in names})
+            content = _content(tensors, names, dtype)
             write_bytes_atomic(path.with_name(name), content)
             digests[name] = hashlib.sha256(content).hexdigest()
             weight_map |= dict.fromkeys(names, name)
-        total = sum(tensor.nbytes for tensor in tensors.values())
-        write_json_atomic(index, {"metadata": {"total_size": total, "sha256": digests}, "weight_map": weight_map})
+        write_json_atomic(
+            index, {"metadata": {"total_size": sum(sizes.values()), "sha256": digests}, "weight_map": weight_map}
+        )
         digest = hashlib.sha256(index.read_bytes()).hexdigest()
         kept = {index.name, *digests}
     for old in (path, index, *path.parent.glob(f"{path.stem}-*-of-*{path.suffix}")):
@@ -60,16 +65,21 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], max_shard_bytes: in
     return digest
 
 
-def _shards(tensors: Mapping[str, Tensor], most: int) -> list[list[str]]:
-    """Names of the tensors of each file, in order; a tensor above ``most`` has a file of its own."""
+def _content(tensors: Mapping[str, Tensor], names: Sequence[str], dtype: torch.dtype | None) -> bytes:
+    """A file of some tensors. Those that share memory are copied: a file holds each."""
+    return save({name: tensors[name].detach().to("cpu", dtype).contiguous().clone() for name in names})
+
+
+def _shards(sizes: Mapping[str, int], most: int) -> list[list[str]]:
+    """Names of the tensors of each file, in order; a tensor above ``most`` bytes has a file of its own."""
     shards: list[list[str]] = [[]]
     size = 0
-    for name in sorted(tensors):
-        if shards[-1] and size + tensors[name].nbytes > most:
+    for name, own in sizes.items():
+        if shards[-1] and size + own > most:
             shards.append([])
             size = 0
         shards[-1].append(name)
-        size += tensors[name].nbytes
+        size += own
     return shards
 
 

@@ -170,7 +170,7 @@ _STEPS = (
     ),
     Step(
         "import_backbone",
-        1,
+        2,
         "worldline_core.model.cosmos3",
         "import_backbone",
         "model.world_model_config.ImportBackboneConfig",
