@@ -33,6 +33,11 @@ check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The rehearsal takes as long as all other slow tests on one core: begun last, it would keep the second one idle."""
+    items.sort(key=lambda item: "tests/rehearsal/" not in item.nodeid)
+
+
 def pytest_collection_finish() -> None:
     """What is imported by now stays: looking through it again and again for garbage took up to a tenth of the time."""
     gc.collect()
