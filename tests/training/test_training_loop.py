@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -169,7 +170,15 @@ def test_the_latest_states_and_the_best_one_stay(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("share", "states"), [(1e-9, [1, 30]), (1.0, None)])
 def test_saving_takes_a_share_of_the_time(tmp_path: Path, share: float, states: list[int] | None) -> None:
-    run(tmp_path, steps=30, save_every_seconds=0, save_every_steps=0, saving={"share": share, "keep": 100})
+    def slow_enough(step: int) -> float:
+        """Steps last as long as a state takes, on a slow disk too, until there are four of them."""
+        before, began = len(saved(tmp_path)), time.monotonic()
+        while states is None and before == len(saved(tmp_path)) <= 3 and time.monotonic() - began < 0.5:
+            time.sleep(0.01)
+        return 1.0
+
+    saving = {"share": share, "keep": 100}
+    run(tmp_path, steps=30, at=slow_enough, save_every_seconds=0, save_every_steps=0, saving=saving)
     if states is None:
         assert len(saved(tmp_path)) > 3
     else:
