@@ -32,7 +32,8 @@ def write_weights(
 ) -> str:
     """Write ``path``, or, above ``max_shard_bytes``, ``NAME-00001-of-0000N.safetensors`` and so on with an index.
 
-    Equal tensors give equal bytes. They are cast to ``dtype`` file by file. Files of an earlier, larger or smaller write of the same name are removed.
+    Equal tensors give equal bytes. They are cast to ``dtype`` file by file. Files of an earlier, larger or smaller write of
+    the same name are removed.
 
     Returns:
         SHA-256 of the one file, or of the index.

@@ -160,7 +160,7 @@ _STEPS = (
     ),
     Step(
         "encode_latents",
-        1,
+        2,
         "worldline_core.training.encode_latents",
         "encode_latents",
         "training.clip_config.EncodeLatentsConfig",

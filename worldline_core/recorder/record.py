@@ -68,7 +68,7 @@ EMBODIMENT_STREAM: dict[str, int] = {
 }
 SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4}
 
-# What went wrong in each failed episode ; for evaluation, never read by a judge.
+# What went wrong in each failed episode; for evaluation, never read by a judge.
 FAILURES_FILE = "failures.json"
 
 
@@ -112,9 +112,7 @@ class Variety(StrictModel):
     def _in_order(self) -> Variety:
         earliest, latest = self.gripper_delay_frames
         if not -32 <= earliest <= latest <= 32:
-            raise ValueError(
-                f"gripper_delay_frames: expected -32 <= earliest <= latest <= 32, got {earliest}, {latest}"
-            )
+            raise ValueError(f"gripper_delay_frames: -32 <= earliest <= latest <= 32 wanted, got {earliest}, {latest}")
         return self
 
     def draw(self, random: np.random.Generator) -> ScriptedPolicy | None:
