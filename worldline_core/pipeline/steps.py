@@ -280,7 +280,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_planning",
-        3,
+        4,
         "worldline_core.evaluation.planning.evaluate_planning",
         "evaluate_planning",
         "evaluation.evaluation_config.PlanningConfig",

@@ -29,7 +29,7 @@ from worldline_core.evaluation.planning.selectors import (
     MeasuredSelector,
     Selector,
     VLMSelector,
-    planning_indices,
+    shown_video,
 )
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import (
@@ -172,11 +172,7 @@ def candidate_loader(
     def load(candidate: int) -> CandidateVideo:
         row = rows[candidate]
         seed = 0 if rollout is None else rollout.seeds(row.episode_id)[0]
-        video = trajectory_of(episodes, row, views, rollout=rollout, seed=seed, tracks=tracks)
-        indices = planning_indices(video.num_frames)
-        frames = {view: shown[list(indices)] for view, shown in video.frames.items()}
-        points = None if video.points is None else video.points[list(indices)]
-        return CandidateVideo(frames, indices, row.fps, video.num_frames, points)
+        return shown_video(trajectory_of(episodes, row, views, rollout=rollout, seed=seed, tracks=tracks))
 
     return load
 
