@@ -5,8 +5,10 @@ None of it is the work itself: a server that ended before fails no run whose wor
 
 from __future__ import annotations
 
+import base64
 import functools
 import logging
+import mimetypes
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,7 +64,7 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
     Args:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
-        pictures: files to show; Prefect's page shows them in a browser that may read files of this machine.
+        pictures: files to show. They travel inside of the artifacts: a page that a browser has over http may not show files.
     """
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     rows = [
@@ -77,6 +79,7 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
             )
         for number, picture in enumerate(pictures):
             key = "picture" if number == 0 else f"picture-{number}"
-            create_image_artifact(picture.as_uri(), key=key, description=f"{picture.stem}: {page / 'index.html'}")
+            data = f"data:{mimetypes.guess_type(picture)[0]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
+            create_image_artifact(data, key=key, description=f"{picture.stem}: {page / 'index.html'}")
     except httpx.TransportError as error:
         logger.warning("Prefect's pages show nothing of this run: its server does not answer (%s)", error)
