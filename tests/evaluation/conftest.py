@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.rollout.rollout_set import RolloutSetWriter
+from worldline_core.store.artifact_files import write_manifest
 
 NUM_FRAMES = 17
 HEIGHT, WIDTH = 48, 72
@@ -53,7 +55,7 @@ def make_film(success: bool, seed: int) -> tuple[dict[str, np.ndarray], np.ndarr
     return {"head": head, "left_wrist": np.full_like(wrist, 100), "right_wrist": wrist}, masks, points
 
 
-def _tracks(episode_id: str, points: np.ndarray, path: np.ndarray) -> SimpleNamespace:
+def _tracks(episode_id: str, points: np.ndarray, path: np.ndarray) -> Any:
     views = len(VIEWS)
     uv = np.zeros((NUM_FRAMES, views, 1, 2))
     uv[:, 0] = points
@@ -80,6 +82,7 @@ def _write(
     sources: dict[str, str] | None = None,
     training: int = 0,
     late: tuple[str, ...] = (),
+    known: bool = True,
 ) -> SmallWorld:
     """With ``training`` further recordings that nobody predicted; the robot of those that are ``late`` stands still at first."""
     episodes, tracks = root / "episodes", root / "tracks"
@@ -94,7 +97,7 @@ def _write(
             episode = Episode(
                 episode_id=episode_id, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm", scene=f"scene_{number % 2}",
                 task_family="lift", instruction="lift the red cube",
-                outcome="unknown" if bank else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
+                outcome="unknown" if bank or not (known or episode_id in learned) else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
                 state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
                 candidate=number if bank else None,
             )  # fmt: skip
@@ -138,6 +141,22 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
     """Two attempts beside the recordings that the model knows; the second one begins later than any of these."""
     root = tmp_path_factory.mktemp("trained")
     return _write(root, {"prompt": True, "late": True}, split="test", bank=None, training=20, late=("late",))
+
+
+@pytest.fixture(scope="session")
+def attempts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, SmallWorld]:
+    """Thirty attempts beside the recordings that the model knows; and the same without their outcomes."""
+    cases = {f"try-{number:02d}": number % 2 == 0 for number in range(30)}
+    root = tmp_path_factory.mktemp("attempts")
+    made = [
+        _write(root / str(known), cases, split="test", bank=None, training=20, late=("try-29",), known=known)
+        for known in (True, False)
+    ]
+    for world in made:
+        for method in ("good", "copy"):
+            told = {"config": {"sampler": "block_causal", "steps": None}, "inputs": {"checkpoint": {"digest": method}}}
+            write_manifest(world.inputs[f"rollouts.{method}"], {"step": "rollout", **told})
+    return made[0], made[1]
 
 
 @pytest.fixture(scope="session")

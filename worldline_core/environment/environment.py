@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worldline_core.environment.episodes import RunningEpisode, Success, Together, each_seed, measured_success
+from worldline_core.environment.episodes import RunningEpisode, Success, Together, TrustedJudge, each_seed, judge_of
 from worldline_core.environment.starts import EpisodeStarts, Start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.recordings import simulated_points
@@ -47,12 +47,16 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         observe_every: steps between two observations of pictures, a divisor of the block's length; by default the block.
         success: "measured" (by colour, with the shipped segmenter), a function, or None: then nothing is a success.
         stop_at_success: ask the judge after every block, and end the episode where it sees success.
+        trust: trust.safetensors of an evaluation of this checkpoint by the measured judge, or its folder: when an episode has
+            been judged, ``info`` has ``trust``, the probability that the judge is right, and ``do_not_trust``, why it should not
+            be relied on ("" where it may).
         limits, response: as of ``WorldLine.start``.
         autoreset_mode: of finished episodes: at the next step, in the same step, or never (``reset`` with ``reset_mask``).
         options: further arguments of ``WorldLine.from_pretrained``.
 
     Raises:
-        ConfigError: ``observe_every`` does not divide the block, or a number is not positive.
+        ConfigError: ``observe_every`` does not divide the block, or a number is not positive; ``trust`` was made with another
+            checkpoint, judge or robot.
         DataError: no recording fits.
     """
 
@@ -69,6 +73,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         observe_every: int | None = None,
         success: Literal["measured"] | Success | None = "measured",
         stop_at_success: bool = False,
+        trust: Path | str | None = None,
         limits: bool = True,
         response: Response | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -95,7 +100,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self.kinematics = ArmKinematics(load_embodiment(self.starts.embodiment))
         self.num_envs, self.episode_frames = num_envs, episode_frames
         self._limits, self._response, self._stop_at_success = limits, response, stop_at_success
-        self._succeeds = measured_success(shipped / "models" / "segmenter") if success == "measured" else success
+        self._succeeds = judge_of(success, trust, model, self.world, self.views, self.starts.embodiment)
         self.render_mode = render_mode
         self._autoreset = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -238,7 +243,8 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             picture = simulation.pictures[index]
             video = {view: [frame[None]] for view, frame in picture.items()}
             points = [simulated_points(simulation, index)]
-            episodes[slot] = RunningEpisode(starts[index], video, points, picture, simulation.state[index])
+            tracks = [simulation.tracks[index]]
+            episodes[slot] = RunningEpisode(starts[index], video, points, picture, simulation.state[index], tracks)
             self._done[slot] = False
         if len(episodes) < self.num_envs:
             raise DataError("Some episodes were never begun", next_step="reset all of them first")
@@ -260,11 +266,14 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 for view, video in clips[index].items():
                     episode.video[view].append(video)
                 episode.points.append(simulated_points(simulation, index)[:count])
+                episode.tracks.append(simulation.tracks[index].clip(range(count)))
             if self._succeeds is not None and (last or (full and self._stop_at_success)):
                 found = self._succeeds(episode.trajectory(self.world.contract.fps))
                 if not isinstance(found, bool | np.bool_ | None):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
                 episode.success = bool(found)
+                if isinstance(self._succeeds, TrustedJudge):
+                    episode.trust = self._succeeds.told(episode.tracks)
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         try:
@@ -296,6 +305,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
             "is_success": episode.success,
             "episode_id": episode.start.episode_id,
             "task": episode.start.instruction,
+            **episode.trust,
         }
 
     def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:

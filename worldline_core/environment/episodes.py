@@ -3,41 +3,138 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.environment.starts import Start
-from worldline_core.errors import DataError
-from worldline_core.evaluation.policy.judge import judge_trajectory
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.policy.judge import confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
+from worldline_core.evaluation.policy.novelty import control_vectors, setup_vectors
+from worldline_core.evaluation.policy.saved_trust import JudgedBy, PredictedBy, SavedTrust, content_digest
+from worldline_core.evaluation.policy.trust import Calibration, reasons
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.model.pretrained import pretrained_folder
+from worldline_core.rollout.samplers import FULL_STEPS
 from worldline_core.rollout.session import Frames
 from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.worldline import WorldLine
+from worldline_core.shipped import shipped_folder
 
 Success = Callable[[Trajectory], bool | None]
 """Whether a video shows that its task was done; None where that cannot be seen."""
 
 
-def measured_success(segmenter: Path) -> Success:
-    """Success by the embedded judge, which follows what the instruction names by colour."""
-    judge = MeasuredEvidenceJudge(open_segmenter("learned", learned=segmenter, sam3=None))
+class TrustedJudge:
+    """Success by the embedded judge, and how far it is to be trusted by a saved calibration.
+
+    Args:
+        segmenter: its folder.
+        saved: trust.safetensors, or its folder.
+        world, checkpoint: the model, and its folder. views, embodiment: of the simulations.
+
+    Raises:
+        ArtifactError: there is no such calibration.
+        ConfigError: it was made with another judge, robot or checkpoint, or reads what one simulation does not tell.
+    """
+
+    def __init__(
+        self, segmenter: Path, saved: Path, world: WorldLine, checkpoint: Path, views: Sequence[str], embodiment: str
+    ) -> None:
+        opened = open_segmenter("learned", learned=segmenter, sam3=None)
+        self._judge = MeasuredEvidenceJudge(opened, states_confidence=True)
+        self._saved = SavedTrust.read(saved)
+        digest = content_digest(segmenter)
+        self._saved.require(
+            JudgedBy(judge="measured", views=tuple(views), segmenter="learned", segmenter_weights=digest), (embodiment,)
+        )
+        causal = world.info.causal
+        sampler, usual = ("full_clip", FULL_STEPS) if causal is None else ("block_causal", causal.steps)
+        asked = PredictedBy(
+            checkpoint=content_digest(checkpoint), sampler=sampler, steps=world.steps, shift=world.shift
+        )
+        either = [asked, asked.model_copy(update={"steps": None})] if world.steps == usual else [asked]
+        found = [self._saved.calibration_of(made) for made in either]
+        fitting = [calibration for calibration in found if isinstance(calibration, Calibration)]
+        if not fitting or "disagreement" in fitting[0].signals:
+            raise ConfigError(
+                "A saved calibration of trust is not of these simulations", where=saved,
+                got=", ".join(fitting[0].signals) + ": disagreement needs a second model" if fitting else found[0],
+                next_step="calibrate with rollouts of this checkpoint, without compare_with (docs/evaluation.md)",
+            )  # fmt: skip
+        self._calibration = fitting[0]
+        self._confidence: float | None = None
+
+    def __call__(self, trajectory: Trajectory) -> bool:
+        judgement = judge_trajectory(self._judge, trajectory)
+        self._confidence = confidence_of(asdict(judgement))
+        return judgement.success
+
+    def told(self, tracks: Sequence[EpisodeTracks]) -> dict[str, Any]:
+        """Of the last verdict ``trust`` (NaN where the judge had nothing to go by), and in ``do_not_trust`` why not to rely on it.
+
+        Args:
+            tracks: of the episode so far.
+        """
+        poses, openings = (
+            np.concatenate(rows) for rows in zip(*((t.T_base_tool, t.gripper[:, 0]) for t in tracks), strict=True)
+        )
+        row = {
+            "episode_id": "of a simulation", "disagreement": None,
+            "doubt": None if self._confidence is None else 1.0 - self._confidence,
+            "new_controls": self._saved.controls.novelty(*control_vectors(poses, openings)),
+            "new_setup": self._saved.setups.novelty(*setup_vectors(tracks[0])),
+        }  # fmt: skip
+        trust = self._calibration.trust([row])
+        row["trust"] = None if isinstance(trust, str) else float(trust[0])
+        marks = reasons(row, self._saved.least_trust) + (["nothing to judge by"] if row["trust"] is None else [])
+        return {"trust": float("nan") if row["trust"] is None else row["trust"], "do_not_trust": ", ".join(marks)}
+
+
+def judge_of(
+    success: Success | Literal["measured"] | None,
+    trust: Path | str | None,
+    model: Path | str | WorldLine | None,
+    world: WorldLine,
+    views: Sequence[str],
+    embodiment: str,
+) -> Success | None:
+    """The judge that an environment asks for; the embedded one follows what the instruction names by colour.
+
+    Raises: ConfigError where trust is asked for in another judge, or in a model without a folder; as of :class:`TrustedJudge`.
+    """
+    shipped = shipped_folder() / "models"
+    if trust is not None:
+        if success != "measured" or isinstance(model, WorldLine):
+            raise ConfigError(
+                "Trust is of the measured judge and of a checkpoint's folder", where="trust",
+                got=f"success {success!r}, model {type(model).__name__}",
+            )  # fmt: skip
+        folder = pretrained_folder(model or shipped / "causal")
+        return TrustedJudge(shipped / "segmenter", Path(trust), world, folder, views, embodiment)
+    if success != "measured":
+        return success
+    judge = MeasuredEvidenceJudge(open_segmenter("learned", learned=shipped / "segmenter", sam3=None))
     return lambda trajectory: judge_trajectory(judge, trajectory).success
 
 
 @dataclass
 class RunningEpisode:
-    """One running episode: its start, its video so far and the tools in the head view."""
+    """One running episode: its start, its video so far, the tools in the head view, and the controls' tracks."""
 
     start: Start
     video: dict[str, list[np.ndarray]]
     points: list[np.ndarray]
     picture: dict[str, np.ndarray]
     state: np.ndarray
+    tracks: list[EpisodeTracks]
     success: bool = False
+    trust: dict[str, Any] = field(default_factory=dict)
 
     def trajectory(self, fps: float) -> Trajectory:
         """The video so far, as a judge sees it."""

@@ -154,6 +154,10 @@ class TrustConfig(StrictModel):
     compare_with: dict[str, str] = Field(
         default={}, description="of a method, another one: where verdicts on both differ, they are less to be trusted"
     )
+    calibration: Path | None = Field(
+        default=None, exclude_if=lambda value: value is None,
+        description="trust.safetensors of an earlier evaluation, or its folder: recordings need no outcome then",
+    )  # fmt: skip
 
 
 class PolicyEvaluationConfig(StrictModel):
@@ -188,7 +192,8 @@ class PolicyEvaluationConfig(StrictModel):
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        return _judge_weights(self.judge, self)
+        saved = {} if self.trust is None else {"trust": self.trust.calibration}
+        return _judge_weights(self.judge, self) | saved
 
 
 class PlanningConfig(StrictModel):

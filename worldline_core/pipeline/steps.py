@@ -270,7 +270,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_policy",
-        4,
+        5,
         "worldline_core.evaluation.policy.evaluate_policy",
         "evaluate_policy",
         "evaluation.evaluation_config.PolicyEvaluationConfig",

@@ -47,16 +47,23 @@ def policy_evaluation(summary: JsonObject, verdicts: Sequence[JsonObject] = ()) 
     chart = interval_chart(
         dots, digits=2, value_label="agreement with the recorded outcome, 95 % interval",
         title=f"Accuracy over {summary.get('trajectories', '?')} trajectories (judge: {summary.get('judge', 'unknown')})",
-    )  # fmt: skip
+    ) if dots else None  # fmt: skip
     shown = [m for m in methods if m.kind in (TRUE_METHOD, "stage2", "causal")]
+    unknown = [
+        [m.long_label, found["count"], interval(found)]
+        for m in methods
+        if (found := results[m.name].get(ALL, {}).get("predicted_success"))
+    ]
+    headings = ["Videos of", "Recordings", "Judged a success"]
     confusions = [(m.long_label, rows) for m in shown if (rows := confusion(results[m.name]))]
     short = sorted((summary.get("shorter_than_recording") or {}).items())
     ranking = policy_ranking(summary["policies"]) if summary.get("policies") else None
-    groups = group_table(results)
+    groups = group_table(results) if dots else None
     trust = trust_view(summary["trust"]) if summary.get("trust") else None
     return {
         "chart": chart, "confusions": confusions, "short": short, "groups": groups, "ranking": ranking, "trust": trust,
         "tasks": task_confusion(verdicts), "failures": failure_tables(verdicts),
+        "unknown": Table(headings, unknown, (1, 2), "Recordings whose outcome is not known", dense=True) if unknown else None,
     }  # fmt: skip
 
 

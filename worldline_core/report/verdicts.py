@@ -23,7 +23,7 @@ MARK = Markup('<strong class="mark">do not trust</strong>')
 def task_confusion(verdicts: Sequence[JsonObject]) -> Table | None:
     """Of the recorded successes and failures of every task (the first word of the instruction), those judged rightly."""
     counts: Counter[tuple[str, str, str, bool]] = Counter()
-    for row in verdicts:
+    for row in (row for row in verdicts if row["outcome"] in ("success", "failure")):
         counts[row["method"], _task(row), row["outcome"], row["predicted"] == row["outcome"]] += 1
     tasks = sorted({task for _, task, _, _ in counts})
     if len(tasks) < 2:

@@ -15,8 +15,9 @@ Axis legend: r recordings, w windows, f features, n frames, a arms.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,9 @@ from worldline_core.data.episodes.episode import TRAINING_SPLITS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import TrustConfig
+
+if TYPE_CHECKING:
+    from worldline_core.evaluation.policy.saved_trust import SavedTrust
 
 PLACE_M, SPEED_M, OPENING = 0.1, 0.05, 0.5
 """Differences that count as much as each other: of place, of the way in a latent frame, of a gripper's opening (share)."""
@@ -59,13 +63,13 @@ class KnownRecordings:
         level: float = 0.05,
         seed: int = 0,
     ) -> None:
-        found: dict[Kind, list[np.ndarray]] = defaultdict(list)
+        found: dict[str, list[np.ndarray]] = defaultdict(list)
         for kind, vectors in recordings:
-            found[kind].append(vectors)
+            found[str(kind)].append(vectors)
         counts = {kind: len(vectors) for kind, vectors in found.items()}
         random = np.random.default_rng(seed)
         self._known = {
-            kind: _Neighbours([vectors[i] for i in random.permutation(len(vectors))[:MOST_RECORDINGS]], level)
+            kind: _Neighbours.of([vectors[i] for i in random.permutation(len(vectors))[:MOST_RECORDINGS]], level)
             for kind, vectors in found.items()
             if len(vectors) >= LEAST_RECORDINGS
         }
@@ -79,25 +83,48 @@ class KnownRecordings:
 
     def novelty(self, kind: Kind, vectors: Float[np.ndarray, "w f"]) -> float:
         """Of a recording; infinite where fewer than five training recordings are of its kind: hardly anything is like it."""
-        return self._known[kind].novelty(vectors) if kind in self._known else float("inf")
+        known = self._known.get(str(kind))
+        return float("inf") if known is None else known.novelty(vectors)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that is known, by name, to be saved."""
+        return {f"{kind}/{name}": array for kind, found in self._known.items() for name, array in found.arrays.items()}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> KnownRecordings:
+        """From what :meth:`arrays` gave. Raises: KeyError where some are missing."""
+        of_kind: dict[str, dict[str, np.ndarray]] = defaultdict(dict)
+        for name, array in arrays.items():
+            kind, _, part = name.rpartition("/")
+            of_kind[kind][part] = array
+        made = cls.__new__(cls)
+        made._known = {kind: _Neighbours(found) for kind, found in of_kind.items()}
+        return made
 
 
 class _Neighbours:
-    """Training recordings of one kind."""
+    """Training recordings of one kind: ``window_0 (r, f)``, ..., ``scale (w)`` of their distances, and ``limit``."""
 
-    def __init__(self, recordings: Sequence[np.ndarray], level: float) -> None:
+    def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
+        self.arrays = arrays
+        self._scale, self._limit = arrays["scale"], float(arrays["limit"][0])
+        self._windows = [arrays[f"window_{w}"] for w in range(len(self._scale))]
+
+    @classmethod
+    def of(cls, recordings: Sequence[np.ndarray], level: float) -> _Neighbours:
         lengths = np.array([len(vectors) for vectors in recordings])
         # Windows that hardly any training recording reaches are not compared.
         windows = int(np.sort(lengths)[-LEAST_RECORDINGS])
-        self._windows = [np.stack([r[w] for r in recordings if len(r) > w]) for w in range(windows)]
+        known = [np.stack([r[w] for r in recordings if len(r) > w]) for w in range(windows)]
         own = np.zeros((windows, len(recordings)))
-        for w, vectors in enumerate(self._windows):
+        for w, vectors in enumerate(known):
             apart = cdist(vectors, vectors)
             np.fill_diagonal(apart, np.inf)
             own[w, lengths > w] = apart.min(axis=1)
         # The windows of a recording are as hard to match as each other: in units of their median.
-        self._scale = np.array([max(float(np.median(own[w, lengths > w])), 1e-6) for w in range(windows)])
-        self._limit = float(np.quantile((own / self._scale[:, None]).max(axis=0), 1.0 - level))
+        scale = np.array([max(float(np.median(own[w, lengths > w])), 1e-6) for w in range(windows)])
+        limit = np.quantile((own / scale[:, None]).max(axis=0), 1.0 - level)
+        return cls({f"window_{w}": vectors for w, vectors in enumerate(known)} | {"scale": scale, "limit": limit[None]})
 
     def novelty(self, vectors: np.ndarray) -> float:
         apart = [
@@ -155,8 +182,10 @@ class KnownSetting:
     count: int
 
     @classmethod
-    def of(cls, episodes: EpisodeSet, tracks: ActionTracks | None, config: TrustConfig) -> KnownSetting:
-        """Reads the recordings of the training splits.
+    def of(
+        cls, episodes: EpisodeSet, tracks: ActionTracks | None, config: TrustConfig, saved: SavedTrust | None = None
+    ) -> KnownSetting:
+        """Reads the recordings of the training splits, or takes those that were saved.
 
         Raises: ConfigError without action tracks; DataError where there are too few training recordings.
         """
@@ -165,6 +194,8 @@ class KnownSetting:
                 "Trust in verdicts is judged from the controls", where="evaluate_policy.trust", expected="the input tracks",
                 next_step="run render_actions and give its folder as --input tracks=FOLDER",
             )  # fmt: skip
+        if saved is not None:
+            return cls(tracks, saved.controls, saved.setups, saved.training_recordings)
         names = [row.episode_id for row in episodes.rows if row.split in TRAINING_SPLITS and row.episode_id in tracks]
         known = [tracks.tracks(name) for name in names]
         level = config.novelty_level

@@ -34,8 +34,35 @@ _SHOWN = 12
 _LARGEST_NOVELTY = 10.0
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """Probability of a right verdict from its signals: weights of the intercept and of each signal."""
+
+    signals: tuple[str, ...]
+    weights: Float[np.ndarray, " s+1"]
+
+    def trust(self, rows: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, " n"] | str:
+        """Of each verdict, or why there is none."""
+        values, known = _signals(rows)
+        if missing := [name for name in self.signals if name not in known]:
+            return f"the calibration reads {', '.join(missing)}, which not all of these verdicts have"
+        return probability(self.weights, values[:, [known.index(name) for name in self.signals]])
+
+
+def calibrated(rows: Sequence[Mapping[str, Any]]) -> Calibration:
+    """Of all verdicts of one method, with signals and recorded outcomes, for verdicts whose outcome is not known."""
+    values, known = _signals(rows)
+    return Calibration(tuple(known), fit_right(values, _right(rows)))
+
+
 def trust_verdicts(
-    rows: Sequence[Mapping[str, Any]], config: TrustConfig, *, policies: bool, resamples: int, seed: int
+    rows: Sequence[Mapping[str, Any]],
+    config: TrustConfig,
+    *,
+    policies: bool,
+    resamples: int,
+    seed: int,
+    saved: Mapping[str, Calibration | str] | None = None,
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """How far each verdict is to be trusted, and how right that is.
 
@@ -43,6 +70,8 @@ def trust_verdicts(
         rows: verdicts of predicted videos with method, episode_id, seed, start, policy, task, outcome, predicted, confidence (of
             the judge in its verdict) and the novelties; None where a signal is not known.
         policies: also how policies rank where the least trusted verdicts are left out.
+        saved: of each method a calibration that was made before, or why there is none; nothing is calibrated then, and outcomes
+            may be ``unknown``.
 
     Returns:
         the rows with :data:`TRUST_COLUMNS`, and by method {"available", "reason", "signals", "auroc", "calibration_error",
@@ -63,15 +92,21 @@ def trust_verdicts(
     for method, of_method in sorted(by_method.items()):
         _add_doubt("doubt", of_method, of_method)
         _add_doubt("disagreement", of_method, by_method.get(config.compare_with.get(method, ""), ()))
-        signals, known = _signals(of_method)
-        found = _calibrated(of_method, signals, seed)
+        if saved is None:
+            found = _calibrated(of_method, _signals(of_method)[0], seed)
+        else:
+            before = saved[method]
+            found = before if isinstance(before, str) else before.trust(of_method)
         for row, value in zip(of_method, [None] * len(of_method) if isinstance(found, str) else found, strict=True):
             row["trust"] = None if value is None else float(value)
-            row["do_not_trust"] = ", ".join(_reasons(row, config))
+            row["do_not_trust"] = ", ".join(reasons(row, config.least_trust))
+        known = [row for row in of_method if row["outcome"] in ("success", "failure")]
+        if not isinstance(found, str) and not known:
+            found = "no outcome is recorded, so how reliable the saved calibration is here cannot be told"
         if isinstance(found, str):
             methods[method] = {"available": False, "reason": found, "marked": _marked(of_method)}
         else:
-            methods[method] = _summary(of_method, signals, known, policies=policies, resamples=resamples, seed=seed)
+            methods[method] = _summary(known, policies=policies, resamples=resamples, seed=seed)
         done += of_method
     return done, methods
 
@@ -106,13 +141,17 @@ def _signals(rows: Sequence[Mapping[str, Any]]) -> tuple[Float[np.ndarray, "n s"
     return np.stack(columns, axis=1) if columns else np.zeros((len(rows), 0)), known
 
 
+def _right(rows: Sequence[Mapping[str, Any]]) -> Bool[np.ndarray, " n"]:
+    return np.array([row["predicted"] == row["outcome"] for row in rows])
+
+
 def _calibrated(rows: Sequence[Mapping[str, Any]], signals: np.ndarray, seed: int) -> Float[np.ndarray, " n"] | str:
     """Probability of each verdict to be right, or why there is none."""
     if not signals.shape[1]:
         return (
             "no signal is known: the judge states no confidence, and there are no training recordings to compare with"
         )
-    right = np.array([row["predicted"] == row["outcome"] for row in rows])
+    right = _right(rows)
     half = halves([row["start"] for row in rows], seed)
     counts = [Counter(right[half == number].tolist()) for number in (0, 1)]
     fewest = min(counts, key=lambda found: min(found[True], found[False]))
@@ -156,12 +195,12 @@ def probability(weights: np.ndarray, signals: Float[np.ndarray, "n s"]) -> Float
     return 1.0 / (1.0 + np.exp(-np.clip(weights[0] + signals @ weights[1:], -60, 60)))
 
 
-def _reasons(row: Mapping[str, Any], config: TrustConfig) -> list[str]:
+def reasons(row: Mapping[str, Any], least_trust: float) -> list[str]:
     """Why a verdict carries the mark; none where it does not."""
-    reasons = [
+    found = [
         name.replace("_", " ") for name in ("new_controls", "new_setup") if row[name] is not None and row[name] > 1.0
     ]
-    return reasons + (["doubtful verdict"] if row["trust"] is not None and row["trust"] < config.least_trust else [])
+    return found + (["doubtful verdict"] if row["trust"] is not None and row["trust"] < least_trust else [])
 
 
 @dataclass(frozen=True)
@@ -212,11 +251,9 @@ def reliability_bins(trust: Float[np.ndarray, " n"], bins: int = 10) -> np.ndarr
     return np.searchsorted(edges, trust, side="right")
 
 
-def _summary(
-    rows: list[dict[str, Any]], signals: np.ndarray, known: list[str], *, policies: bool, resamples: int, seed: int
-) -> dict[str, Any]:
-    trust = np.array([row["trust"] for row in rows])
-    right = np.array([row["predicted"] == row["outcome"] for row in rows])
+def _summary(rows: list[dict[str, Any]], *, policies: bool, resamples: int, seed: int) -> dict[str, Any]:
+    signals, known = _signals(rows)
+    trust, right = np.array([row["trust"] for row in rows]), _right(rows)
     over = _Resamples.of([row["start"] for row in rows], resamples, seed)
     weights = fit_right(signals, right)[1:]
     bins = reliability_bins(trust)
