@@ -11,6 +11,8 @@ MuJoCo, which also says how it ended.
     open        best of N by the measured judge, chosen once
     closed_*    N/2 candidates at each of three decisions (3 + 2 + 1 chunks predicted: as many model calls), by solver
     random      a proposal taken blindly, once or after every chunk (`closed_random`)
+    *_goal      best of N once (`open_goal`) or after every chunk (`closed_goal`), by nearness to a goal picture: the last head view of
+                a demonstration that succeeded from this start, which is no candidate; the judge has no part in it
     oracle      MuJoCo itself chooses, among the candidates of `open` or after every chunk (`closed_oracle`)
 
 Each finished attempt is a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints the table.
@@ -29,7 +31,7 @@ import numpy as np
 import torch
 
 from worldline_core import Camera, WorldLine
-from worldline_core.evaluation.planning.closed_loop import Plan, Planner, Situation, judged
+from worldline_core.evaluation.planning.closed_loop import GoalPicture, Plan, Planner, Situation, judged
 from worldline_core.evaluation.planning.selectors import MeasuredSelector
 from worldline_core.evaluation.planning.solvers import SOLVERS
 from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
@@ -44,6 +46,7 @@ from worldline_core.recorder.rendering import TEST_SCENES, prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, Motion
 from worldline_core.recorder.things import Layout, sample_layout
+from worldline_core.training.video_teacher import VideoTeacher, load_teacher
 
 SHIPPED = Path("artifacts/shipped")
 SEED = 83
@@ -53,7 +56,8 @@ ATTEMPT_SECONDS = 3.5
 BODIES = ("viperx_graphite", "ur5e_silver", "xarm7_white", "viperx_pearl", "ur5e_slate", "xarm7_bronze")
 BLIND_RUNS = 4
 BLIND = ("random", "oracle", "closed_random", "closed_oracle")
-ARMS = (*BLIND, "open", *(f"closed_{solver}" for solver in SOLVERS))
+GOAL = ("open_goal", "closed_goal")
+ARMS = (*BLIND, "open", *(f"closed_{solver}" for solver in SOLVERS), *GOAL)
 
 
 class World:
@@ -182,10 +186,12 @@ class RememberingPlanner(Planner):
 class Start:
     """One start, and what the arms make of it."""
 
-    def __init__(self, spec: BankSpec, candidates: int, model: WorldLine, selector: MeasuredSelector) -> None:
-        self.spec, self.candidates, self.model, self.selector = spec, candidates, model, selector
+    def __init__(
+        self, spec: BankSpec, candidates: int, model: WorldLine, selector: MeasuredSelector, encoder: VideoTeacher
+    ) -> None:
+        self.spec, self.candidates, self.model, self.selector, self.encoder = spec, candidates, model, selector, encoder
         self.kinematics = ArmKinematics(load_embodiment(spec.embodiment))
-        self.remembered: dict[bytes, float] = {}
+        self.remembered: dict[bool, dict[bytes, float]] = {False: {}, True: {}}  # by whether the goal picture scores
 
     def drawn(self, recorder: EpisodeRecorder) -> World:
         """The first initial state that all of the first proposals can reach."""
@@ -204,6 +210,18 @@ class Start:
         """(N, 48, J), those of `open`."""
         situation = Situation({}, world.actions[-1], CHUNK * CHUNKS, 0)
         return Attempts(world)(situation, self.candidates, np.random.default_rng(SEED))
+
+    def goal(self, world: World) -> GoalPicture:
+        """The last head view of a demonstration that succeeds."""
+        random = np.random.default_rng((SEED, 1))
+        situation = Situation({}, world.actions[-1], CHUNK * CHUNKS, 0)
+        for _ in range(20):
+            shown = world.again()
+            shown.execute(Attempts(shown)(situation, 1, random)[0])
+            if shown.ended(shown.actions[:0]).outcome == "success":
+                frames, _ = shown.film(CHUNK * CHUNKS)
+                return GoalPicture(self.encoder, {"head": frames["head"][-1]})
+        raise ValueError(f"{self.spec.name}: none of 20 demonstrations succeeds")
 
     def run(self, arm: str, start: World) -> tuple[float, list[Plan]]:
         """Success (a mean where the arm is one of chance), and the plans of a planner."""
@@ -233,19 +251,21 @@ class Start:
     def planned(self, world: World, arm: str) -> tuple[float, list[Plan]]:
         """Success of a planner's choices, and its plans."""
         frames, cameras = world.film(0)
+        once, by_goal = arm in ("open", "open_goal"), arm in GOAL
         planner = RememberingPlanner(
-            self.remembered,
+            self.remembered[by_goal],
             world=self.model, cameras={view: cameras[view] for view in self.model.views},
             embodiment=self.kinematics, instruction=world.layout.instruction, propose=Attempts(world),
-            score=judged(self.selector), solver="best_of_n" if arm == "open" else arm.removeprefix("closed_"),
-            candidates=self.candidates if arm == "open" else self.candidates // 2, seed=SEED,
+            score=self.goal(world) if by_goal else judged(self.selector),
+            solver="best_of_n" if once or by_goal else arm.removeprefix("closed_"),
+            candidates=self.candidates if once else self.candidates // 2, seed=SEED,
         )  # fmt: skip
         plans: list[Plan] = []
         while world.frame < CHUNK * CHUNKS:
             seen = {view: frames[view] for view in self.model.views}
             left = CHUNKS - world.frame // CHUNK
             plans.append(planner.plan(seen, world.actions[-1], horizon=left))
-            world.execute(plans[-1].sequence if arm == "open" else plans[-1].controls)
+            world.execute(plans[-1].sequence if once else plans[-1].controls)
             if world.frame < CHUNK * CHUNKS:
                 frames, _ = world.film(world.frame - CHUNK + 1)
         return float(world.ended(world.actions[:0]).outcome == "success"), plans
@@ -261,7 +281,8 @@ def _successful(world: World, candidates: np.ndarray, random: np.random.Generato
 
 
 def table(attempts: list[dict]) -> dict:
-    """Success by arm and by task, differences to `open` on the starts of both; 95 % bootstrap intervals over starts."""
+    """Success by arm and by task, differences to choosing once by the same score on the starts of both; 95 % bootstrap intervals
+    over starts."""
     by_arm: dict[str, dict[str, float]] = {}
     for attempt in attempts:
         by_arm.setdefault(attempt["arm"], {})[attempt["start"]] = attempt["success"]
@@ -277,7 +298,7 @@ def table(attempts: list[dict]) -> dict:
         arm: {
             "model_calls": calls[arm],
             "success": shown(bootstrap_mean(list(by_arm[arm].values()))),
-            "minus_open": shown(paired_difference(by_arm[arm], by_arm.get("open", {}))),
+            "minus_open": shown(paired_difference(by_arm[arm], by_arm.get("open_goal" if arm in GOAL else "open", {}))),
             "by_task": {
                 task: round(float(np.mean([v for name, v in by_arm[arm].items() if tasks[name] == task])), 3)
                 for task in sorted({tasks[name] for name in by_arm[arm]})
@@ -313,12 +334,13 @@ def main() -> None:
     )
     model = WorldLine.from_pretrained(options.model)
     selector = MeasuredSelector(LearnedSegmenter.load(SHIPPED / "models" / "segmenter"))
+    encoder = load_teacher(SHIPPED / "models" / "teacher")
     for spec in grid.specs():
         missing = [arm for arm in options.arms if (spec.name, arm) not in done]
         if not missing:
             continue
         recorder = open_recorder(spec.embodiment)
-        start = Start(spec, options.open, model, selector)
+        start = Start(spec, options.open, model, selector, encoder)
         world = start.drawn(recorder)
         for arm in missing:
             success, plans = start.run(arm, world)
