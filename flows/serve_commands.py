@@ -37,7 +37,7 @@ def serve_command(arguments: argparse.Namespace) -> None:
     try:
         import msgpack  # noqa: F401
 
-        from worldline_core.serving.app import make_server, server_token
+        from worldline_core.serving.app import listening_socket, make_server, server_token
     except ImportError as error:
         raise UnavailableError(
             "The server needs packages that are not here", got=str(error), next_step="pip install 'worldline[serve]'"
@@ -49,14 +49,11 @@ def serve_command(arguments: argparse.Namespace) -> None:
     config = config.model_copy(
         update={name: project_path(project, getattr(config, name)) for name in ("model", "episodes")}
     )
+    listening = listening_socket(config)  # before the model is loaded: whether there is a port is known at once
     world = WorldLine.from_pretrained(config.model, device=config.device, bfloat16=config.bfloat16, steps=config.steps)
     server = make_server(world, config, token)
-    host = f"[{config.host}]" if ":" in config.host else config.host
-    print(f"{config.model} at ws://{host}:{config.port}/v1", flush=True)
+    host, port = f"[{config.host}]" if ":" in config.host else config.host, listening.getsockname()[1]
+    print(f"{config.model} at ws://{host}:{port}/v1", flush=True)
     hint = "" if token is None else "#token=..., with the token of WORLDLINE_TOKEN"
-    print(f"drive it by hand at http://{host}:{config.port}/play{hint}", flush=True)
-    server.run()
-    if not server.started:
-        raise UnavailableError(
-            "The server could not listen", where=f"{config.host}:{config.port}", next_step="--set port=..."
-        )
+    print(f"drive it by hand at http://{host}:{port}/play{hint}", flush=True)
+    server.run(sockets=[listening])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 
@@ -20,7 +21,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
@@ -165,6 +166,25 @@ def server_token(config: ServeConfig) -> str | None:
             next_step=f"{TOKEN_VARIABLE}={secrets.token_urlsafe(24)} worldline serve ..., or listen at 127.0.0.1",
         )  # fmt: skip
     return token
+
+
+def listening_socket(config: ServeConfig) -> socket.socket:
+    """Bound to the configured host and port; nobody is answered before a server runs on it.
+
+    Raises: UnavailableError when the port is taken, or the host is not this machine's.
+    """
+    try:
+        found = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
+        made = socket.socket(family, kind, protocol)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.bind(address)
+    except OSError as error:
+        raise UnavailableError(
+            "The server could not listen", where=f"{config.host}:{config.port}", got=error.strerror,
+            next_step="end the program that listens there, or take another port: --set port=... (0 takes a free one)",
+        ) from error  # fmt: skip
+    return made
 
 
 def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvicorn.Server:

@@ -39,7 +39,7 @@ function padButtons() {
   held = Boolean(pressed);
 }
 function choose(index) { arm = (index + started.arms.length) % started.arms.length; $("arm").value = arm; }
-function run(on) { running = Boolean(on && started); $("run").setAttribute("aria-pressed", running); $("run").textContent = running ? "Pause" : "Run"; }
+function run(on) { if (on && started && !running) say(""); running = Boolean(on && started); $("run").setAttribute("aria-pressed", running); $("run").textContent = running ? "Pause" : "Run"; }
 
 // One frame: show the next picture, and send what is wished for the next command.
 function frame() {

@@ -52,8 +52,9 @@ class RecordedStarts:
         }
 
     def listed(self) -> list[dict[str, str]]:
-        """``id``, ``embodiment``, ``task`` and ``instruction`` of each."""
+        """``id``, ``embodiment``, ``task`` and ``instruction`` of each; bodies and cameras that no model has seen come last."""
         rows = [self._episodes.rows[position] for position in self._positions.values()]
+        rows.sort(key=lambda row: row.split == "ood_test")
         return [
             {
                 "id": row.episode_id,

@@ -1,0 +1,39 @@
+"""What a server says before it serves."""
+
+from __future__ import annotations
+
+import argparse
+import socket
+from pathlib import Path
+
+import pytest
+
+from flows.serve_commands import serve_command
+from worldline_core import WorldLine
+from worldline_core.errors import UnavailableError
+from worldline_core.serving.app import listening_socket
+from worldline_core.serving.recorded_starts import RecordedStarts
+from worldline_core.serving.serve_config import ServeConfig
+
+
+def test_a_port_that_is_taken_is_told_before_the_model_is_loaded() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        asked = argparse.Namespace(config=None, overrides=[f"port={port}", "model=nowhere"])
+        with pytest.raises(UnavailableError, match=rf"(?s)could not listen.*127.0.0.1:{port}.*take another port"):
+            serve_command(asked)
+
+
+def test_a_free_port_is_known_before_the_server_runs() -> None:
+    with listening_socket(ServeConfig.model_validate({"port": 0, "host": "localhost"})) as bound:
+        host, port = bound.getsockname()[:2]
+        assert (host, port > 0) == ("127.0.0.1", True)
+        with pytest.raises(ConnectionRefusedError, match=r".+"):  # nobody waits for a server that is not there yet
+            socket.create_connection((host, port), timeout=5)
+
+
+def test_what_no_model_has_seen_is_listed_last(shipped: Path, small_world: WorldLine) -> None:
+    names = [row["id"] for row in RecordedStarts(shipped / "recordings", small_world).listed()]
+    unseen = ["ood_test" in name for name in names]
+    assert 0 < sum(unseen) < len(unseen)
+    assert unseen == sorted(unseen)
