@@ -72,12 +72,13 @@ class EpisodeStarts:
             else:
                 left_out[reason] += 1
         if len(robots) != 1:
+            recorded = ", ".join(sorted({row.embodiment for row in self._episodes.rows}))
             raise DataError(
                 "An environment is of one robot",
                 where=recordings,
                 expected=f"recordings of {embodiment or 'one embodiment'} in {', '.join(splits)} with {', '.join(views)}",
                 got=f"{', '.join(sorted(robots)) or 'none'}; left out: {dict(left_out)}",
-                next_step="name the embodiment, or give other recordings",
+                next_step=f"name an embodiment of the recordings ({recorded}), or give others",
             )
         self.embodiment = robots.pop()
         self._read = lru_cache(maxsize=64)(self._start)
