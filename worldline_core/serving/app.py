@@ -25,7 +25,7 @@ from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.pages.page import render
 from worldline_core.policies.array_messages import pack, unpack
 from worldline_core.rollout.worldline import WorldLine
-from worldline_core.serving.gate import Gate, patient_http
+from worldline_core.serving.gate import Gate, HeldBytes, bounded_websocket, patient_http
 from worldline_core.serving.play_session import PlaySession
 from worldline_core.serving.serve_config import TOKEN_VARIABLE, ServeConfig
 from worldline_core.serving.session_host import SessionHost, error_message
@@ -36,8 +36,8 @@ TAKE_S = 30.0
 _STATUS = {"BusyError": 503}
 
 
-def make_app(host: SessionHost, token: str | None) -> ASGIApp:
-    """The server as an ASGI application."""
+def make_app(host: SessionHost, token: str | None, held: HeldBytes) -> ASGIApp:
+    """The server as an ASGI application; what its requests hold is counted in `held`."""
     config, connections = host.config, set[int]()
     over_http = object()  # owns the sessions that were started over HTTP
 
@@ -50,8 +50,17 @@ def make_app(host: SessionHost, token: str | None) -> ASGIApp:
     async def request(http: Request) -> Response:
         body = bytearray()
         try:
+            return await answered(http, body)
+        finally:
+            held.free(len(body))
+
+    async def answered(http: Request, body: bytearray) -> Response:
+        try:
             async with asyncio.timeout(TAKE_S):
                 async for part in http.stream():
+                    if not held.take(len(body), len(part)):
+                        late = "too much is being received, try again later\n"
+                        return PlainTextResponse(late, 503, {"connection": "close", "retry-after": "1"})
                     body += part
                     if len(body) > config.max_message_bytes:
                         return PlainTextResponse("the request is too large\n", 413, {"connection": "close"})
@@ -189,11 +198,11 @@ def listening_socket(config: ServeConfig) -> socket.socket:
 
 def make_server(world: WorldLine, config: ServeConfig, token: str | None) -> uvicorn.Server:
     """A server that ``run()`` starts; its limits and timeouts are those of the configuration."""
-    host = SessionHost(world, config)
+    host, held = SessionHost(world, config), HeldBytes(config.max_held_bytes)
     host.warm_up()
     settings = uvicorn.Config(
-        make_app(host, token), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S),
-        ws="websockets-sansio", ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
+        make_app(host, token, held), config.host, config.port, http=patient_http(2 * config.max_connections, TAKE_S),
+        ws=bounded_websocket(held), ws_max_size=config.max_message_bytes, ws_per_message_deflate=False, ws_ping_interval=10.0, ws_ping_timeout=20.0,
         timeout_keep_alive=30, timeout_graceful_shutdown=3, access_log=False, log_level="warning", server_header=False,
     )  # fmt: skip
     return uvicorn.Server(settings)

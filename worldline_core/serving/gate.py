@@ -1,4 +1,5 @@
-"""Who may reach the server: checks of host, origin and token before anything else is done with a request."""
+"""Who may reach the server, and with how much: checks of host, origin and token before anything else is done with a request,
+and bounds on connections and on what they hold."""
 
 from __future__ import annotations
 
@@ -10,14 +11,38 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from worldline_core.serving.serve_config import ServeConfig, is_loopback
 
 if TYPE_CHECKING:
     from asyncio import Transport
 
+    from uvicorn._types import ASGIReceiveEvent
+
 OPEN_PATHS = ("/healthz", "/play")
 """Need no token: they say nothing of sessions. The page connects with the token that its own address carries."""
+
+SMALL_BYTES = 1 << 16
+"""A request of so many bytes, as those of a step are, is taken whatever the others hold."""
+
+
+class HeldBytes:
+    """What all requests that are being received or answered hold together, at most `most` bytes and what small ones hold."""
+
+    def __init__(self, most: int) -> None:
+        self.most, self.held = most, 0
+
+    def take(self, before: int, size: int) -> bool:
+        """Whether a request that holds so many bytes already may hold so many more; if so they are counted."""
+        if self.held + size > self.most and before + size > SMALL_BYTES:
+            return False
+        self.held += size
+        return True
+
+    def free(self, size: int) -> None:
+        """A request is answered, or given up."""
+        self.held -= size
 
 
 class Gate:
@@ -90,3 +115,38 @@ def patient_http(most: int, patience_s: float) -> type[H11Protocol]:
                 self.loop.call_later(patience_s, self._give_up, self.cycle)
 
     return PatientHttp
+
+
+def bounded_websocket(held: HeldBytes) -> type[WebSocketsSansIOProtocol]:
+    """Uvicorn's websocket protocol; a connection whose message is more than all may hold together is closed (1013)."""
+
+    class BoundedWebSocket(WebSocketsSansIOProtocol):
+        _coming = _given = 0
+        """Bytes of the message that arrives, and of the one that the application has not answered yet."""
+
+        def data_received(self, data: bytes) -> None:
+            if held.take(self._coming + self._given, len(data)):
+                self._coming += len(data)
+                super().data_received(data)
+            elif not self.close_sent:
+                self.conn.fail(1013, "too much is being received, try again later")
+                self.handle_parser_exception()
+
+        async def receive(self) -> ASGIReceiveEvent:
+            self._free_given()
+            event = await super().receive()
+            # Nothing more is read until the application asks again, so all that came belongs to this message.
+            self._given, self._coming = self._given + self._coming, 0
+            return event
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            held.free(self._coming)
+            self._coming = 0
+            self._free_given()
+            super().connection_lost(exc)
+
+        def _free_given(self) -> None:
+            held.free(self._given)
+            self._given = 0
+
+    return BoundedWebSocket

@@ -47,6 +47,7 @@ class ServeConfig(StrictModel):
         origins: pages of other servers that may connect (http://host:port).
         max_sessions, max_clips: at a time, those of the page included; clips of all sessions together.
         max_message_bytes: of one request or reply.
+        max_held_bytes: of all requests together that are being received or answered; one of up to 64 KiB always may.
         max_waiting: requests that wait for the worker; beyond it they are refused as busy.
         idle_s: sessions that nobody uses for so long are closed.
         max_blocks: blocks that one session of the page keeps for rewinding and saving.
@@ -65,6 +66,7 @@ class ServeConfig(StrictModel):
     max_sessions: int = Field(64, ge=1)
     max_clips: int = Field(256, ge=1)
     max_message_bytes: int = Field(64 << 20, ge=1 << 16)
+    max_held_bytes: int = Field(256 << 20, ge=1 << 16)
     max_waiting: int = Field(64, ge=1)
     idle_s: float = Field(300.0, gt=0)
     max_blocks: int = Field(300, ge=1)
