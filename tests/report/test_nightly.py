@@ -206,3 +206,24 @@ def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifact
     assert "Night 1 &lt;script&gt;" in pages["index.html"]
     assert "&lt;b onmouseover=alert(1)&gt;/robot_iou@head" in pages["index.html"]
     assert "&lt;script&gt;alert(" in pages["planning.html"]
+
+
+@pytest.mark.parametrize(
+    ("step", "summary"),
+    [
+        ("evaluate_video", {"metrics": ["test"]}),
+        ("evaluate_video", {"metrics": {"test": {"shipped": "0.5"}}}),
+        ("evaluate_video", {"metrics": {"test": {"shipped": {"psnr": {"mean": 10**400, "low": 0, "high": 0}}}}}),
+        (
+            "evaluate_video",
+            {"metrics": {"test": {"shipped": {"psnr": {"mean": 1, "low": 0, "high": 2, "count": "x"}}}}},
+        ),
+        ("evaluate_policy", {"methods": {"shipped": {"test": 0.5}}}),
+        ("evaluate_planning", {"methods": {"shipped": {"budgets": [1, 2]}}}),
+    ],
+)
+def test_a_summary_of_another_form_is_named(tmp_path: Path, step: str, summary: dict) -> None:
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(ArtifactError, match=r"(?s)summary of an evaluation has another form.*summary\.json.*verify"):
+        record_night(tmp_path / "history", "2026-11-20", {step: tmp_path})
+    assert not read_history(tmp_path / "history")

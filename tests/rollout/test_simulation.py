@@ -281,6 +281,15 @@ def test_misuse_is_refused_and_changes_nothing(causal: WorldLine, starts: list[S
         start.begin(causal, seed=[1, 2])
     with pytest.raises(DataError, match="wrong length for this embodiment"):
         start.begin(causal, state=np.zeros(7))
+    arms = load_embodiment(ROBOT)
+    for column, value, message in (
+        (0, 45.0, r"(?s)beyond its limit.*state at the start.*left/.*got: 45 rad"),  # degrees
+        (arms.gripper_column(arms.arms[1]), 80.0, r"(?s)gripper is far beyond.*clip 0, arm right.*opening of 80"),
+    ):
+        state = start.controls[0].astype(np.float64)
+        state[column] = value
+        with pytest.raises(DataError, match=message):
+            start.begin(causal, state=state)
     small = replace(start, images={view: image[:32] for view, image in start.images.items()})
     with pytest.raises(DataError, match="same views at one size"):
         causal.start([start.images, small.images], start.cameras, embodiment=ROBOT, state=start.controls[0])

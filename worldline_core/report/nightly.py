@@ -22,7 +22,7 @@ from markupsafe import Markup
 from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.paired import EVALUATIONS, read_scores, read_series, write_series
 from worldline_core.evaluation.paired import Series as ScoreSeries
-from worldline_core.evaluation.scores import SCORES_FILE, Interval
+from worldline_core.evaluation.scores import SCORES_FILE, SUMMARY_FILE, Interval
 from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, interval, render, words
 from worldline_core.report.context import ReportConfig, ReportContext, Section
@@ -215,18 +215,30 @@ def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
 
     Watched are whole splits and every number of candidates; embodiments and families apart would make a false alarm
     likely on any night. What has no finite mean and bounds is left out.
+
+    Raises: ArtifactError when a summary has another form than its evaluation writes.
     """
     found: dict[str, Interval] = {}
     for name, folder in sorted(inputs.items()):
         step, _, variant = name.partition(".")
-        summary = read_json(folder / "summary.json") if step in EVALUATIONS else {}
+        path = folder / SUMMARY_FILE
+        summary = read_json(path) if step in EVALUATIONS else {}
         what = ".".join(part for part in (step.removeprefix("evaluate_"), variant) if part)
-        for where, method, metric, value in intervals(step, summary):
-            numbers = [value.get(key) for key in ("mean", "low", "high")] if isinstance(value, dict) else []
-            finite = [float(n) for n in numbers if isinstance(n, (int, float)) and math.isfinite(n)]
-            if len(finite) == 3:
-                mean, low, high = finite
-                found[f"{what}/{where}/{method}/{metric}"] = Interval(mean, low, high, int(value.get("count", 0)))
+        try:
+            for where, method, metric, value in intervals(step, summary):
+                numbers = [value.get(key) for key in ("mean", "low", "high")] if isinstance(value, dict) else []
+                finite = [float(n) for n in numbers if isinstance(n, (int, float)) and math.isfinite(n)]
+                if len(finite) == 3:
+                    mean, low, high = finite
+                    found[f"{what}/{where}/{method}/{metric}"] = Interval(mean, low, high, int(value.get("count", 0)))
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise ArtifactError(
+                "A summary of an evaluation has another form",
+                where=path,
+                expected="by group or method the mean, low, high and count of each metric",
+                got=str(error),
+                next_step=f"worldline verify {folder} --set-aside, then the same command writes it again",
+            ) from error
     return found
 
 

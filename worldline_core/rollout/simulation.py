@@ -32,6 +32,9 @@ from worldline_core.rollout.observation import Camera, image_size, project_contr
 from worldline_core.rollout.robot import CommandedRobot, Response
 from worldline_core.rollout.session import Frames, Session
 
+START_TOLERANCE_RAD, START_OPENING_RANGES = 0.5, 1.5
+"""A recorded start may lie a little beyond the limits; one that is further out, or a gripper that is further than one range
+outside of its own, is in another unit or of another robot."""
 USUAL_CLIP_FRAMES = 33
 """Of a Stage II model that is stepped, where ``clip_frames`` does not say how long its clips are: as in the paper."""
 
@@ -44,7 +47,8 @@ class Starts:
         state: ``(j)`` or ``(b, j)``, the controls that belong to the images.
 
     Raises:
-        DataError: the starts do not fit together, a shape is wrong, a view or a camera is missing, or a number is not finite.
+        DataError: the starts do not fit together, a shape is wrong, a view or a camera is missing, a number is not finite,
+            or the state is far beyond the robot's limits.
         ConfigError: there is no such embodiment.
     """
 
@@ -69,7 +73,17 @@ class Starts:
             raise DataError(
                 "The starts of a simulation do not fit together", expected="one of each per clip", got=given
             )
-        self.kinematics.embodiment.check_state(self.state, "the state at the start")
+        self.kinematics.embodiment.check_limits(self.state, "the state at the start", START_TOLERANCE_RAD)
+        opening = self.kinematics.gripper(self.state).numpy()
+        if (beyond := (np.abs(opening - 0.5) > START_OPENING_RANGES)).any():
+            row, arm = np.argwhere(beyond)[0]
+            raise DataError(
+                "A gripper is far beyond its range",
+                where=f"the state at the start, clip {row}, arm {self.kinematics.embodiment.arms[arm].name}",
+                expected="0 (closed) to 1 (open), in the units of the embodiment's file",
+                got=f"an opening of {opening[row, arm]:g}",
+                next_step="check the gripper's units and its column",
+            )
         sizes = {image_size(*pair) for pair in zip(self.images, self.cameras, strict=True)}
         if len(sizes) > 1 or len({frozenset(start) for start in self.images}) > 1:
             raise DataError(
