@@ -38,6 +38,8 @@ def test_a_source_that_finds_nothing_says_what_it_looked_for(tmp_path: Path) -> 
     said = r"(?s)holds no episode.*source good, .*/good.*annotation/<split>/<id>\.json.*got: one\.mp4 \(1 \.mp4\).*kind"
     with pytest.raises(DataError, match=said):
         run(tmp_path, {**good, "kind": "droid_annotation"})
+    with pytest.raises(DataError, match=r"(?s)holds no episode.*expected: meta/info\.json.*collection.*got: one\.mp4"):
+        run(tmp_path, {**good, "kind": "lerobot_v21", **KINDS["lerobot_v3"]})
     with pytest.raises(DataError, match=r"(?s)None of.*is wanted.*include: two\*.*1 episodes: good-one"):
         run(tmp_path, {**good, "include": ["two*"]})
 
@@ -47,6 +49,8 @@ KINDS = {
     "agibot_world": {},
     "droid_annotation": {},
     "enerverse_ac": {"fps": 30},
+    "episode_set": {},
+    "lerobot_v3": {"embodiment": "none", "angle_unit": "rad", "views": {"top": "head"}},
     "lerobot_v21": {"embodiment": "none", "angle_unit": "rad", "views": {"top": "head"}, "collection": True},
     "mcap": {},
     "robomind": {"layout": "h5_franka_3rgb", "fps": 30, "gripper_state": {"closed": 1, "open": 0}},

@@ -64,6 +64,27 @@ _READERS: dict[type, Callable[[Any, AnyPath], EpisodeSource]] = {
 }
 
 
+class _NoDataset:
+    """A folder without the file that a data set of its kind begins with: it lists nothing."""
+
+    def __init__(self, looked_for: str) -> None:
+        self.looked_for = looked_for
+
+    def episode_ids(self) -> list[str]:
+        return []
+
+    def load(self, episode_id: str) -> LoadedEpisode:
+        raise DataError("Source holds no episode", where=episode_id, expected=self.looked_for)
+
+
+def _reader(config: SourceConfig, root: AnyPath) -> EpisodeSource:
+    if isinstance(config, EpisodeSetSourceConfig) and not exists(root / "index.parquet"):
+        return _NoDataset("index.parquet, which an EpisodeSet begins with")
+    if isinstance(config, LeRobotSourceConfig) and not config.collection and not exists(root / "meta" / "info.json"):
+        return _NoDataset("meta/info.json, which a LeRobotDataset begins with (a folder of several: collection: true)")
+    return _READERS[type(config)](config, root)
+
+
 def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """The reader of a configured source. Its episodes keep the contract's conventions, whatever the configuration declares
     as departing from them, and are those of pinhole cameras.
@@ -72,7 +93,7 @@ def open_source(config: SourceConfig, root: AnyPath) -> EpisodeSource:
     """
     if not exists(root):
         raise DataError("Source folder is missing", where=str(root), next_step="check curate.sources[].path")
-    return _RepairedSource(_READERS[type(config)](config, root), config)
+    return _RepairedSource(_reader(config, root), config)
 
 
 def nothing_found(config: SourceConfig, source: EpisodeSource, root: AnyPath) -> DataError:
