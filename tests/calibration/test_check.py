@@ -246,6 +246,20 @@ def test_the_table_shows_the_worst_of_each_measure() -> None:
     assert "  b:\n    line one\n    line two" in text
 
 
+def test_an_episode_that_cannot_be_read_takes_one_line_and_notes_are_printed() -> None:
+    check = made_up()
+    gone = Finding(
+        "d", "s", None, "missing_file", "2 things are wrong; got \n    file is missing\n" + 40 * "      where: /x "
+    )
+    noted = replace(check.findings[0], notes=("without kinematics of x: set Y",))
+    text = table_text(replace(check, findings=(noted, *check.findings[1:], gone)))
+    row = next(line for line in text.splitlines() if line.startswith("d "))
+    assert "missing_file: 2 things are wrong; got file is missing where: /x" in row
+    assert row.endswith(" ...")
+    assert len(row) < 250
+    assert text.count("note: without kinematics of x: set Y") == 1
+
+
 @pytest.mark.parametrize(("agreeing", "cautious"), [(1, True), (4, True), (5, False), (10, False)])
 def test_a_minority_does_not_change_a_source_unnoticed(agreeing: int, cautious: bool) -> None:
     best = explained(RecordedConventions(camera_axes="opengl"))

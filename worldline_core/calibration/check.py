@@ -254,7 +254,8 @@ def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmK
     try:
         built = kinematics.get(episode.embodiment)
     except (ConfigError, DataError, UnavailableError) as error:
-        return None, f"without kinematics of {episode.embodiment}: {error.what}"
+        how = f" ({error.next_step})" if error.next_step else ""
+        return None, f"without kinematics of {episode.embodiment}: {error.what}{how}"
     if episode.T_base_ee is None or episode.T_base_ee.shape[1] == len(built.embodiment.arms):
         return built, ""
     return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"

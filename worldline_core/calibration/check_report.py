@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
@@ -29,6 +30,8 @@ TONES = {
     "consistent": "good",
 }
 MEASURES = ("hand-eye", "camera lag", "image lag", "in view", "flow")
+DETAIL_LETTERS = 160
+"""Of what is wrong with an episode, in its line of the table; the page and diagnoses.json have all of it."""
 _READINGS_SHOWN, _GROUPS_SHOWN = 6, 12
 
 
@@ -73,7 +76,7 @@ def table_text(check: CalibrationCheck) -> str:
         cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
         if finding is not None and finding.diagnosis is None:
             # The reason of an episode that cannot be read takes the place of all that was not measured.
-            cells[2:] = [f"{finding.reason}: {finding.detail}"]
+            cells[2:] = [textwrap.shorten(f"{finding.reason}: {finding.detail}", DETAIL_LETTERS, placeholder=" ...")]
         lines.append("  ".join(cells).rstrip())
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join([*lines, "", *conclusion_lines(check)])
@@ -104,7 +107,8 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
         lines += [f"  {caution}" for caution in cautions(found)]
         lines += [f"  {off_text(residual)}" for residual in found.off]
         lines += [f"  {line}" for line in bounds_lines(found.residuals)]
-        lines += [f"  note: {note}" for note in found.notes]
+        own = [note for finding in check.findings if finding.source == found.source for note in finding.notes]
+        lines += [f"  note: {note}" for note in dict.fromkeys((*found.notes, *own))]
         lines += [f"  near: {near}" for near in found.nearest]
         if found.config_lines:
             lines += ["  what repairs it, in the configuration of this source:"]
@@ -123,7 +127,7 @@ def _single_episodes(check: CalibrationCheck) -> list[str]:
             continue
         if found is not None and found.verdict == diagnosis.verdict and found.config_lines == finding.config_lines:
             continue
-        notes = (*diagnosis.notes, *finding.notes) if found is None else finding.notes
+        notes = (*diagnosis.notes, *finding.notes) if found is None else ()  # else printed with the source
         said = [f"note: {note}" for note in notes] + [f"near: {near}" for near in diagnosis.nearest]
         groups.setdefault((*said, *finding.config_lines), []).append(finding.episode_id)
     lines = ["", "single episodes (give those that differ a source of their own, by `include`):"] if groups else []

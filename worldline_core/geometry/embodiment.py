@@ -282,7 +282,10 @@ def how_to_get(embodiment: Embodiment) -> str:
     description = embodiment.description
     steps = [description.how_to_get or "restore the file beside the embodiment's YAML"]
     if description.package is None:
-        steps.append(f"then set {description_variable(embodiment.name)}=/path/to/it or pass description_path")
+        name, variable = embodiment.name, description_variable(embodiment.name)
+        steps.append(
+            f"then set {variable}=/path/to/it, or render_actions.description_paths.{name} in the configuration"
+        )
     return "; ".join(steps)
 
 
