@@ -18,7 +18,7 @@ from prefect import Flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
 from tasks.artifact_task import ArtifactReference
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import UnavailableError, WorldLineError
 from worldline_core.report.nightly import collect_metrics
 
 logger = logging.getLogger(__name__)
@@ -36,6 +36,8 @@ def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
         done.append(flow.fn(*values, **named))
         return done[0]
 
+    for name in ("prefect.flow_runs", "prefect.task_runs"):
+        logging.getLogger(name).addFilter(is_worth_saying)
     observed = flow.with_options()
     observed.fn = body
     try:
@@ -47,6 +49,14 @@ def run_flow[R](flow: Flow[..., R], *arguments: Any) -> R:
             ) from error
         logger.warning("The run is finished; Prefect's server ended before it could be told: %s", error)
         return done[0]
+
+
+def is_worth_saying(record: logging.LogRecord) -> bool:
+    """Whether a record of Prefect's says more than the command itself: not that a run was stopped. Of an error whose message
+    says what is wrong and what to do, where in the code it arose is taken out."""
+    if record.exc_info and isinstance(record.exc_info[1], WorldLineError):
+        record.exc_info = None
+    return "aborted by a termination signal" not in record.getMessage()
 
 
 def report_pictures(report: Path) -> list[Path]:

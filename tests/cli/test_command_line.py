@@ -78,6 +78,23 @@ for command in ("pipeline", "nightly"):
     assert "Traceback" not in result.stderr
 
 
+def test_a_missing_recording_is_named_before_prefect_starts(project_root: Path) -> None:
+    code = """
+import sys
+sys.modules.update(dict.fromkeys(["prefect", "torch"]))
+from flows.command_line import main
+for command in ("pipeline", "nightly"):
+    try:
+        main([command, "--set", "curate.sources=[{kind: episode_set, path: nowhere}]"])
+    except SystemExit as ended:
+        print(command, ended.code)
+"""
+    result = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True, check=False)
+    assert result.stdout.split() == ["pipeline", "1", "nightly", "1"], result.stderr
+    assert result.stderr.count("got: curate.sources[0].path: nowhere") == 2
+    assert "Traceback" not in result.stderr
+
+
 def test_missing_upstream_names_the_step_to_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["task", "filter", "--preset", "tiny", "--artifacts", str(tmp_path)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from tasks.artifact_task import ArtifactReference
-from tasks.prefect_artifacts import show_in_prefect
+from tasks.prefect_artifacts import is_worth_saying, show_in_prefect
 from tasks.run_nodes import by_urgency, run_nodes
 from tasks.run_page import RunPage
 from worldline_core.config import StrictModel, load_config
@@ -240,6 +241,17 @@ def test_nodes_side_by_side_write_each_line_once_and_say_whose_it_is(
         f"count.more: counting: {n} of 4" for n in (1, 2, 3, 4)
     ]
     assert sorted(shown) == sorted(expected)
+
+
+@pytest.mark.parametrize(("error", "shown"), [(DataError("x"), False), (KeyError("x"), True)])
+def test_an_error_that_says_what_to_do_is_logged_without_a_traceback(error: Exception, *, shown: bool) -> None:
+    record = logging.LogRecord(
+        "prefect.flow_runs", logging.ERROR, "", 0, "failed: %r", (error,), (type(error), error, None)
+    )
+    assert is_worth_saying(record)
+    assert (record.exc_info is not None) == shown
+    record.msg, record.args = "Crash detected! Execution was aborted by a termination signal.", None
+    assert not is_worth_saying(record)
 
 
 def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:

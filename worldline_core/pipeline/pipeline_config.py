@@ -157,6 +157,26 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
         )
 
 
+def check_recordings(config: PipelineConfig, project: Path) -> None:
+    """Refuse a run whose recordings are not there, before anything is started.
+
+    Raises: UnavailableError when the folder of a source is missing; the message lists all of them.
+    """
+    missing = [
+        f"{section}.sources[{number}].path: {source.path}"
+        for section, curate in (("curate", config.curate), ("curate_banks", config.curate_banks))
+        for number, source in enumerate(() if curate is None else curate.sources)
+        if not is_remote(source.path) and not project_path(project, source.path).exists()
+    ]
+    if missing:
+        raise UnavailableError(
+            "Recordings that this run reads are not here",
+            where=project,
+            got="; ".join(missing),
+            next_step="correct the paths, or fetch or record what belongs there (the comments of a configuration say how)",
+        )
+
+
 def source_inputs(config: StrictModel, project: Path) -> dict[str, Path]:
     """``source.<n>`` -> folder or location in an object store, in the order of the configuration. Relative folders are
     taken from ``project``."""
