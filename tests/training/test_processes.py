@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from safetensors.torch import load_file
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
+from worldline_core.training.train_teacher import train_teacher
+from worldline_core.training.training_config import TeacherConfig
 
 
 def free_port() -> int:
@@ -28,8 +29,14 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def run_processes(project: Path, folder: Path, runs: list[dict[str, Any]], count: int = 2) -> list[int]:
-    """Run requests on processes that find each other as torchrun's do; their exit codes."""
+def run_processes(
+    project: Path, folder: Path, runs: list[dict[str, Any]], count: int = 2, *, alone_at_most: float = 200
+) -> list[int]:
+    """Run requests on processes that find each other as torchrun's do; their exit codes.
+
+    Args:
+        alone_at_most: seconds that the others may go on after the last one.
+    """
     request = folder / f"request-{len(list(folder.glob('request-*')))}.json"
     request.write_text(json.dumps(runs, default=str))
     shared = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),
@@ -45,7 +52,7 @@ def run_processes(project: Path, folder: Path, runs: list[dict[str, Any]], count
         last = processes[-1].wait(timeout=400)
         try:
             # Where one process is gone, the others must end by themselves.
-            return [process.wait(timeout=200) for process in processes[:-1]] + [last]
+            return [process.wait(timeout=alone_at_most) for process in processes[:-1]] + [last]
         finally:
             for process in processes:
                 process.kill()
@@ -86,17 +93,23 @@ def inputs(world: Any, tiny_model: dict[str, Any], tmp_path_factory: pytest.Temp
     model.initialise(torch.Generator().manual_seed(0))
     folder = tmp_path_factory.mktemp("base")
     save_checkpoint(folder, model, kind="base", action_contract=None)
-    return {**world.inputs, "stage1": folder}
+    shape = {"image_size": [32, 32], "patch": 8, "hidden_size": 16, "num_layers": 4, "num_heads": 2}
+    values = {"shape": shape, "trainer": trainer(2, 2), "clip_frames": 9, "held_out_episodes": 1}
+    teacher = tmp_path_factory.mktemp("teacher")
+    train_teacher(TeacherConfig.model_validate(values), {"episodes": world.episodes}, teacher)
+    return {**world.inputs, "stage1": folder, "teacher": teacher}
 
 
-def stage2(output: Path, inputs: dict[str, Path], name: str, *, steps: int = 20, **changes: Any) -> dict[str, Any]:
+def stage2(
+    output: Path, inputs: dict[str, Path], name: str, *, steps: int = 20, relational: Any = None, **changes: Any
+) -> dict[str, Any]:
     """A run of Stage II, four clips a step whatever the number of processes."""
     run = {key: changes.pop(key) for key in ("kill_before",) if key in changes}
     config = {
         "trainer": trainer(steps, **{"batch_size": 2, "global_batch": 4, **changes}),
         "clips": {"lengths": [9, 17], "view_weights": {"joint": 1.0, "head": 1.0}},
         "action_multiplier": 3.0,
-        "relational": None,
+        "relational": relational,
     }
     return {"step": "train_stage2", "config": config, "inputs": inputs, "output": output / name, **run}
 
@@ -119,7 +132,6 @@ class Runs:
     folder: Path
     log: str
     codes: list[int]
-    seconds: float
 
     def __truediv__(self, name: str) -> Path:
         return self.folder / name
@@ -136,19 +148,23 @@ def runs(
     for path in (one, two, four):
         path.mkdir()
     # One process: whole runs, and one that is stopped half-way.
-    alone = [stage1(one, world, tiny_model, "text"), stage2(one, inputs, "plain")]
+    terms = {"ramp_steps": 2}
+    alone = [
+        stage1(one, world, tiny_model, "text"),
+        stage2(one, inputs, "plain"),
+        stage2(one, inputs, "terms", relational=terms),
+    ]
     assert run_processes(project_root, one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
     assert run_processes(project_root, one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
     # Two processes: the same, with blocks computed again; the last run loses its second process.
     shared = [
         stage1(two, world, tiny_model, "text"),
         stage2(two, inputs, "plain"),
+        stage2(two, inputs, "terms", relational=terms),
         stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
         stage2(two, inputs, "killed", kill_before=11),
     ]
-    begun = time.monotonic()
-    codes = run_processes(project_root, two, shared)
-    seconds = time.monotonic() - begun
+    codes = run_processes(project_root, two, shared, alone_at_most=60)
     # Two go on from one, one goes on from two, two from two.
     shutil.copytree(one / "half", two / "half")
     shutil.copytree(two / "killed", one / "killed")
@@ -161,7 +177,7 @@ def runs(
     assert run_processes(project_root, four, [copies], count=4) == [0] * 4, (four / "log").read_text()[-3000:]
     single = stage2(four, inputs, "single", batch_size=1)
     assert run_processes(project_root, four, [single], count=1) == [0]
-    return Runs(folder, log, codes, seconds)
+    return Runs(folder, log, codes)
 
 
 @pytest.mark.slow
@@ -170,12 +186,21 @@ def runs(
     [
         ("one/plain", "two/plain"),
         ("one/text", "two/text"),
+        ("one/terms", "two/terms"),
         ("one/plain", "two/again"),
         ("one/plain", "one/killed"),
         ("one/plain", "two/half"),
         ("four/single", "four/plain"),
     ],
-    ids=["two", "two, text", "two, blocks again", "two, then one", "one, then two", "two copies of two parts"],
+    ids=[
+        "two",
+        "two, text",
+        "two, relational terms",
+        "two, blocks again",
+        "two, then one",
+        "one, then two",
+        "two copies of two parts",
+    ],
 )
 def test_another_number_of_processes_learns_the_same(runs: Runs, first: str, second: str) -> None:
     assert losses(runs / second) == pytest.approx(losses(runs / first), rel=1e-6)

@@ -73,13 +73,28 @@ def test_both_sides_are_pooled_to_the_coarser_grid_and_at_most_eight_bins() -> N
 
 def test_scales_hold_the_weighted_terms_at_their_share_within_caps_and_ramp() -> None:
     scales = RelationalScales(RelationalConfig(ramp_steps=250, ema_decay=0.9))
+    assert scales.at(0) == (0.0, 0.0)  # no ratio is known yet
     for step in range(300):
-        intra, cross = scales.update(1.0, 0.5, 0.25, step)
+        intra, cross = scales.at(step)
+        scales.update(1.0, 0.5, 0.25)
         if step == 124:
             assert intra == pytest.approx(0.5 * 0.03 / 0.5)
     assert intra * 0.5 == pytest.approx(0.03)
     assert cross * 0.25 == pytest.approx(0.005)
-    assert RelationalScales(RelationalConfig(ramp_steps=0)).update(1.0, 1e-3, 1e-3, 0) == (0.20, 0.10)
     resumed = RelationalScales(scales.config)
     resumed.ratios = dict(scales.ratios)
-    assert resumed.update(2.0, 0.5, 0.25, 300) == scales.update(2.0, 0.5, 0.25, 300)
+    for one in (scales, resumed):
+        one.update(2.0, 0.5, 0.25)
+    assert resumed.at(300) == scales.at(300)
+    capped = RelationalScales(RelationalConfig(ramp_steps=0))
+    capped.update(1.0, 1e-3, 1e-3)
+    assert capped.at(1) == (0.20, 0.10)
+
+
+def test_a_step_on_one_view_leaves_the_scale_of_pairs_of_views() -> None:
+    scales = RelationalScales(RelationalConfig(ramp_steps=0))
+    scales.update(1.0, 0.5, 0.25)
+    intra, cross = scales.at(1)
+    scales.update(2.0, 0.5, 0.0)
+    assert scales.at(2)[0] > intra
+    assert scales.at(2)[1] == cross

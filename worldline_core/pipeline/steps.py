@@ -219,7 +219,7 @@ _STEPS = (
     ),
     Step(
         "train_stage2",
-        1,
+        2,
         "worldline_core.training.stage2",
         "train_stage2",
         "training.training_config.Stage2Config",

@@ -9,6 +9,7 @@ The flow-matching objective of Stage I and Stage II, with the relational terms w
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -159,6 +160,12 @@ class FlowMatchingObjective:
 
     def _text(self, batch: Batch) -> TextContext | None:
         return None if batch.text_ids is None else self.model.encode_text(batch.text_ids, batch.text_mask)
+
+    def end_step(self, values: Mapping[str, float]) -> None:
+        """Let the loss scales follow."""
+        if self.relational is not None:
+            means = (values[name] for name in ("flow_matching", "relational_intra", "relational_cross"))
+            self.relational.scales.update(*means)
 
     def state(self) -> dict[str, Any]:
         """Running loss scales."""

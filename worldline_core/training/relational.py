@@ -22,7 +22,6 @@ from torch.nn import functional
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.processes import average_values
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import VideoTeacher
 
@@ -92,6 +91,9 @@ def relational_losses(
 class RelationalScales:
     """Loss scales that follow moving averages of L_FM / L_rel, so that each weighted term is a fixed part of L_FM.
 
+    A step's scales come from the steps before it, so all its micro-steps have the same ones, on however many processes; the
+    first step, which knows no ratio yet, measures alone.
+
     ``ratios``: the averages so far, which are part of the training state.
     """
 
@@ -99,20 +101,24 @@ class RelationalScales:
         self.config = config
         self.ratios: dict[str, float] = {}
 
-    def update(self, flow: float, intra: float, cross: float, step: int) -> tuple[float, float]:
-        """Scales (intra, cross) at ``step``, after taking in this step's losses."""
+    def at(self, step: int) -> tuple[float, float]:
+        """Scales (intra, cross) of this step."""
         ramp = min(1.0, (step + 1) / self.config.ramp_steps) if self.config.ramp_steps else 1.0
-        terms = (
-            ("intra", intra, self.config.intra_ratio, self.config.intra_cap),
-            ("cross", cross, self.config.cross_ratio, self.config.cross_cap),
+        intra, cross = (self.ratios.get(name, 0.0) for name in ("intra", "cross"))
+        config = self.config
+        return (
+            ramp * min(config.intra_cap, config.intra_ratio * intra),
+            ramp * min(config.cross_cap, config.cross_ratio * cross),
         )
-        scales: list[float] = []
-        for name, value, target, cap in terms:
+
+    def update(self, flow: float, intra: float, cross: float) -> None:
+        """Take in a step's mean losses; a term that is zero was not there (clips of one view have no pairs of views)."""
+        for name, value in (("intra", intra), ("cross", cross)):
+            if value == 0:
+                continue
             ratio = flow / max(value, 1e-6)
             before = self.ratios.get(name, ratio)
             self.ratios[name] = self.config.ema_decay * before + (1 - self.config.ema_decay) * ratio
-            scales.append(ramp * min(cap, target * self.ratios[name]))
-        return scales[0], scales[1]
 
 
 class TeacherRelations:
@@ -199,9 +205,7 @@ class RelationalTerm:
             features: the student's; taught: of the same clips.
         """
         intra, cross = relational_losses(pool_features(features, taught.shape), taught, step)
-        # Over all processes, so that their scales stay equal and one saved state is everyone's.
-        seen = average_values({"flow": flow.item(), "intra": intra.item(), "cross": cross.item()})
-        scale_intra, scale_cross = self.scales.update(seen["flow"], seen["intra"], seen["cross"], step)
+        scale_intra, scale_cross = self.scales.at(step)
         values = {
             "relational_intra": intra.item(),
             "relational_cross": cross.item(),

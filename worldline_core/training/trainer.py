@@ -53,11 +53,15 @@ class NamedBatch(Protocol):
 
 
 class Objective[BatchT: NamedBatch](Protocol):
-    """What a training minimises. Objectives without a state of their own inherit `state` and `load_state`."""
+    """What a training minimises. Objectives without a state of their own inherit what follows `loss`."""
 
     def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss of one micro-batch, and values to log beside it."""
         ...
+
+    def end_step(self, values: Mapping[str, float]) -> None:
+        """Take note of a step's mean values over its micro-steps and all processes."""
+        del values
 
     def state(self) -> dict[str, Any]:
         """JSON values that change from step to step (loss scales): saved with the run."""
@@ -303,4 +307,5 @@ def _step[BatchT: NamedBatch](run: _Run[BatchT], step: int) -> tuple[dict[str, f
             next_step=f"lower the learning rate or the clipping norm; {run.states.last_good()}",
         )
     run.optimizer.step()
+    run.objective.end_step(totals)
     return totals, size
