@@ -2,6 +2,7 @@
 
     python benchmarks/full_size.py                                   # the floors: nothing is loaded, any machine will do
     python benchmarks/full_size.py --card H200 --time cuda           # rollouts with random weights, timed on this card
+    python benchmarks/full_size.py --time cuda --captured            # the model's passes replayed as CUDA graphs
     python benchmarks/full_size.py --memory                          # planned against measured memory at three small sizes
 
 The floor counts every matrix product, convolution and attention at the card's peak, or at its bandwidth where that takes
@@ -31,6 +32,7 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.planner import Planner
 from worldline_core.pipeline.sheet import Machine
+from worldline_core.rollout.captured import Captured, Run, run_now
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip
 from worldline_core.rollout.speed import device_name, timed
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -69,9 +71,10 @@ class Rollouts:
     frames: int
     grid: tuple[int, int]
     device: str
+    run: Run
 
     @classmethod
-    def of(cls, preset: str, device: str) -> Rollouts:
+    def of(cls, preset: str, device: str, run: Run = run_now) -> Rollouts:
         """Clips as long as the preset's longest; weights made in bfloat16 on the device, never in float32."""
         config = load_config(PipelineConfig, preset=preset)
         planner = Planner(config, Path.cwd(), Machine(1, 80e9, CARDS["H100"], 1.0))
@@ -79,7 +82,7 @@ class Rollouts:
         if isinstance(tokenizer, WanTokenizer):
             in_bfloat16(tokenizer)
         grid, frames = planner.grid(config.encode_latents.image_size), max(config.distill.clips.lengths)
-        return cls(random_model(planner.generation, device), tokenizer, config.distill.spec, frames, grid, device)
+        return cls(random_model(planner.generation, device), tokenizer, config.distill.spec, frames, grid, device, run)
 
     @torch.no_grad()
     def seconds(self, sampler: str) -> float:
@@ -92,11 +95,14 @@ class Rollouts:
         def predict() -> None:
             if sampler == "stage2":
                 clip = rollout_full_clip(
-                    self.model, first, maps, noise=Noise([42]), steps=FULL_STEPS, views=views, bfloat16=True
-                )
+                    self.model, first, maps, noise=Noise([42]), steps=FULL_STEPS, views=views, bfloat16=True,
+                    run=self.run,
+                )  # fmt: skip
                 self.tokenizer.decode(clip[0])
                 return
-            simulator = BlockCausalSimulator(self.model, self.spec, noise=Noise([42]), views=views, bfloat16=True)
+            simulator = BlockCausalSimulator(
+                self.model, self.spec, noise=Noise([42]), views=views, bfloat16=True, run=self.run
+            )
             simulator.start(first, maps[:, :, :, :1])
             decode = self.tokenizer.decoder()
             decode(first[0][:, :, None])
@@ -190,6 +196,9 @@ def main() -> None:
     parser.add_argument("--preset", default="cosmos3-nano")
     parser.add_argument("--card", choices=tuple(CARDS), default="H200")
     parser.add_argument("--time", metavar="DEVICE", help="time the rollouts there (cuda)")
+    parser.add_argument(
+        "--captured", action="store_true", help="record the model's passes and replay them as CUDA graphs"
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--memory", action="store_true")
     options = parser.parse_args()
@@ -202,10 +211,11 @@ def main() -> None:
                 print(f"{config.num_layers} layers of {config.hidden_size}, {frames} frames, accumulation {accumulation}, checkpointing {checkpointing}: planned "
                       f"{planned / 1e6:.1f} MB, measured {measured / 1e6:.1f} MB, ratio {planned / measured:.4f}")  # fmt: skip
     elif options.time:
-        rollouts = Rollouts.of(options.preset, options.time)
+        run = Captured(options.time) if options.captured else run_now
+        rollouts = Rollouts.of(options.preset, options.time, run)
         for sampler, target in TARGETS.items():
             seconds = [rollouts.seconds(sampler) for _ in range(1 + options.repeats)][1:]
-            figures = {"device": device_name(options.time), "seconds": seconds}
+            figures = {"device": device_name(options.time), "captured": options.captured, "seconds": seconds}
             print(json.dumps({"sampler": sampler, "frames": rollouts.frames, "target": target, **figures}))
     else:
         for row in floors(options.preset, options.card):

@@ -75,7 +75,7 @@ def test_blocks_of_a_clip() -> None:
 def test_the_window_keeps_the_sink_and_the_recent_blocks() -> None:
     cache = KVCache(sink_blocks=1, recent_blocks=3)
     for number, kept in enumerate(([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], [0, 2, 3, 4], [0, 3, 4, 5])):
-        cache.append(CachedBlock(10**number, {}))
+        cache.append(CachedBlock(10**number, {}), torch.zeros(1, 1, 1, 1, 1, 1))
         assert cache.frames == sum(10**block for block in kept)
 
 

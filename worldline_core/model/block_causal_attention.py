@@ -7,8 +7,9 @@ A block of latent frames sees itself and the clean blocks before it. Block 0 is 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from einops import rearrange
@@ -205,8 +206,14 @@ class KVCache:
         parts = (part for block in self.window.blocks for pair in block.layers.values() for part in pair)
         return sum(part.numel() * part.element_size() for part in parts)
 
-    def append(self, block: CachedBlock) -> None:
-        """Take a finished block into the window and let go of what falls out of it."""
+    def append(self, block: CachedBlock, clean: Tensor) -> None:
+        """Take a finished block into the window and let go of what falls out of it.
+
+        Args:
+            clean: its latents; of the first block, the observed frame, they are the reference.
+        """
+        if self.reference is None:
+            self.reference = clean[:, :, :, :1].detach()
         blocks = (*self.window.blocks, block)
         stop, start = window_bounds(len(blocks), self.sink_blocks, self.recent_blocks)
         self.window = CacheWindow(blocks[:stop] + blocks[start:])
@@ -215,16 +222,17 @@ class KVCache:
         """The window of these clips, to go on separately. Tensors are never changed, so what can be shared is: a cache of
         one clip serves any number of branches without a copy.
         """
-        other = KVCache(self.sink_blocks, self.recent_blocks, None if self.fps is None else _of_clips(self.fps, clips))
-        other.reference = None if self.reference is None else _of_clips(self.reference, clips)
+        return self.map(partial(_of_clips, clips=clips))
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> KVCache:
+        """A cache of the same blocks with other tensors, always visited in the same order."""
+        other = KVCache(self.sink_blocks, self.recent_blocks, None if self.fps is None else change(self.fps))
+        other.reference = None if self.reference is None else change(self.reference)
         other.window = CacheWindow(
             [
                 CachedBlock(
                     block.frames,
-                    {
-                        layer: (_of_clips(keys, clips), _of_clips(values, clips))
-                        for layer, (keys, values) in block.layers.items()
-                    },
+                    {layer: (change(keys), change(values)) for layer, (keys, values) in block.layers.items()},
                 )
                 for block in self.window.blocks
             ]

@@ -62,7 +62,8 @@ def video_positions(
         rate = config.fps if fps is None else rearrange(fps.to(device, torch.float32), "b -> b 1")
         time = time / rate * config.base_fps
     time = time + temporal_offset
-    starts = torch.tensor(view_starts(config, views), device=device)
+    # Filled on the device: a GPU would wait for numbers that are copied to it.
+    starts = torch.stack([torch.full((), start, device=device) for start in view_starts(config, views)])
     height = rearrange(starts, "v -> v 1") + torch.arange(rows, device=device, dtype=torch.float32)
     width = torch.arange(columns, device=device, dtype=torch.float32)
     shape = (*time.shape, len(views), rows, columns)
@@ -93,10 +94,10 @@ def rotation(config: WorldModelConfig, positions: Float[Tensor, "3 *batch n"]) -
     # Angles stay in float32 even under autocast: bfloat16 cannot tell consecutive integers apart beyond 256.
     exponent = torch.arange(0, config.head_dim, 2, dtype=torch.float32, device=positions.device) / config.head_dim
     frequencies = 1.0 / (config.rope_theta**exponent)
-    axis_of = torch.zeros(half, dtype=torch.long)
+    axis_of = torch.zeros(half, dtype=torch.long, device=positions.device)
     for axis in (1, 2):
         axis_of[axis : config.rope_sections[axis] * 3 : 3] = axis
-    chosen = positions.to(torch.float32)[axis_of.to(positions.device)]
+    chosen = positions.to(torch.float32)[axis_of]
     angles = torch.movedim(chosen, 0, -1) * frequencies
     angles = torch.cat((angles, angles), dim=-1)
     return angles.cos(), angles.sin()

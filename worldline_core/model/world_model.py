@@ -191,7 +191,8 @@ class WorldModel(nn.Module):
             DataError: a shape does not fit.
             ConfigError: a view is unknown, or the cache holds no first frame for a model that predicts residuals to it.
         """
-        sigma = torch.as_tensor(sigma, device=noisy.device).expand(len(noisy))
+        sigma = sigma if isinstance(sigma, Tensor) else torch.full((), sigma, device=noisy.device)
+        sigma = sigma.expand(len(noisy))
         clean = torch.zeros(len(noisy), noisy.shape[3], dtype=torch.bool, device=noisy.device)
         tokens = self._run_block(noisy, sigma, clean, cache, action_maps, views)
         return self._velocity(tokens, noisy, sigma, clean, cache.reference)
@@ -203,8 +204,8 @@ class WorldModel(nn.Module):
         *,
         action_maps: Float[Tensor, "b v a t #h #w"] | None = None,
         views: Sequence[str] = VIEWS,
-    ) -> None:
-        """Put the keys and values of a finished block into ``cache``: one pass over its clean latents, as conditioning.
+    ) -> CachedBlock:
+        """Put the keys and values of a finished block into ``cache``, and return them: one pass over clean latents.
 
         The first block written is the observed frame, which the cache remembers. No gradient flows into a cache.
 
@@ -217,9 +218,9 @@ class WorldModel(nn.Module):
         written: dict[int, tuple[Tensor, Tensor]] = {}
         with torch.no_grad():
             self._run_block(clean, sigma, every_frame, cache, action_maps, views, written)
-        cache.append(CachedBlock(clean.shape[3], written))
-        if cache.reference is None:
-            cache.reference = clean[:, :, :, :1].detach()
+        block = CachedBlock(clean.shape[3], written)
+        cache.append(block, clean)
+        return block
 
     def forward_teacher_forcing(
         self,
@@ -312,7 +313,7 @@ class WorldModel(nn.Module):
         time = torch.where(clean[..., None], torch.zeros((), dtype=time.dtype, device=time.device), time)
         tokens = tokens + rearrange(time, "b t d -> b t 1 d").to(tokens.dtype)
         if isinstance(self.view_embedding, nn.Parameter):
-            chosen = self.view_embedding[[self.config.views.index(view) for view in views]]
+            chosen = torch.stack([self.view_embedding[self.config.views.index(view)] for view in views])
             chosen = repeat(chosen, "v d -> (v n) d", n=tokens.shape[2] // len(views))
             tokens = tokens + chosen.to(tokens.dtype)
         tokens = rearrange(tokens, "b t n d -> b (t n) d")

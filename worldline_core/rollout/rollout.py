@@ -23,6 +23,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.video_tokenizer import frames_to_video, video_to_frames
 from worldline_core.progress import Progress
+from worldline_core.rollout.captured import Captured
 from worldline_core.rollout.ge_sim import GeSim
 from worldline_core.rollout.ge_sim_client import RefusedPredictionError
 from worldline_core.rollout.predictions import Prediction, batches, choose_episodes, plan_predictions
@@ -213,6 +214,8 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
         sink_blocks=config.sink_blocks,
         recent_blocks=config.recent_blocks,
     )
+    if config.captured:
+        world.run = Captured(config.device)
     if world.contract.fps not in rates:
         world.contract.require(where=inputs["episodes"], fps=rates[0])
     return world

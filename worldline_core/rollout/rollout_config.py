@@ -81,6 +81,8 @@ class RolloutConfig(StrictModel):
     """How the model's weights are held, and those of a Wan autoencoder, which then computes in bfloat16 too: half the
     memory, and no copy in float32 is ever made."""
     device: str = "cpu"
+    captured: bool = Field(default=False, exclude_if=lambda value: not value)
+    """On a GPU: record the passes of a block (or of a step of a whole clip) once, and replay them as CUDA graphs."""
     timed_blocks: int = Field(default=0, ge=0)
     """Blocks of one long block-causal rollout made to measure what each costs; it changes no prediction."""
 
@@ -90,6 +92,11 @@ class RolloutConfig(StrictModel):
             raise ValueError(f"seeds repeat: {self.seeds}")
         if self.weights == "bfloat16" and not self.bfloat16:
             raise ValueError("weights: bfloat16 are computed with in bfloat16; set bfloat16, or hold them in float32")
+        if self.captured and (self.sampler not in ("full_clip", "block_causal") or not self.device.startswith("cuda")):
+            raise ValueError(
+                f"captured needs the sampler full_clip or block_causal on the device cuda, not {self.sampler} on {self.device}: "
+                "leave it out there, nothing else changes"
+            )
         if self.timed_blocks and self.sampler != "block_causal":
             raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
         if self.shift != 1.0 and self.sampler not in ("full_clip", "text_to_video"):

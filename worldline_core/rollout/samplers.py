@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 
 import torch
@@ -12,9 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.block_causal_attention import CachedBlock, KVCache
 from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.model.world_model_config import VIEWS
+from worldline_core.rollout.captured import Run, run_now
 
 VelocityField = Callable[[Tensor, float], Tensor]
 """Velocity at (state, noise level)."""
@@ -93,6 +96,7 @@ def rollout_full_clip(
     text: TextContext | None = None,
     fps: float | None = None,
     bfloat16: bool = False,
+    run: Run = run_now,
 ) -> Float[Tensor, "b v c t h w"]:
     """Integrate from noise to a clip whose first latent frame is ``first_latents``; no classifier-free guidance.
 
@@ -101,6 +105,7 @@ def rollout_full_clip(
         noise: one source per clip.
         shift: moves the noise levels of the steps towards noise.
         fps: frames per second of the clips; None: as the model's config says.
+        run: how every step is run (a `Captured`, on a GPU).
 
     Raises:
         ConfigError: fewer than one step.
@@ -115,12 +120,45 @@ def rollout_full_clip(
     rates = None if fps is None else torch.full((batch,), fps, device=first.device)
 
     def velocity(state: Tensor, sigma: float) -> Tensor:
-        # The first frame's velocity is zero, so it stays what was observed.
         levels = torch.full((batch,), sigma, device=state.device)
-        return model(state, levels, action_maps=action_maps, text=text, views=views, fps=rates).velocity
+        fixed = {"model": model, "text": text, "views": tuple(views), "bfloat16": bfloat16}
+        return run(_clip_velocity, None, state, levels, action_maps, rates, **fixed)[0]
 
-    with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
-        return integrate(velocity, latents, shifted_sigmas(steps, shift))
+    return integrate(velocity, latents, shifted_sigmas(steps, shift))
+
+
+def _clip_velocity(
+    _cache: None, state: Tensor, levels: Tensor, action_maps: Tensor | None, rates: Tensor | None, *,
+    model: WorldModel, text: TextContext | None, views: Sequence[str], bfloat16: bool,
+) -> Sequence[Tensor]:  # fmt: skip
+    # The first frame's velocity is zero, so it stays what was observed.
+    with torch.autocast(state.device.type, torch.bfloat16, enabled=bfloat16):
+        return [model(state, levels, action_maps=action_maps, text=text, views=views, fps=rates).velocity]
+
+
+def _denoised_block(
+    cache: KVCache, noise: Tensor, action_maps: Tensor | None, *,
+    model: WorldModel, sigmas: Sequence[float], views: Sequence[str], bfloat16: bool,
+) -> Sequence[Tensor]:  # fmt: skip
+    velocity = partial(model.forward_block, cache=cache, action_maps=action_maps, views=views)
+    with torch.autocast(noise.device.type, torch.bfloat16, enabled=bfloat16):
+        return [integrate(velocity, noise, sigmas)]
+
+
+def _finished_block(
+    cache: KVCache,
+    clean: Tensor,
+    action_maps: Tensor | None,
+    *,
+    model: WorldModel,
+    views: Sequence[str],
+    bfloat16: bool,
+) -> Sequence[Tensor]:
+    """Keys and values, layer by layer."""
+    with torch.autocast(clean.device.type, torch.bfloat16, enabled=bfloat16):
+        # The caller's cache takes the block from what is returned.
+        block = model.write_block(clean, copy(cache), action_maps=action_maps, views=views)
+    return [part for layer in sorted(block.layers) for part in block.layers[layer]]
 
 
 class BlockCausalSimulator:
@@ -134,6 +172,7 @@ class BlockCausalSimulator:
         spec: block size, window and nodes, as the model was trained with.
         noise: one source per clip.
         fps: frames per second of the clips; None: as the model's config says.
+        run: how the passes of every block are run (a `Captured`, on a GPU).
     """
 
     def __init__(
@@ -145,6 +184,7 @@ class BlockCausalSimulator:
         views: Sequence[str] = VIEWS,
         fps: float | None = None,
         bfloat16: bool = False,
+        run: Run = run_now,
     ) -> None:
         self.model = model
         self.spec = spec
@@ -152,6 +192,7 @@ class BlockCausalSimulator:
         self.fps = fps
         self.bfloat16 = bfloat16
         self.noise = noise
+        self.run = run
         self.cache = spec.new_cache()
         self._unwritten: tuple[Tensor, Tensor | None] | None = None
 
@@ -184,9 +225,8 @@ class BlockCausalSimulator:
             raise DataError("The cache lost its first frame", next_step="call start() again")
         views, channels, _, height, width = reference.shape[1:]
         latents = self.noise.draw((views, channels, self.spec.block_size, height, width), reference.device)
-        velocity = partial(self.model.forward_block, cache=self.cache, action_maps=action_maps, views=self.views)
-        with torch.autocast(reference.device.type, torch.bfloat16, enabled=self.bfloat16):
-            latents = integrate(velocity, latents, self.spec.sigmas)
+        fixed = {"model": self.model, "sigmas": self.spec.sigmas, "views": self.views, "bfloat16": self.bfloat16}
+        latents = self.run(_denoised_block, self.cache, latents, action_maps, **fixed)[0]
         self._unwritten = (latents, action_maps)
         return latents
 
@@ -203,7 +243,7 @@ class BlockCausalSimulator:
             self._write()
         noise = self.noise.select(clips) if seeds is None else Noise(seeds)
         other = BlockCausalSimulator(
-            self.model, self.spec, noise=noise, views=self.views, fps=self.fps, bfloat16=self.bfloat16
+            self.model, self.spec, noise=noise, views=self.views, fps=self.fps, bfloat16=self.bfloat16, run=self.run
         )
         other.cache = self.cache.select(clips)
         if self._unwritten is not None:
@@ -217,6 +257,8 @@ class BlockCausalSimulator:
         if self._unwritten is None:
             return
         latents, action_maps = self._unwritten
-        with torch.autocast(latents.device.type, torch.bfloat16, enabled=self.bfloat16):
-            self.model.write_block(latents, self.cache, action_maps=action_maps, views=self.views)
+        fixed = {"model": self.model, "views": self.views, "bfloat16": self.bfloat16}
+        written = self.run(_finished_block, self.cache, latents, action_maps, **fixed)
+        layers = dict(enumerate(zip(written[::2], written[1::2], strict=True)))
+        self.cache.append(CachedBlock(latents.shape[3], layers), latents)
         self._unwritten = None

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from worldline_core.model.video_tokenizer import VideoDecoder, VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.captured import Run
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout_full_clip
 from worldline_core.rollout.speed import timed
 
@@ -94,11 +95,13 @@ class ClipSampler:
         views: tuple[str, ...],
         fps: float,
         bfloat16: bool,
+        run: Run,
     ) -> None:
         self.views = views
         self._sample = partial(
-            rollout_full_clip, model, noise=noise, steps=steps, shift=shift, views=views, fps=fps, bfloat16=bfloat16
-        )
+            rollout_full_clip, model, noise=noise, steps=steps, shift=shift, views=views, fps=fps, bfloat16=bfloat16,
+            run=run,
+        )  # fmt: skip
         self._first: Tensor
 
     def begin(self, first: Float[Tensor, "b v c h w"]) -> None:

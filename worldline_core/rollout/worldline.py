@@ -22,6 +22,7 @@ from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.captured import Run, run_now
 from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
 from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
@@ -83,6 +84,7 @@ class WorldLine:
         rows, columns = self.contract.grid_size
         self.image_size = (rows * tokenizer.spatial_compression, columns * tokenizer.spatial_compression)
         self.block_seconds: list[float] = []
+        self.run: Run = run_now  # or a `Captured`, which replays the passes of the model
 
     @classmethod
     def from_pretrained(
@@ -287,7 +289,7 @@ class WorldLine:
         else:
             sampler = ClipSampler(
                 self.model, Noise(seeds), steps=self.steps, shift=self.shift, views=chosen,
-                fps=self.contract.fps / stride, bfloat16=self.bfloat16,
+                fps=self.contract.fps / stride, bfloat16=self.bfloat16, run=self.run,
             )  # fmt: skip
         return Session(sampler, self.tokenizer, images, device=self.device, bfloat16=self.bfloat16)
 
@@ -345,5 +347,5 @@ class WorldLine:
         chosen = self.views if views is None else tuple(views)
         return BlockCausalSimulator(
             self.model, self.causal, noise=Noise(seeds), views=chosen, fps=self.contract.fps / stride,
-            bfloat16=self.bfloat16,
+            bfloat16=self.bfloat16, run=self.run,
         )  # fmt: skip
