@@ -20,8 +20,9 @@ from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, OutsideModel, write_outside_models
 from worldline_core.rehearsal.recordings import TWO_VIEWS, write_recordings
-from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, table
+from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, other_input, table
 from worldline_core.report.ablation_table import load_variants
+from worldline_core.training.clip_config import FrameInput
 
 PRESET = "cosmos3-nano"
 SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
@@ -66,6 +67,28 @@ def test_what_is_small_already_stays_as_it_is() -> None:
     }
     with pytest.raises(ConfigError, match="unknown key"):
         changes_of(PRESET, None, ["train_stage1.trainer.stepps=2"])
+
+
+@pytest.mark.parametrize("published", ["latents", "frames"])
+def test_both_ways_to_read_clips_are_distilled_from(published: str) -> None:
+    frames = "distill.input={kind: frames, image_size: [480, 640], workers: 4}"
+    given = [frames] if published == "frames" else []
+    given += [change.override for change in changes_of(PRESET, None, given)]
+    again = other_input(PRESET, None, given)
+    first, second = (
+        load_config(PipelineConfig, preset=PRESET, overrides=[*given, *(change.override for change in more)])
+        for more in ([], again)
+    )
+    assert first.distill.input.kind == published
+    assert {first.distill.input.kind, second.distill.input.kind} == {"latents", "frames"}
+    read = next(
+        settings.distill.input for settings in (first, second) if isinstance(settings.distill.input, FrameInput)
+    )
+    assert (read.image_size, read.workers) == ((64, 96), 1)
+    assert second.distill.clips.lengths == (33,)
+    assert [second.distill.teacher_forcing.trainer.steps, second.distill.distribution_matching.trainer.steps] == [2, 6]
+    others = {name: value for name, value in first.model_dump().items() if name != "distill"}
+    assert others == {name: value for name, value in second.model_dump().items() if name != "distill"}
 
 
 @pytest.fixture
@@ -158,10 +181,13 @@ def test_the_full_size_preset_runs_from_import_to_report(tmp_path: Path, project
     manifests = {}
     for path in (folder / "artifacts").glob("*/*/manifest.json"):
         manifests.setdefault(path.parts[-3], []).append(json.loads(path.read_text()))
-    for step in ("train_stage1", "train_stage2", "distill"):
+    for step in ("train_stage1", "train_stage2"):
         assert any(manifest["environment"]["processes"] == 2 for manifest in manifests[step])
+    assert all(manifest["environment"]["processes"] == 2 for manifest in manifests["distill"])
     assert any(manifest["metrics"].get("relational_intra", 0) > 0 for manifest in manifests["train_stage2"])
-    assert manifests["distill"][0]["metrics"]["lpips"] == "on"
+    assert [manifest["metrics"]["lpips"] for manifest in manifests["distill"]] == ["on", "on"]
+    read = {manifest["config"].get("input", {"kind": "latents"})["kind"] for manifest in manifests["distill"]}
+    assert read == {"latents", "frames"}
     (ablations,) = (folder / "artifacts" / "ablation_table").glob("*/table.json")
     rows = {cell["variant"] for cell in json.loads(ablations.read_text())["cells"] if cell["mean"] is not None}
     assert rows == load_variants().keys()

@@ -16,6 +16,7 @@ from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.rehearsal.recordings import THREE_VIEWS, TWO_VIEWS, write_recordings
 from worldline_core.store.atomic import atomic_path
+from worldline_core.training.clip_config import ClipInput, FrameInput, LatentInput
 
 CHANGES_FILE = "changes.md"
 RECORDINGS, TWO_VIEW_RECORDINGS = "recordings", "recordings_two_views"
@@ -40,10 +41,11 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("*device", "cpu", "no accelerator"),
     ("*.workers", 1, "two cores"),
     ("distill.distribution_matching.trainer.steps", 6, "one cycle"),
+    ("distill.*.trainer.steps", 2, "long enough for a state and an average"),
     ("*.trainer.steps", 4, "long enough for a log, a state and an average"),
     ("*.trajectories.clips", 2, "one batch a process"),
     ("*.relational.student_layer", 2, "the model has 4 layers where 36 are published"),
-    ("encode_latents.start_step", 48, "starts of cached clips"),
+    ("encode_latents.start_step", 96, "starts of cached clips"),
     ("rollouts.causal.*.seeds", [42, 43], "enough for a mean over seeds"),
     ("rollouts.*.seeds", [42], "one seed is enough beside them"),
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
@@ -58,6 +60,9 @@ ABLATION_SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.*.num_frames", 33, "six models are evaluated"),
 )
 """What the ablations change besides."""
+
+OTHER_INPUT_SIZES: tuple[tuple[str, Any, str], ...] = (("distill.clips.lengths", [33], "two blocks"),)
+"""What the second distillation changes besides: see :func:`other_input`."""
 
 ALWAYS = ("curate.sources", "encode_latents.start_step", "runner.nodes_at_once")
 """Changed whatever they are; of the others nothing is made larger, and what is off stays off."""
@@ -100,6 +105,22 @@ def changes_of(
     return [change for change in small if after[change.key] != change.published]
 
 
+def other_input(preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
+    """What a second distillation changes: it reads its clips the other way, cached latents or frames that are encoded when
+    they are needed, because a laboratory chooses by what its disks hold. Its clips are shorter.
+
+    Args:
+        overrides: those of the rehearsal.
+    """
+    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
+    mine, stage2 = config.distill.input, config.train_stage2.input
+    other: ClipInput = LatentInput()
+    if not isinstance(mine, FrameInput):
+        other = stage2 if isinstance(stage2, FrameInput) else FrameInput(image_size=config.encode_latents.image_size)
+    read = Change("distill.input", mine.model_dump(), other.model_dump(), "the other way to read clips")
+    return [read, *changes_of(preset, path, overrides, OTHER_INPUT_SIZES)]
+
+
 def _larger(value: Any, small: Any) -> bool:
     """Whether a rehearsal makes it smaller."""
     if isinstance(value, int) and isinstance(small, int):
@@ -138,10 +159,10 @@ def _shown(value: Any) -> str:
 
 def prepare(
     folder: Path, preset: str | None, path: Path | None, overrides: Sequence[str], *, ablations: bool = True
-) -> tuple[list[Change], list[Change]]:
+) -> tuple[list[Change], list[Change], list[Change]]:
     """Write outside models, recordings and the list of changes into ``folder``; what is there already is kept.
 
-    Returns the changes, and those that the ablations make besides.
+    Returns the changes, those that the second distillation makes besides, and those that the ablations make.
 
     Raises:
         ConfigError: the configuration is not valid, or not with its changes, or has nothing to ablate.
@@ -149,6 +170,7 @@ def prepare(
     """
     changes = changes_of(preset, path, overrides)
     changed = [*overrides, *(change.override for change in changes)]
+    again = other_input(preset, path, changed)
     besides = changes_of(preset, path, changed, ABLATION_SIZES) if ablations else []
     if ablations:  # what is wrong with them is said now, not at the end
 
@@ -160,6 +182,7 @@ def prepare(
     with atomic_path(folder / CHANGES_FILE) as temporary:
         temporary.write_text(
             f"# {preset or path}\n\nWhat the rehearsal changes; all else is as the file says.\n\n{table(changes)}\n"
+            f"\nBesides, in the second distillation:\n\n{table(again)}\n"
             + (f"\nBesides, in the ablations:\n\n{table(besides)}\n" if ablations else "")
         )
     if not (folder / WEIGHTS).is_dir():
@@ -169,4 +192,4 @@ def prepare(
     for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
         if not (folder / name / "index.parquet").is_file():
             write_recordings(folder / name, episodes, split=split)
-    return changes, besides
+    return changes, again, besides
