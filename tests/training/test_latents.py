@@ -91,10 +91,13 @@ def test_bad_requests_and_bad_values_are_named(world: object, tmp_path: Path) ->
         LatentStore.open(tmp_path)
 
 
-def test_a_damaged_shard_is_named(world: object, tmp_path: Path) -> None:
+def test_a_damaged_and_a_missing_shard_are_named(world: object, tmp_path: Path) -> None:
     root = tmp_path / "latents"
     shutil.copytree(world.latents, root)  # type: ignore[attr-defined]
     content = (root / "00000.safetensors").read_bytes()
     (root / "00000.safetensors").write_bytes(content[: len(content) // 2])
     with pytest.raises(ArtifactError, match="shard is damaged or cannot be opened"):
+        LatentStore.open(root).clip("episode-000", 0, 17)
+    (root / "00000.safetensors").unlink()
+    with pytest.raises(ArtifactError, match=r"(?s)cannot be opened.*00000\.safetensors.*encode the latents again"):
         LatentStore.open(root).clip("episode-000", 0, 17)
