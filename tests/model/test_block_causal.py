@@ -120,7 +120,7 @@ def test_a_pass_that_is_computed_again_reads_the_window_it_read_first(make_model
     """Activation checkpointing runs the layers once more, when later blocks are already in the cache."""
     model, gradients = make_model(), []
     _, clean, _, sigma = clip()
-    for model.gradient_checkpointing in (False, True):
+    for model.checkpointing in ("none", "block"):
         cache = KVCache(1, 1)
         model.write_block(frames_of(clean, 0, 1), cache)
         velocity = model.forward_block(frames_of(clean, 1, 3), sigma[:, 0], cache)

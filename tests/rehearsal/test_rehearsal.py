@@ -49,7 +49,9 @@ def test_sizes_are_the_only_change_and_each_is_listed() -> None:
         assert f"| {change.key} " in table(changes)
     assert values == before
     assert [source.path for source in after.curate.sources] == [Path("recordings"), Path("recordings_two_views")]
-    assert after.rollouts["causal"].config.num_frames == 129
+    causal = after.rollouts["causal"].config
+    assert causal is not None
+    assert causal.num_frames == 129
     assert after.train_stage2.relational is not None
 
 

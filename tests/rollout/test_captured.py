@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from worldline_core.errors import ConfigError
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
@@ -90,7 +91,7 @@ class OnTheDevice(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = func(*args, **(kwargs or {}))
-        values = torch.utils._pytree.tree_leaves((args, kwargs, found))
+        values = tree_leaves((args, kwargs, found))
         here = [value for value in values if isinstance(value, Tensor) and value.device.type == "cpu"]
         if any(value.ndim or func not in self._AS_NUMBERS for value in here):
             raise AssertionError(f"{func} reads the processor's memory")

@@ -74,6 +74,7 @@ def test_both_sides_are_pooled_to_the_coarser_grid_and_at_most_eight_bins() -> N
 def test_scales_hold_the_weighted_terms_at_their_share_within_caps_and_ramp() -> None:
     scales = RelationalScales(RelationalConfig(ramp_steps=250, ema_decay=0.9))
     assert scales.at(0) == (0.0, 0.0)  # no ratio is known yet
+    intra = cross = 0.0
     for step in range(300):
         intra, cross = scales.at(step)
         scales.update(1.0, 0.5, 0.25)
