@@ -119,8 +119,9 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     torch.set_num_threads(1)  # as the command
     try:
         for number in range(2):
-            first, end = (written.meta.episodes[number][f"dataset_{name}_index"] for name in ("from", "to"))
-            rows = [written[index] for index in range(first, end)]
+            episodes: Any = written.meta.episodes
+            first, end = (episodes[number][f"dataset_{name}_index"] for name in ("from", "to"))
+            rows: list[Any] = [written[index] for index in range(first, end)]
             assert len(rows) > 16
             commands = torch.stack([row["action"] for row in rows]).double().numpy()
             start = starts[number]
@@ -158,6 +159,25 @@ def test_lerobot_record_writes_what_recorded_commands_lead_to(
     starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
     for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
         np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+
+
+@pytest.mark.slow
+def test_lerobot_record_goes_on_with_a_dataset(lerobot: Callable[..., str], project_root: Path, tmp_path: Path) -> None:
+    """Another command records the second episode; it begins at the second start."""
+    pytest.importorskip("deepdiff", reason="--resume compares features with deepdiff, of LeRobot's core_scripts")
+    one = [option.replace("num_episodes=2", "num_episodes=1") for option in RECORDED]
+    asked = (
+        "--robot.type=worldline", "--robot.views=[head]", "--robot.dataset_root=out", "--teleop.type=worldline_replay",
+        "--teleop.views=[head]", "--dataset.repo_id=local/simulated", "--dataset.video=false", *one,
+    )  # fmt: skip
+    lerobot(tmp_path, "lerobot_record", *asked)
+    lerobot(tmp_path, "lerobot_record", *asked, "--resume=true")
+    starts = EpisodeStarts(
+        project_root / "artifacts" / "shipped" / "recordings", embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8
+    )  # fmt: skip
+    for number, commands in enumerate(check_recorded(project_root, tmp_path / "out", ("head",), lossless=True)):
+        np.testing.assert_array_equal(commands, starts.commands(number)[: len(commands)])
+    assert len(list((tmp_path / "out" / "meta" / "cameras").iterdir())) == 2
 
 
 @pytest.mark.slow
