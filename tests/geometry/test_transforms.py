@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.rotations import rotation_angle, rotation_from_quaternion_wxyz, rotation_from_rot6d
 from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
-from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, repair_rotations
+from worldline_core.geometry.transforms import lengths, pose_from_quaternion_wxyz, repair_rotations
 
 steady = settings(derandomize=True, deadline=None)
 unit = st.floats(-1.0, 1.0, allow_nan=False)
@@ -102,3 +102,13 @@ def test_a_quaternion_without_direction_is_refused(bad):
 def test_rot6d_that_spans_no_frame_is_refused(columns):
     with pytest.raises(CalibrationError, match=r"spans no frame[\s\S]*1 of 1"):
         rotation_from_rot6d(np.array(columns))
+
+
+@pytest.mark.parametrize("shape", [(9, 50, 2), (20, 7, 3), (4, 5, 6, 3), (2, 2)])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_lengths_are_numpys_to_the_bit(shape: tuple[int, ...], kind: type) -> None:
+    vectors = np.random.default_rng(0).normal(size=shape).astype(kind)
+    for each in (vectors, np.asfortranarray(vectors), vectors[::2]):
+        expected = np.linalg.norm(each, axis=-1)
+        assert lengths(each).dtype == expected.dtype
+        assert np.array_equal(lengths(each), expected)

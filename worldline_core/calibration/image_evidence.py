@@ -13,10 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Spread, Typical
-from worldline_core.calibration.observation import CELL_PX, Observation, cell_centres
+from worldline_core.calibration.observation import CELL_PX, Motion, Observation, cell_centres
 from worldline_core.calibration.reading import Reading, predict_motion
+from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import project_points
-from worldline_core.geometry.transforms import rigid_inverse
+from worldline_core.geometry.transforms import lengths, rigid_inverse
 
 WORST_TURN_TERM = -12.0
 MIN_STEP_PX = 0.7
@@ -115,7 +116,7 @@ def still_view_agreement(observation: Observation, reading: Reading, view: str) 
         return 0.0, 0.0, 0.0
     measured, expected = flow[moving], vector[moving]
     # One outlier of a hundred pixels must not outweigh a thousand cells.
-    expected = expected * np.minimum(1.0, 20.0 / np.maximum(np.linalg.norm(expected, axis=-1, keepdims=True), 1e-9))
+    expected = expected * np.minimum(1.0, 20.0 / np.maximum(lengths(expected)[:, None], 1e-9))
     agreement = cosine(measured, expected)
     across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
     follows = np.hypot(agreement, across) > FOLLOWS_CORRELATION
@@ -138,6 +139,13 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
     states, images = reading.steps(observation.num_images)
     if not camera.moving:
         return 0.0
+    key = b"".join((camera.T_base_camera.tobytes(), camera.K.tobytes(), repr((states, images)).encode()))
+    if key not in motion.agreements:
+        motion.agreements[key] = _wrist_flow_agreement(camera, motion, states, images)
+    return motion.agreements[key]
+
+
+def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, images: slice) -> float:
     poses = camera.T_base_camera
     T_next_this = (rigid_inverse(poses[1:]) @ poses[:-1])[states]
     keep = (motion.texture[images] > MIN_TEXTURE) & (motion.change[images] > MIN_CHANGE)
@@ -151,10 +159,9 @@ def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) 
         moved = (turned[None] + inverse_depths[:, None, None] * T[:3, 3]) @ camera.K.T
         ahead = moved[..., 2:] > 0.1
         step = np.where(ahead, moved[..., :2] / np.where(ahead, moved[..., 2:], 1.0) - centres[cells], 0.0)
-        error = np.minimum(np.linalg.norm(step - flow[cells], axis=-1), LARGEST_FLOW_ERROR_PX).sum(axis=1)
+        error = np.minimum(lengths(step - flow[cells]), LARGEST_FLOW_ERROR_PX).sum(axis=1)
         best = step[error.argmin()]
-        length = np.linalg.norm(best, axis=-1, keepdims=True)
-        expected.append(best * np.minimum(1.0, 20.0 / np.maximum(length, 1e-9)))
+        expected.append(best * np.minimum(1.0, 20.0 / np.maximum(lengths(best)[:, None], 1e-9)))
         measured.append(flow[cells])
     if sum(len(cells) for cells in measured) < 50:
         return 0.0
@@ -237,7 +244,7 @@ def finger_agreement(
     if not _moves(observation, reading, arm, config):
         return None
     camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
-    near = np.median(np.linalg.norm(reading.points - tool[:, None], axis=-1), axis=0) < FINGER_LENGTH_M
+    near = np.median(lengths(reading.points - tool[:, None]), axis=0) < FINGER_LENGTH_M
     T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
     points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
     fixed = replace(camera, T_base_camera=np.eye(4)[None])
@@ -274,7 +281,7 @@ def finger_flow(observation: Observation, reading: Reading, arm: int, config: Ca
     if near < 0.01 or not np.isfinite(point).all():
         return 0.0
     away = cell_centres(camera.height, camera.width) - point
-    distance = np.linalg.norm(away, axis=-1)
+    distance = lengths(away)
     close = (distance < camera.K[0, 0] * FINGER_REACH_M / near) & (distance > CELL_PX / 4)
     if close.sum() < 4:
         return 0.0

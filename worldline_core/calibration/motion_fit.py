@@ -18,7 +18,7 @@ from worldline_core.calibration.image_evidence import MIN_CHANGE, MIN_TEXTURE
 from worldline_core.calibration.observation import CELL_PX, Motion, cell_centres, cell_means
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import project_points
-from worldline_core.geometry.transforms import rigid_inverse
+from worldline_core.geometry.transforms import lengths, rigid_inverse
 
 PARAMETERS = 10
 """Rotation and translation of the camera in its own frame [rad, m] (3 + 3), relative focal length (1), principal point in
@@ -110,7 +110,7 @@ class StillView:
         uv, depth, ahead, slope = _projected(self.points, camera)
         uv = _delayed(uv, float(theta[9]))
         step = np.diff(uv, axis=0)
-        length = np.linalg.norm(step, axis=-1)
+        length = lengths(step)
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
         step, length, alive = step[:, kept].astype(np.float32), length[:, kept], alive[:, kept]
@@ -140,7 +140,7 @@ class StillView:
             cover[i] = 1.0 - np.prod(1.0 - inside, axis=0)
             motion = share.T @ step[i, on]
             value[i, :, :2] = cover[i, :, None] * motion
-            value[i, :, 2] = cover[i] * np.log1p(np.minimum(np.linalg.norm(motion, axis=-1), LONGEST_STEP_PX))
+            value[i, :, 2] = cover[i] * np.log1p(np.minimum(lengths(motion), LONGEST_STEP_PX))
             pushed = (share.T @ pushes[i, on].reshape(len(on), -1)).reshape(cells, 2, 2 * PARAMETERS)
             shift[i, ..., :PARAMETERS], growth[i] = pushed[..., :PARAMETERS], pushed[..., PARAMETERS:]
             share *= wide / np.maximum(distance, 0.3)
@@ -221,7 +221,7 @@ class WristView:
         x, y = (np.stack([cv2.Sobel(v, cv2.CV_32F, *order, scale=1 / 8) for v in value]) for order in ((1, 0), (0, 1)))
         tensor = cell_means(np.stack([x * x, x * y, x * y, y * y], axis=-1))[step, row, column].reshape(-1, 2, 2)
         sharp = tensor / (np.trace(tensor, axis1=1, axis2=2) + FAINT_EDGE)[:, None, None]
-        error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * np.linalg.norm(self.flow, axis=-1)
+        error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
     def equations(self, theta: np.ndarray, blur: float) -> Equations:
@@ -301,5 +301,5 @@ def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: 
         uv, depth = project_points(points[i], camera.K, pose[None])
         ahead = depth > NEAR_M
         reach = camera.K[0, 0] * radii[ahead] / depth[ahead] + HAND_MARGIN_CELLS * CELL_PX
-        hidden[i] = (np.linalg.norm(centres[:, :, None] - uv[ahead], axis=-1) < reach).any(-1)
+        hidden[i] = (lengths(centres[:, :, None] - uv[ahead]) < reach).any(-1)
     return hidden[1:] | hidden[:-1]

@@ -42,6 +42,8 @@ class Motion:
     flow: np.ndarray
     change: np.ndarray
     texture: np.ndarray
+    agreements: dict[bytes, float] = field(default_factory=dict, repr=False)
+    """Of wrist cameras that were compared with it already: most readings leave the camera as it is."""
 
     @cached_property
     def moves(self) -> bool:
@@ -64,6 +66,10 @@ class Observation:
     kinematics: ArmKinematics | None
     _motion: dict[str, Motion] = field(default_factory=dict, repr=False)
     _stands: dict[str, bool] = field(default_factory=dict, repr=False)
+    moved_arms: dict[tuple[int, bytes], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = field(
+        default_factory=dict, repr=False
+    )
+    """Of kinematics and joints that were read already: most readings leave both as they are."""
 
     def motion(self, view: str) -> Motion:
         """Flow and change of a view; computed once."""

@@ -17,8 +17,9 @@ from worldline_core.data.episodes.conventions import (
     image_frames,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import rigid_inverse
+from worldline_core.geometry.transforms import lengths, rigid_inverse
 
 METRES_PER_RADIAN = 0.15
 """A wrist camera that turns by one radian shows about as much change as one that goes this far."""
@@ -97,7 +98,7 @@ class Reading:
 def tool_travel(tools: np.ndarray) -> np.ndarray:
     """(n - 1, a) how far each tool (n, a, 4, 4) moves from frame to frame [m], turning counted as travel."""
     relative = rigid_inverse(tools[:-1]) @ tools[1:]
-    travel = np.linalg.norm(relative[..., :3, 3], axis=-1)
+    travel = lengths(relative[..., :3, 3])
     return travel + METRES_PER_RADIAN * np.radians(rotation_angle_deg(relative[..., :3, :3]))
 
 
@@ -112,12 +113,7 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
     tools, kinematic, action = episode.T_base_ee, None, None
     points, radii = np.zeros((episode.num_frames, 0, 3)), np.zeros(0)
     if kinematics is not None and episode.state_kind == "joints":
-        both = np.concatenate([episode.state, episode.action]).astype(np.float64)
-        links = kinematics.link_poses(both, posture=_tracks(observation.posture, len(both)))
-        fk = kinematics.tools_of(links).numpy()
-        kinematic, action = fk[: episode.num_frames], fk[episode.num_frames :]
-        capsules, radius = robot_capsules(kinematics, {k: v[: episode.num_frames] for k, v in links.items()})
-        points, radii = _sampled(capsules.numpy(), radius.numpy())
+        kinematic, action, points, radii = _moved_arms(observation, kinematics, episode)
     if tools is None:
         if kinematic is None:
             return None
@@ -145,6 +141,21 @@ def read(observation: Observation, conventions: RecordedConventions) -> Reading 
         whole_arms,
         image_frames(recorded.num_frames, conventions).start,
     )
+
+
+def _moved_arms(
+    observation: Observation, kinematics: ArmKinematics, episode: Episode
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Tool poses of states and of commands, points on the arms and their radii; of the same joints computed once."""
+    both = np.concatenate([episode.state, episode.action]).astype(np.float64)
+    key = (id(kinematics), both.tobytes())
+    if key not in observation.moved_arms:
+        links = kinematics.link_poses(both, posture=_tracks(observation.posture, len(both)))
+        fk = kinematics.tools_of(links).numpy()
+        capsules, radius = robot_capsules(kinematics, {k: v[: episode.num_frames] for k, v in links.items()})
+        points, radii = _sampled(capsules.numpy(), radius.numpy())
+        observation.moved_arms[key] = fk[: episode.num_frames], fk[episode.num_frames :], points, radii
+    return observation.moved_arms[key]
 
 
 def _tracks(posture: dict[str, float], length: int) -> dict[str, np.ndarray]:
@@ -179,23 +190,23 @@ def predict_motion(points: np.ndarray, radii: np.ndarray, camera: CameraTrack) -
     safe = np.where(visible, depth, 1.0)
     uv = ((in_camera / safe[..., None]) @ camera.K.T)[..., :2]
     step = np.where((visible[1:] & visible[:-1])[..., None], np.diff(uv, axis=0), 0.0)
-    length = np.linalg.norm(step, axis=-1)
+    length = lengths(step)
     # Discs are drawn on the grid of cells, in 1/16 of a cell, the fastest last.
     reach = (camera.K[0, 0] * radii / safe + CELL_PX / 2) / CELL_PX
     place = (uv - (CELL_PX - 1) / 2) / CELL_PX
     near = (
         visible & (place > -reach[..., None]).all(-1) & (place < np.array([columns, rows]) + reach[..., None]).all(-1)
     )
-    fixed = np.clip(place * _SUBCELL, -(2**20), 2**20).astype(int)
-    radius = np.clip(reach * _SUBCELL, 1, 2**20).astype(int)
-    owner = np.full((len(step), rows, columns), -1, dtype=np.int32)
-    for i in range(len(step)):
+    # Lists: an element of an array costs more than the disc that it places.
+    centres = np.clip(place * _SUBCELL, -(2**20), 2**20).astype(int).tolist()
+    radius = np.clip(reach * _SUBCELL, 1, 2**20).astype(int).tolist()
+    owner, shown = np.full((len(step), rows, columns), -1, dtype=np.int32), near.tolist()
+    for i, cells in enumerate(owner):
         moving = np.flatnonzero((length[i] > _STILL_PX) & (near[i] | near[i + 1]))
         for point in moving[np.argsort(length[i, moving], kind="stable")].tolist():
             for j in (i, i + 1):
-                if near[j, point]:
-                    centre = (int(fixed[j, point, 0]), int(fixed[j, point, 1]))
-                    cv2.circle(owner[i], centre, int(radius[j, point]), point, -1, cv2.LINE_8, _SUBCELL_BITS)
+                if shown[j][point]:
+                    cv2.circle(cells, centres[j][point], radius[j][point], point, -1, cv2.LINE_8, _SUBCELL_BITS)
     covered = owner >= 0
     frames = np.arange(len(step))[:, None, None]
     best = np.where(covered, length[frames, owner], 0.0)
