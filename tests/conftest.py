@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from worldline_core.model.contracts import ActionContract, CausalSpec
     from worldline_core.model.world_model import WorldModel
 
+os.fsync = lambda descriptor: None  # no test cuts the power, and thousands of files would wait for the disk
+gc.disable()  # until all is imported: nothing of it is garbage
+
 CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", "rollout")
 """Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
 check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
@@ -40,9 +43,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """What is imported by now stays: looking through it again and again for garbage took up to a tenth of the time."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture
