@@ -69,10 +69,10 @@ def estimate_of(config: WorldModelConfig, trainer: TrainerConfig, frames: int = 
 
 
 def test_deep_models_cost_what_two_shallow_ones_foretell(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = WorldModelConfig(towers="generation", num_layers=8)
+    config = WorldModelConfig(towers="generation", num_layers=9)
     estimate = estimate_of(config, TrainerConfig(steps=1))
     drawn = estimate(Spread()).cost
-    monkeypatch.setattr("worldline_core.model.step_cost._TRACED_LAYERS", (4, 8))
+    monkeypatch.setattr("worldline_core.model.step_cost._TRACED_LAYERS", (4, 9))
     traced = estimate(Spread()).cost
     assert drawn.flops == pytest.approx(traced.flops, rel=1e-9)
     assert drawn.activations == pytest.approx(traced.activations, rel=1e-3)
