@@ -1,12 +1,14 @@
-"""One of several training processes, for test_processes: `python run_process.py REQUEST.json`.
+"""Training processes for test_processes: each line of the input is a request, answered with their exit codes.
 
-A request is a list of runs: step, config, inputs, output, and what the test wants to happen in it. The weights that a
-run ends with are written to `<output>.safetensors`.
+A request has a count of processes, an address, a log and runs: step, config, inputs, output, and what the test wants to
+happen in it. The weights that a run ends with are written to `<output>.safetensors`. The processes are forked from this
+one, which imports what they need once.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import sys
@@ -25,7 +27,6 @@ from worldline_core.training.stage2 import train_stage2
 from worldline_core.training.training_config import Stage1Config, Stage2Config
 
 STEPS = {"train_stage1": (Stage1Config, train_stage1), "train_stage2": (Stage2Config, train_stage2)}
-RANK = int(os.environ.get("RANK", "0"))
 
 
 def kill_before(step: int) -> None:
@@ -33,7 +34,7 @@ def kill_before(step: int) -> None:
     inner = trainer._step
 
     def stepping(run: Any, at: int) -> Any:
-        if int(os.environ["WORLD_SIZE"]) - 1 == RANK and at == step:
+        if int(os.environ["WORLD_SIZE"]) - 1 == int(os.environ["RANK"]) and at == step:
             while any(not (path / "state.json").is_file() for path in run.output.glob("run/training_state/step-*")):
                 time.sleep(0.01)
             os.kill(os.getpid(), signal.SIGKILL)
@@ -48,17 +49,21 @@ def keep_weights(path: Path) -> None:
 
     def save(self: Stage, *arguments: Any, **named: Any) -> Any:
         weights = gathered(self.model.state_dict())
-        if RANK == 0:
+        if os.environ["RANK"] == "0":
             save_file({name: value.contiguous() for name, value in weights.items()}, path)
         return inner(self, *arguments, **named)
 
     Stage.save = save
 
 
-def main() -> None:
+def work(rank: int, request: dict[str, Any]) -> None:
+    with Path(request["log"]).open("ab") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    os.environ.update(request["environment"] | {"RANK": str(rank)})
     torch.set_num_threads(1)
     originals = trainer._step, Stage.save
-    for run in json.loads(Path(sys.argv[1]).read_text()):
+    for run in request["runs"]:
         trainer._step, Stage.save = originals
         if "kill_before" in run:
             kill_before(run["kill_before"])
@@ -67,6 +72,21 @@ def main() -> None:
         config, step = STEPS[run["step"]]
         inputs = {name: Path(path) for name, path in run["inputs"].items()}
         step(config.model_validate(run["config"]), inputs, output)  # type: ignore[operator]
+
+
+def main() -> None:
+    context = multiprocessing.get_context("fork")
+    for line in sys.stdin:
+        request = json.loads(line)
+        processes = [context.Process(target=work, args=(rank, request)) for rank in range(request["count"])]
+        for process in processes:
+            process.start()
+        processes[-1].join(400)
+        for process in processes:
+            process.join(request["alone_at_most"])  # where one process is gone, the others must end by themselves
+        print(json.dumps([process.exitcode for process in processes]), flush=True)
+        for process in processes:
+            process.kill()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,33 +30,31 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def run_processes(
-    project: Path, folder: Path, runs: list[dict[str, Any]], count: int = 2, *, alone_at_most: float = 200
-) -> list[int]:
-    """Run requests on processes that find each other as torchrun's do; their exit codes.
+@pytest.fixture(scope="module")
+def run_processes(project_root: Path) -> Iterator[Callable[..., list[int | None]]]:
+    """Runs requests on processes that find each other as torchrun's do; their exit codes, None for one that hangs.
 
-    Args:
+    Of the function:
         alone_at_most: seconds that the others may go on after the last one.
     """
-    request = folder / f"request-{len(list(folder.glob('request-*')))}.json"
-    request.write_text(json.dumps(runs, default=str))
-    shared = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),
-              "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(project), os.environ.get("EXTRA", "")])}  # fmt: skip
-    command = [sys.executable, str(Path(__file__).with_name("run_process.py")), str(request)]
-    with (folder / "log").open("ab") as log:
-        processes = [
-            subprocess.Popen(
-                command, cwd=project, env={**os.environ, **shared, "RANK": str(rank)}, stdout=log, stderr=log
-            )
-            for rank in range(count)
-        ]
-        last = processes[-1].wait(timeout=400)
-        try:
-            # Where one process is gone, the others must end by themselves.
-            return [process.wait(timeout=alone_at_most) for process in processes[:-1]] + [last]
-        finally:
-            for process in processes:
-                process.kill()
+    command = [sys.executable, str(Path(__file__).with_name("run_process.py"))]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(project_root)}
+    with subprocess.Popen(
+        command, cwd=project_root, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as starting:
+        requests, answers = starting.stdin, starting.stdout
+        assert requests is not None
+        assert answers is not None
+
+        def run(
+            folder: Path, runs: list[dict[str, Any]], count: int = 2, *, alone_at_most: float = 200
+        ) -> list[int | None]:
+            address = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+            request = {"count": count, "environment": address, "log": folder / "log", "runs": runs}
+            print(json.dumps(request | {"alone_at_most": alone_at_most}, default=str), file=requests, flush=True)
+            return json.loads(answers.readline())
+
+        yield run
 
 
 def weights(output: Path) -> dict[str, torch.Tensor]:
@@ -131,7 +130,7 @@ class Runs:
 
     folder: Path
     log: str
-    codes: list[int]
+    codes: list[int | None]
 
     def __truediv__(self, name: str) -> Path:
         return self.folder / name
@@ -139,7 +138,7 @@ class Runs:
 
 @pytest.fixture(scope="module")
 def runs(
-    world: Any, inputs: dict[str, Path], tiny_model: dict[str, Any], project_root: Path,
+    world: Any, inputs: dict[str, Path], tiny_model: dict[str, Any], run_processes: Callable[..., list[int | None]],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Runs:  # fmt: skip
     """Every run that the tests below compare: starting processes costs more than the runs."""
@@ -154,8 +153,8 @@ def runs(
         stage2(one, inputs, "plain"),
         stage2(one, inputs, "terms", relational=terms),
     ]
-    assert run_processes(project_root, one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
-    assert run_processes(project_root, one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
+    assert run_processes(one, alone, count=1) == [0], (one / "log").read_text()[-3000:]
+    assert run_processes(one, [stage2(one, inputs, "half", kill_before=11)], count=1) == [-9]
     # Two processes: the same, with blocks computed again; the last run loses its second process.
     shared = [
         stage1(two, world, tiny_model, "text"),
@@ -164,19 +163,19 @@ def runs(
         stage2(two, inputs, "again", sharding={"checkpointing": "block", "reduce_every_micro_step": True}),
         stage2(two, inputs, "killed", kill_before=11),
     ]
-    codes = run_processes(project_root, two, shared, alone_at_most=60)
+    codes = run_processes(two, shared, alone_at_most=60)
     # Two go on from one, one goes on from two, two from two.
     shutil.copytree(one / "half", two / "half")
     shutil.copytree(two / "killed", one / "killed")
     resumed = [stage2(two, inputs, "killed"), stage2(two, inputs, "half")]
     log = (two / "log").read_text()
-    assert run_processes(project_root, two, resumed) == [0, 0], (two / "log").read_text()[-3000:]
-    assert run_processes(project_root, one, [stage2(one, inputs, "killed")], count=1) == [0]
+    assert run_processes(two, resumed) == [0, 0], (two / "log").read_text()[-3000:]
+    assert run_processes(one, [stage2(one, inputs, "killed")], count=1) == [0]
     # Four processes, two copies of two parts.
     copies = stage2(four, inputs, "plain", batch_size=1, sharding={"shards": 2})
-    assert run_processes(project_root, four, [copies], count=4) == [0] * 4, (four / "log").read_text()[-3000:]
+    assert run_processes(four, [copies], count=4) == [0] * 4, (four / "log").read_text()[-3000:]
     single = stage2(four, inputs, "single", batch_size=1)
-    assert run_processes(project_root, four, [single], count=1) == [0]
+    assert run_processes(four, [single], count=1) == [0]
     return Runs(folder, log, codes)
 
 
