@@ -34,6 +34,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory, project_root: Path) ->
         "PREFECT_HOME": str(home),
         "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_WORKER_QUERY_SECONDS": "1",  # runs are picked up at once, not within ten seconds
         "NO_COLOR": "1",
     }
     log = (home / "server.log").open("w")
