@@ -36,7 +36,7 @@ from worldline_core.evaluation.policy.evidence import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts, measure, score
 from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
-from worldline_core.evaluation.segmenters.segmenter import Segmenter
+from worldline_core.evaluation.segmenters.segmenter import MaskStream, Segmenter
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import load_tokenizer
@@ -58,6 +58,9 @@ class KnownMasks:
 
     def segment(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
         return self.masks
+
+    def stream(self) -> MaskStream:
+        return self.segment
 
 
 def shrunk(images: np.ndarray) -> np.ndarray:

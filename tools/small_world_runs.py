@@ -1,56 +1,98 @@
-"""Plans of what to train on the small world, and runs of a given number of seconds."""
+"""Plans of what to train on the small world: runs of steps, each for a number of seconds, with one seed or several."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar, Self
 
-import torch
-from pydantic import Field
-from torch import Tensor
-from torch._dynamo import config as compiler
+from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
-from worldline_core.errors import TrainingError
-from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.trainer import ParameterGroup
-from worldline_core.training.training_config import SigmaSampling
+from worldline_core.distillation.distill_config import CYCLE
+from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
+from worldline_core.training.training_config import OptimizerConfig, SavingConfig, SigmaSampling, TrainerConfig
 
 
 class Timed(StrictModel):
-    """A run: its length, which leaves out compilation and measuring, and its peak learning rate."""
+    """A step's length and peak learning rate.
 
-    seconds: float = Field(gt=0)
+    ``seconds`` leave out compilation and measuring: what an optimiser step takes is measured once, before the first run
+    with these settings, and all runs with them take as many steps. ``steps``: so many instead.
+    ``decay``: share of the steps over which the learning rate falls to 0.
+    """
+
+    seconds: float | None = Field(default=None, gt=0)
+    steps: int | None = Field(default=None, ge=1)
     batch: int = Field(ge=1)
     lr: float = Field(gt=0)
+    betas: ClassVar[tuple[float, float]] = (0.9, 0.95)
+    weight_decay: ClassVar[float] = 1e-6
+    decay: float = Field(default=0.35, ge=0, le=1)
+    ema: float = Field(default=0.999, ge=0, lt=1)
+    warmup: int = Field(default=100, ge=0)
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        if (self.seconds is None) == (self.steps is None):
+            raise ValueError("give seconds or steps, one of the two")
+        return self
+
+    def trainer(self, steps: int, seed: int, device: str, log_every: int = 5 * CYCLE) -> TrainerConfig:
+        """The training loop of so many steps."""
+        return TrainerConfig(
+            steps=steps,
+            batch_size=self.batch,
+            seed=seed,
+            device=device,
+            ema_decay=self.ema,
+            log_every=log_every,
+            optimizer=OptimizerConfig(
+                learning_rate=self.lr,
+                betas=self.betas,
+                weight_decay=self.weight_decay,
+                warmup_steps=self.warmup,
+                decay_steps=round(self.decay * steps),
+            ),
+            saving=SavingConfig(share=0.03),
+        )
 
 
-class TokenizerSettings(StrictModel):
-    """`wait`: recordings, in the order of their files, that are waited for and fitted to."""
+class TokenizerSettings(Timed):
+    """``episodes``: recordings, in the order of their files, that it is fitted to."""
 
-    seconds: float = Field(gt=0)
+    betas: ClassVar[tuple[float, float]] = (0.9, 0.99)
+    weight_decay: ClassVar[float] = 1e-4
+    batch: int = Field(default=96, ge=1)
+    lr: float = Field(default=2e-3, gt=0)
+    ema: float = Field(default=0.998, ge=0, lt=1)
     channels: int = Field(default=32, ge=1)
     width: int = Field(default=48, ge=4)
     depth: int = Field(default=2, ge=1)
-    wait: int = Field(default=600, ge=1)
+    episodes: int = Field(default=600, ge=1)
+
+    def factor(self, step: int, steps: int) -> float:
+        """Factor on the learning rate: a warm-up times half a cosine down to 0."""
+        return min(1.0, (step + 1) / max(self.warmup, 1)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 class BaseSettings(Timed):
-    """Text and the first frame to one view."""
+    """Text and the first frame to one view: what Stage I learns, from nothing."""
 
     batch: int = Field(default=512, ge=1)
     lr: float = Field(default=2e-3, gt=0)
 
 
 class Stage2Settings(Timed):
-    """Controls and the first frames to three views.
+    """Controls and the first frames to the views.
 
-    ``things``: extra weight of what the task moves, and of other things. ``decay``: the share of the time over which
-    the learning rate falls to 0. ``poll``: take in recordings that come during the run.
+    ``things``: extra weight of what the task moves, and of other things.
+    ``outcomes``: only recordings that ended so (``[success]``); None takes all.
+    ``native_size``: control vectors, padded to this size, by FiLM in every layer instead of maps (32 holds all bodies').
+    ``relational``: the relational terms, with the shipped video teacher.
     """
 
     batch: int = Field(default=256, ge=1)
@@ -60,161 +102,109 @@ class Stage2Settings(Timed):
     things: tuple[float, float] = (0.0, 0.0)
     action_dropout: float = Field(default=0.05, ge=0, lt=1)
     action_multiplier: float = Field(default=1.0, gt=0)
-    decay: float = Field(default=0.35, gt=0, le=1)
-    ema: float = Field(default=0.999, ge=0, lt=1)
     compile: bool = False
-    poll: bool = True
+    views: tuple[str, ...] = VIEWS
+    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1)
+    native_size: int | None = Field(default=None, ge=16, le=32)
+    relational: bool = False
 
-
-class Stage2Plan(Stage2Settings):
-    """``start``: from the base model in the output folder, or from nothing."""
-
-    start: Literal["base", "scratch"] = "base"
-
-
-class Variant(Stage2Settings):
-    """Settings to compare; every variant starts from nothing."""
-
-    model: WorldModelConfig = WorldModelConfig(prediction="first_frame_residual", first_frame_std=0.75)
+    @model_validator(mode="after")
+    def _known_views(self) -> Self:
+        if not set(self.views) <= set(VIEWS) or "head" not in self.views:
+            raise ValueError(f"views: some of {', '.join(VIEWS)}, the head view among them, not {self.views}")
+        return self
 
 
 class ForcingSettings(Timed):
-    """Teacher forcing. ``history_noise``: largest standard deviation of noise on the clean blocks that a block sees."""
+    """Teacher forcing. ``history_noise``: largest standard deviation of noise on the clean blocks that a block sees.
 
-    batch: int = Field(default=192, ge=1)
+    ``long_every``: every so many batches are a third as many cuts of 65 frames of long recordings, so that the model meets
+    a window that moves; 0 does without them.
+    """
+
+    batch: int = Field(default=192, ge=3)
     lr: float = Field(default=1e-3, gt=0)
     sigma: SigmaSampling = SigmaSampling(shift=5.0)
     history_noise: float = Field(default=0.0, ge=0)
+    long_every: int = Field(default=4, ge=0)
     compile: bool = False
 
 
 class RegressionSettings(Timed):
-    """Trajectory regression, on trajectories of ``batches`` times ``clips`` clips."""
+    """Trajectory regression, on trajectories of ``batches`` times ``clips`` clips; ``long_every`` of these are long."""
 
     batches: int = Field(default=16, ge=1)
     clips: int = Field(default=192, ge=3)
     batch: int = Field(default=96, ge=1)
     lr: float = Field(default=1e-4, gt=0)
+    ema: float = Field(default=0.99, ge=0, lt=1)
+    warmup: int = Field(default=20, ge=0)
+    long_every: int = Field(default=4, ge=0)
 
 
 class MatchingSettings(Timed):
     """Distribution matching; the fake score learns four times as fast."""
 
+    betas: ClassVar[tuple[float, float]] = (0.0, 0.999)
     batch: int = Field(default=48, ge=1)
     lr: float = Field(default=2e-5, gt=0)
+    decay: float = Field(default=0.0, ge=0, le=1)
+    ema: float = Field(default=0.99, ge=0, lt=1)
+    warmup: int = Field(default=12, ge=0)
 
 
-class CausalSettings(StrictModel):
-    """The three steps of Stage III, each from the one before.
+class RunPlan(StrictModel):
+    """A run: its steps, each from the one before. ``start``: checkpoint that the first starts from; None: nothing."""
 
-    ``long_every``: every so many batches of the first two steps are a third as many cuts of 65 frames of long
-    recordings, so that the model meets a window that moves; 0 does without them.
-    """
-
-    long_every: int = Field(default=4, ge=0)
-    teacher_forcing: ForcingSettings
+    start: Path | None = None
+    model: WorldModelConfig | None = None
+    base: BaseSettings | None = None
+    stage2: Stage2Settings | None = None
+    teacher_forcing: ForcingSettings | None = None
     trajectory_regression: RegressionSettings | None = None
     distribution_matching: MatchingSettings | None = None
 
+    def steps(self) -> dict[str, Timed]:
+        """Settings of the steps that the run has, in their order."""
+        return {name: value for name in STEPS if (value := getattr(self, name)) is not None}
+
+
+STEPS = ("base", "stage2", "teacher_forcing", "trajectory_regression", "distribution_matching")
+
+
+class MeasureSettings(StrictModel):
+    """``splits``: recordings to measure with. ``samplers``: Euler steps and shift, of Stage II models; the first counts."""
+
+    splits: dict[str, int] = Field(default={"test": 300}, min_length=1)
+    samplers: tuple[tuple[int, float], ...] = Field(default=((1, 1.0),), min_length=1)
+
 
 class Plan(StrictModel):
-    """What to train. ``model``: the model of the sections base and stage2, where they start from nothing."""
+    """What to train and to measure.
+
+    ``model``: of runs that begin with nothing and name no other. ``seeds``: every run is made with each.
+    ``reference``: the run that the others are compared with; None: the first.
+    """
 
     model: WorldModelConfig = WorldModelConfig(prediction="first_frame_residual", first_frame_std=0.75)
     tokenizer: TokenizerSettings | None = None
-    base: BaseSettings | None = None
-    stage2: Stage2Plan | None = None
-    causal: CausalSettings | None = None
-    variants: dict[str, Variant] = Field(default_factory=dict)
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    reference: str | None = None
+    measure: MeasureSettings = MeasureSettings()
+    runs: dict[str, RunPlan] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_reference(self) -> Self:
+        if self.reference is not None and self.reference not in self.runs:
+            raise ValueError(f"reference: one of {', '.join(self.runs)}, not {self.reference}")
+        return self
+
+    @property
+    def relational(self) -> bool:
+        """Whether a run needs the video teacher."""
+        return any(run.stage2 is not None and run.stage2.relational for run in self.runs.values())
 
 
-def cosine(done: float) -> float:
-    """Factor on the learning rate when a share of the time is over: half a cosine down to 0."""
-    return 0.5 * (1 + math.cos(math.pi * done))
-
-
-def plateau(done: float, last: float = 0.35) -> float:
-    """Factor on the learning rate: 1, then down to 0 over the last share of the time."""
-    return min(1.0, (1 - done) / last)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """AdamW for a number of seconds, after which the parameters hold their average.
-
-    Attributes:
-        warmup: steps over which the learning rate rises.
-        schedule: factor on the learning rate as a function of the share of the time that is over.
-        ema: decay of the average.
-    """
-
-    title: str
-    groups: list[ParameterGroup]
-    seconds: float
-    lr: float
-    warmup: int = 100
-    schedule: Callable[[float], float] = plateau
-    ema: float = 0.999
-    betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = 1e-6
-
-    def train(self, loss_of: Callable[[int], Tensor], poll: Callable[[], None] | None = None) -> dict[str, float]:
-        """Train on the loss of each step; steps, seconds and the last loss.
-
-        Args:
-            poll: called every eight seconds, to take in new recordings.
-
-        Raises: TrainingError when the loss is not finite.
-        """
-        named = {f"{group.name}/{name}": p for group in self.groups for name, p in group.parameters.items()}
-        optimizer = torch.optim.AdamW(
-            [{"params": list(group.parameters.values())} for group in self.groups],
-            betas=self.betas,
-            weight_decay=self.weight_decay,
-            fused=True,
-        )
-        average = ExponentialAverage(named, self.ema)
-        losses: list[Tensor] = []
-        started = polled = reported = time.monotonic()
-        while (elapsed := time.monotonic() - started) < self.seconds:
-            step = len(losses)
-            factor = min(1.0, (step + 1) / self.warmup) * self.schedule(elapsed / self.seconds)
-            for slot, group in zip(optimizer.param_groups, self.groups, strict=True):
-                slot["lr"] = self.lr * group.multiplier * factor
-            optimizer.zero_grad(set_to_none=True)
-            loss = loss_of(step)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(named.values(), 1.0)
-            optimizer.step()
-            average.update(step)
-            losses.append(loss.detach())
-            if poll is not None and time.monotonic() - polled > 8:
-                poll()
-                polled = time.monotonic()
-            # Rarely: reading a loss waits for the device.
-            if time.monotonic() - reported > 15:
-                print(
-                    f"{self.title}: step {step + 1}, {elapsed:.0f} s, loss {self._mean(losses[-50:]):.4f}", flush=True
-                )
-                reported = time.monotonic()
-        last = self._mean(losses[-100:])
-        with torch.no_grad():
-            for name, parameter in named.items():
-                parameter.copy_(average.average[name])
-        return {"steps": len(losses), "seconds": round(time.monotonic() - started, 1), "loss": round(last, 5)}
-
-    def _mean(self, losses: list[Tensor]) -> float:
-        mean = float(torch.stack(losses).mean())
-        if not math.isfinite(mean):
-            raise TrainingError("The loss is not finite", where=self.title, next_step="lower the learning rate")
-        return mean
-
-
-def compile_now(title: str, loss_of: Callable[[int], Tensor], steps: tuple[int, ...]) -> None:
-    """Take these steps for their shapes alone: compilation is not training time."""
-    # Each model compiles the same code anew, and each shape does.
-    compiler.recompile_limit = 64
-    begun = time.monotonic()
-    for step in steps:
-        loss_of(step).backward()
-    print(f"{title}: compiled in {time.monotonic() - begun:.0f} s", flush=True)
+def key_of(values: Mapping[str, object]) -> str:
+    """Short digest of JSON values."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:12]

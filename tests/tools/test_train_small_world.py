@@ -1,9 +1,12 @@
-"""The tool that trains the shipped models: its plan, its files, its cuts of long recordings, its weights."""
+"""The tool that trains the shipped models: its plans, its files, its batches, runs that go on, and their table."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import signal
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +16,26 @@ import yaml
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from tools import small_world_data
-from tools.small_world_data import Arrivals, Episodes, Fact, joined, plan_files
-from tools.small_world_runs import Plan, plateau
-from tools.train_small_world import first_recordings, object_weights
+from tools import small_world_steps
+from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, plan_files
+from tools.small_world_measures import Measuring, Shown, gradient_energy, judged
+from tools.small_world_memory import Episodes, KnownRelations, Memory, joined, videos
+from tools.small_world_runs import Plan
+from tools.small_world_steps import controls_of, object_weights
+from tools.small_world_table import Spread, compared, markdown
+from tools.train_small_world import MODELS, Training
 from worldline_core.config import CONFIG_ROOT, load_config
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import ConfigError, DataError, StoppedError
+from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
+from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
+from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.recorder.bodies import BODIES
+from worldline_core.training.clip_source import Clip
+from worldline_core.training.relational import TeacherRelations
+from worldline_core.training.training_config import RelationalConfig
+from worldline_core.training.video_teacher import load_teacher
 
-SHIPPED = CONFIG_ROOT / "shipped" / "small_world.yaml"
+SHIPPED = CONFIG_ROOT / "shipped"
 FACT = Fact("ur5e_slate-train-s1-00000", "ur5e_slate", "train", "success", "lift", "lift the red block", "", False)
 
 
@@ -37,16 +51,10 @@ def episodes(count: int, frames: int, *, long: bool) -> Episodes:
         latents=filled(4, 0.0),
         maps=filled(9, 0.25),
         things=filled(2, 0.0),
-        robot=filled(1, 0.0)[:, :, 0],
+        robot=filled(1, 0.75)[:, :, 0],
+        native=torch.zeros(count, 32, frames),
         singles=filled(4, 0.5) if long else None,
     )
-
-
-def write_file(path: Path, split: str, count: int, frames: int = 33) -> None:
-    facts = json.dumps([asdict(FACT) | {"split": split}] * count)
-    arrays = {name: np.zeros((count, 3, 1), np.uint8) for name in ("maps", "robot", "things")}
-    pixels = np.zeros((count, 3, frames, 1, 1, 3), np.uint8)
-    save_file({"frames": pixels, **arrays}, path, metadata={"facts": facts})
 
 
 def test_weights_of_things_have_mean_one_and_are_larger_where_the_moved_thing_is_or_was() -> None:
@@ -66,25 +74,19 @@ def test_weights_of_things_have_mean_one_and_are_larger_where_the_moved_thing_is
 
 def test_cuts_begin_with_the_frame_that_was_coded_alone_and_hold_its_maps() -> None:
     long = episodes(3, 33, long=True)
-    latents, maps = long.cuts(torch.tensor([2, 0]), torch.tensor([16, 3]), blocks=4)
+    latents, maps, robot = long.cuts(torch.tensor([2, 0]), torch.tensor([16, 3]), blocks=4)
     assert latents.shape == (2, 3, 4, 17, 2, 2)
     assert maps.shape == (2, 3, 9, 17, 2, 2)
     for row, start in ((0, 216.0), (1, 3.0)):
         assert (latents[row, :, :, 0] == start + 0.5).all()
         assert latents[row, 1, 2, 1:, 0, 1].tolist() == [start + step for step in range(1, 17)]
         assert maps[row, 1, 8, :, 0, 1].tolist() == [start + step + 0.25 for step in range(17)]
-
-
-def test_random_cuts_lie_within_their_recordings() -> None:
-    latents, maps = episodes(2, 20, long=True).random_cuts(64, torch.Generator().manual_seed(0), blocks=4)
-    starts = maps[:, 0, 0, 0, 0, 0] % 100
-    assert set(starts.tolist()) == {0.25, 1.25, 2.25, 3.25}
-    torch.testing.assert_close(latents[:, 0, 0, 0, 0, 0] % 100, starts + 0.25)
+        assert robot[row, 1, :, 0, 1].tolist() == [start + step + 0.75 for step in range(17)]
 
 
 def test_short_recordings_are_not_cut() -> None:
     with pytest.raises(DataError, match="Short recordings are not cut"):
-        episodes(1, 9, long=False).random_cuts(1, torch.Generator(), blocks=1)
+        episodes(1, 9, long=False).cuts(torch.tensor([0]), torch.tensor([0]), blocks=1)
 
 
 def test_what_comes_later_follows_what_is_there() -> None:
@@ -94,26 +96,9 @@ def test_what_comes_later_follows_what_is_there() -> None:
     assert both.latents[:, 0, 0, 0, 0, 0].tolist() == [0.0, 0.0, 100.0]
 
 
-def test_the_first_recordings_are_those_of_the_first_files(tmp_path: Path) -> None:
-    for number, split in enumerate(("train", "validation", "train")):
-        write_file(tmp_path / f"{number:05d}.safetensors", split, 5)
-    (tmp_path / ".00003.1.tmp.safetensors").write_bytes(b"unfinished")
-    found = first_recordings(Arrivals(tmp_path), 8)
-    assert [(file.split, len(file.facts)) for file in found] == [("train", 5), ("validation", 5)]
-    assert found[0].facts[0] == FACT
-
-
-def test_waiting_ends_when_no_more_recordings_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(small_world_data, "PATIENCE_S", -1.0)
-    write_file(tmp_path / "00000.safetensors", "train", 5)
-    monkeypatch.setattr(small_world_data.time, "sleep", lambda seconds: None)
-    with pytest.raises(DataError, match=r"(?s)no more come.*6 episodes.*5"):
-        first_recordings(Arrivals(tmp_path), 6)
-
-
 def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     everything = plan_files(Path(), 3000, None)
-    long = plan_files(Path(), 3000, "small_world_long")
+    long = plan_files(Path(), 3000, ["small_world_long"])
     assert [task.path.name for task in everything] == [f"{number:05d}.safetensors" for number in range(len(everything))]
     assert long == [task for task in everything if task.num_frames == 129]
     assert all(task.with_masks for task in long)
@@ -122,36 +107,303 @@ def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     assert len({job.episode_id for task in everything for job in task.jobs}) == sum(len(t.jobs) for t in everything)
 
 
-def test_the_shipped_plan_is_one_that_the_tool_reads() -> None:
-    plan = load_config(Plan, path=SHIPPED)
-    assert plan.tokenizer is not None
-    assert plan.base is not None
-    assert plan.stage2 is not None
-    assert plan.stage2.things == (3.0, 0.5)
-    assert plan.causal is not None
-    assert plan.causal.distribution_matching is not None
-
-
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"stage2": {"seconds": 1, "thigns": [3, 0.5]}}, r"stage2\.thigns: unknown key; did you mean 'things'"),
         (
-            {"causal": {"teacher_forcing": {"seconds": 1, "histroy_noise": 0.2}}},
-            r"causal\.teacher_forcing\.histroy_noise: unknown key; did you mean 'history_noise'",
+            {"stage2": {"steps": 1, "thigns": [3, 0.5]}},
+            r"runs\.one\.stage2\.thigns: unknown key; did you mean 'things'",
         ),
-        ({"tokenizer": {"seconds": 1, "widht": 8}}, r"tokenizer\.widht: unknown key; did you mean 'width'"),
-        ({"variants": {"plain": {"seconds": 1, "start": "base"}}}, r"variants\.plain\.start: unknown key"),
+        (
+            {"teacher_forcing": {"steps": 1, "histroy_noise": 0.2}},
+            r"histroy_noise: unknown key; did you mean 'history_noise'",
+        ),
+        ({"stage2": {"steps": 1, "seconds": 1}}, r"runs\.one\.stage2: .*give seconds or steps"),
+        ({"stage2": {"steps": 1, "views": ["left_wrist"]}}, r"runs\.one\.stage2: .*the head view among them"),
     ],
 )
 def test_a_wrong_key_of_the_plan_is_refused_by_its_name(
     tmp_path: Path, section: dict[str, object], message: str
 ) -> None:
     path = tmp_path / "plan.yaml"
-    path.write_text(yaml.safe_dump(section))
+    path.write_text(yaml.safe_dump({"runs": {"one": section}}))
     with pytest.raises(ConfigError, match=message):
         load_config(Plan, path=path)
 
 
-def test_the_learning_rate_falls_over_the_last_share_of_the_time() -> None:
-    assert [plateau(done, last=0.5) for done in (0.0, 0.5, 0.75, 1.0)] == [1.0, 1.0, 0.5, 0.0]
+@pytest.mark.parametrize(
+    "name", ["small_world", "small_world_directions", "small_world_distillation", "small_world_continued"]
+)
+def test_the_plans_are_ones_that_the_tool_reads(name: str) -> None:
+    plan = load_config(Plan, path=SHIPPED / f"{name}.yaml")
+    assert plan.runs
+    assert all(run.steps() for run in plan.runs.values())
+
+
+def test_the_directions_change_one_thing_each_and_last_equally_long() -> None:
+    plan = load_config(Plan, path=SHIPPED / "small_world_directions.yaml")
+    assert plan.reference == "full"
+    assert len(plan.seeds) == 3
+    full = plan.runs["full"]
+    assert full.stage2 is not None
+    changed = {}
+    for name, run in plan.runs.items():
+        assert run.stage2 is not None
+        own, reference = run.stage2.model_dump(), full.stage2.model_dump()
+        changed[name] = {key for key in own if own[key] != reference[key]}
+        assert sum(step.seconds or 0 for step in run.steps().values()) == 50
+    assert changed == {
+        "full": set(),
+        "success_only": {"outcomes"},
+        "native_film": {"native_size"},
+        "head_only": {"views"},
+        "no_regularization": {"relational"},
+        "no_action_free": {"seconds"},
+    }
+    assert plan.runs["no_action_free"].base is None
+
+
+def test_the_moved_thing_is_found_and_the_judge_scores_both_kinds_of_views() -> None:
+    pixels = np.full((3, 33, 64, 96, 3), 120, np.uint8)
+    thing = np.zeros((33, 64, 96), bool)
+    for frame in range(33):
+        thing[frame, 40 - frame : 50 - frame, 30:40] = True
+    pixels[0][thing] = (220, 20, 20)
+    shown = Shown("lift the red block", VIEWS, pixels, np.zeros_like(thing), thing)
+    found = judged(shown)
+    assert found["object_iou"] == pytest.approx(1.0)
+    assert found["area"] is not None
+    assert found["area_head"] is not None
+    copied = replace(shown, pixels=pixels[:, :1].repeat(33, axis=1))
+    assert judged(copied)["object_iou"] == pytest.approx(0.1, abs=0.1)
+    still = replace(shown, thing=thing[:1].repeat(33, axis=0))
+    assert judged(still)["object_iou"] is None
+
+
+def test_gradient_energy_is_the_step_to_the_next_pixel() -> None:
+    video = torch.zeros(1, 3, 2, 4, 5)
+    video[..., 2, 3] = 1.0
+    energy = gradient_energy(video)
+    assert energy.shape == (1, 2, 4, 5)
+    assert energy[0, 0].nonzero().tolist() == [[1, 3], [2, 2], [2, 3]]
+    assert energy[0, 0, 2, 3] == 2.0
+
+
+def test_intervals_over_seeds_are_those_of_students_t() -> None:
+    spread = Spread.of([1.0, 2.0, 3.0])
+    assert spread.mean == 2.0
+    assert spread.high == pytest.approx(2.0 + 4.302653 / 3**0.5, abs=1e-5)
+    assert Spread.of([1.0]) == Spread(1.0, None, None, 1)
+
+
+def test_a_comparison_is_made_seed_by_seed_and_its_sign_is_that_of_better() -> None:
+    measured = {
+        "full": {seed: {"robot_iou": 0.8 + 0.1 * seed, "error_head": 0.2, "area": 0.9} for seed in range(3)},
+        "other": {
+            seed: {"robot_iou": 0.7 + 0.1 * seed + 0.001 * seed, "error_head": 0.1 + 0.001 * seed} for seed in range(3)
+        },
+        "native_film": {0: {"robot_iou": 0.5}},
+    }
+    found = {(one.run, one.figure): one for one in compared(measured, "full")}
+    assert found["other", "robot_iou"].verdict == "holds"
+    assert found["other", "robot_iou"].difference.mean == pytest.approx(0.099)
+    assert found["other", "error_head"].verdict == "opposite"
+    assert found["native_film", "robot_iou"].verdict == "open"
+    assert ("other", "area") not in found
+    text = markdown(measured, "full")
+    assert "| native_film | +0.300: open |" in text
+    assert "| +0.198 |" in text
+
+
+def recording(
+    split: str, outcomes: list[str], seed: int, frames: int = 33
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Made-up episodes of a red square that moves, with all that a file holds."""
+    count, latent = len(outcomes), (frames + 3) // 4
+    random = np.random.default_rng(seed)
+    pixels = np.repeat(random.integers(60, 160, (count, 3, 1, 64, 96, 3), np.uint8), frames, axis=2)
+    masks = np.zeros((count, 3, 2, frames, 64, 96), np.uint8)
+    for row, outcome in enumerate(outcomes):
+        for frame in range(frames):
+            top = 40 - (frame % 33 if outcome == "success" else frame % 8)
+            pixels[row, :, frame, top : top + 10, 30:40] = (220, 20, 20)
+            masks[row, :, 1, frame, top : top + 10, 30:40] = 1
+            masks[row, :, 0, frame, :8] = 1
+    arrays = {
+        "frames": pixels,
+        "masks": masks,
+        "maps": random.standard_normal((count, 3, 9, latent, 8, 12)).astype(np.float16),
+        "native": random.standard_normal((count, NATIVE_SIZE, latent)).astype(np.float32),
+        "robot": np.ones((count, 3, latent, 8, 12), np.uint8),
+        "things": random.random((count, 3, 2, latent, 8, 12)).astype(np.float16),
+    }
+    facts = [
+        asdict(replace(FACT, id=f"{split}-{seed}-{row}", split=split, outcome=outcome))
+        for row, outcome in enumerate(outcomes)
+    ]
+    return arrays, {"facts": json.dumps(facts)}
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    ends = ["success", "failure", "success", "failure"]
+    for number, (split, outcomes, frames) in enumerate(
+        [("train", ends, 33), ("test", ends, 33), ("train", ends[:2], 129), ("test", ends[:1], 129)]
+    ):
+        arrays, header = recording(split, outcomes, number, frames)
+        save_file(arrays, folder / f"{number:05d}.safetensors", metadata=header)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def measuring(recordings: Path) -> Iterator[Measuring]:
+    names = sorted(path.name for path in recordings.iterdir())
+    teacher = load_teacher(MODELS / "teacher", device="cpu")
+    memory = Memory(recordings, names, PatchTokenizer.load(MODELS / "tokenizer"), teacher)
+    with ThreadPool(1) as judges:
+        yield Measuring(memory, judges, LearnedSegmenter.load(MODELS / "segmenter"))
+
+
+TINY = {
+    "hidden_size": 32,
+    "num_layers": 2,
+    "num_heads": 1,
+    "head_dim": 32,
+    "rope_sections": [6, 5, 5],
+    "intermediate_size": 32,
+    "prediction": "first_frame_residual",
+    "first_frame_std": 0.75,
+}
+BASE = {"steps": 2, "batch": 2}
+STAGE2 = {"steps": 3, "batch": 2, "things": [3, 0.5]}
+
+
+def plan_of(**runs: object) -> Plan:
+    return Plan.model_validate({"model": TINY, "measure": {"splits": {"test": 4}}, "runs": runs})
+
+
+def test_runs_share_what_they_have_in_common_and_are_measured(measuring: Measuring, tmp_path: Path) -> None:
+    with_base = {"base": BASE, "stage2": STAGE2}
+    plan = plan_of(
+        full={"base": BASE, "stage2": {**STAGE2, "relational": True}},
+        no_regularization=with_base,
+        success_only={"base": BASE, "stage2": {**STAGE2, "outcomes": ["success"]}},
+        native_film={"base": BASE, "stage2": {**STAGE2, "native_size": 32}},
+        head_only={"base": BASE, "stage2": {**STAGE2, "views": ["head"]}},
+        no_action_free={"stage2": STAGE2},
+    )
+    plan = plan.model_copy(update={"seeds": (0, 1)})
+    Training(measuring.memory, plan, tmp_path, measuring).all()
+    runs = json.loads((tmp_path / "runs.json").read_text())
+    assert len(runs) == 12
+    assert len({folders["base"] for name, folders in runs.items() if "base" in folders}) == 2
+    assert len({folders["stage2"] for folders in runs.values()}) == 12
+    for name, kept in (("native_film", {"native_size": 32}), ("head_only", {}), ("full", {})):
+        info = read_checkpoint_info(tmp_path / runs[f"{name}, seed 1"]["stage2"])
+        assert info.config.native_size == kept.get("native_size")
+        assert info.views == (("head",) if name == "head_only" else VIEWS)
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert set(table["runs"]) == set(plan.runs)
+    assert table["runs"]["full"]["robot_iou"]["count"] == 2
+    assert {one["run"] for one in table["compared"]} == set(plan.runs) - {"full"}
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")}
+    Training(measuring.memory, plan, tmp_path, measuring).all()
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")} == before
+
+
+def test_successes_alone_are_drawn_where_a_run_asks_for_them(measuring: Measuring) -> None:
+    train = measuring.memory.episodes()
+    assert train.ended(("success",)).tolist() == [0, 2]
+    assert train.ended(None).tolist() == [0, 1, 2, 3]
+    with pytest.raises(DataError, match="No recording ended so"):
+        train.ended(("unknown",))
+
+
+def test_controls_are_maps_of_the_views_or_vectors(measuring: Measuring) -> None:
+    train = measuring.memory.episodes()
+    maps = controls_of(train.maps, train.native, ("head", "right_wrist"), None)
+    torch.testing.assert_close(maps, train.maps[:, [0, 2]].float())
+    vectors = controls_of(train.maps, train.native, ("head", "right_wrist"), 16)
+    assert vectors.shape == (4, 2, 16, 9, 1, 1)
+    torch.testing.assert_close(vectors[:, 1, :, :, 0, 0], train.native[:, :16])
+
+
+def test_relations_in_memory_are_the_teachers(measuring: Measuring, recordings: Path) -> None:
+    memory = measuring.memory
+    assert memory.teacher is not None
+    taught = TeacherRelations.__new__(TeacherRelations)
+    taught.teacher, taught.config, taught._cache = memory.teacher, RelationalConfig(cached_clips=0), {}  # type: ignore
+    clips = tuple(Clip(fact.id, 0, 33, 1) for fact in memory.episodes().facts[2:4])
+    frames = torch.from_numpy(recording("train", ["success", "failure"] * 2, 0)[0]["frames"][2:4])
+    for views in (VIEWS, ("head", "right_wrist"), ("head",)):
+        found = KnownRelations(memory.episodes()).relations(clips, views, (9, 4, 6))
+        expected = taught.relations(clips, views, (9, 4, 6), frames[:, [VIEWS.index(view) for view in views]])
+        assert found.shape == expected.shape
+        torch.testing.assert_close(found.intra, expected.intra, atol=2e-3, rtol=0)
+        torch.testing.assert_close(found.cross, expected.cross, atol=2e-3, rtol=0)
+
+
+CAUSAL = {
+    "teacher_forcing": {"steps": 5, "batch": 3, "history_noise": 0.2, "long_every": 2},
+    "trajectory_regression": {"steps": 2, "batch": 2, "batches": 2, "clips": 3, "long_every": 2},
+    "distribution_matching": {"steps": 4, "batch": 2},
+}
+
+
+def test_a_run_that_was_stopped_ends_with_the_same_bits(
+    measuring: Measuring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = plan_of(all={"stage2": {**STAGE2, "relational": True}, **CAUSAL})
+    Training(measuring.memory, plan, tmp_path / "whole", measuring).all()
+    drawn, calls = small_world_steps.drawn, 0
+
+    def stopping(count: int, size: int, draws: torch.Generator) -> Tensor:
+        nonlocal calls
+        calls += 1
+        if calls % 4 == 0:
+            signal.raise_signal(signal.SIGTERM)
+        return drawn(count, size, draws)
+
+    monkeypatch.setattr(small_world_steps, "drawn", stopping)
+    # A signal outside the loop must not end this process.
+    before = signal.signal(signal.SIGTERM, lambda number, frame: None)
+    stops = 0
+    try:
+        while True:
+            try:
+                Training(measuring.memory, plan, tmp_path / "stopped", measuring).all()
+                break
+            except StoppedError:
+                stops += 1
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert stops >= 3
+    whole = json.loads((tmp_path / "whole" / "runs.json").read_text())
+    assert whole == json.loads((tmp_path / "stopped" / "runs.json").read_text())
+    for folder in whole["all, seed 0"].values():
+        for name in ("model.safetensors", "checkpoint.json", "metrics.jsonl"):
+            assert (tmp_path / "whole" / folder / name).read_bytes() == (
+                tmp_path / "stopped" / folder / name
+            ).read_bytes()
+    assert (tmp_path / "whole" / "table.md").read_text() == (tmp_path / "stopped" / "table.md").read_text()
+    last = load_checkpoint(tmp_path / "whole" / whole["all, seed 0"]["distribution_matching"], expect_kind="causal")[1]
+    assert last.metadata["run"]["steps"] == 6
+
+
+def test_seconds_become_the_same_number_of_steps_for_every_seed(measuring: Measuring, tmp_path: Path) -> None:
+    plan = plan_of(one={"stage2": {"seconds": 0.2, "batch": 1}}).model_copy(update={"seeds": (0, 1)})
+    Training(measuring.memory, plan, tmp_path, measuring).all()
+    (pace,) = json.loads((tmp_path / "pace.json").read_text()).values()
+    taken = [read_checkpoint_info(path.parent).metadata["run"] for path in tmp_path.glob("stage2-*/checkpoint.json")]
+    assert [run["steps"] for run in taken] == [max(1, round(0.2 / pace))] * 2
+
+
+def test_missing_recordings_are_told_by_name(recordings: Path) -> None:
+    with pytest.raises(DataError, match=r"(?s)Recordings are missing.*09999\.safetensors"):
+        Memory(recordings, ["00000.safetensors", "09999.safetensors"], PatchTokenizer.load(MODELS / "tokenizer"))
+
+
+def test_video_values_lie_between_minus_one_and_one() -> None:
+    frames = np.array([0, 255], np.uint8)[:, None, None, None, None, None] * np.ones((1, 3, 5, 2, 2, 3), np.uint8)
+    assert videos(frames, "cpu").unique().tolist() == [-1.0, 1.0]

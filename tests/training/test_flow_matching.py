@@ -73,6 +73,25 @@ def test_loss_is_the_mean_over_noisy_frames(clip: tuple[torch.Tensor, ...]) -> N
     assert weighted.item() == pytest.approx(4.0 * (0.3**2 + 0.8**2) / 2, rel=1e-5)
 
 
+def test_weights_of_a_batch_count_its_errors(
+    make_model: Callable[..., WorldModel], clip: tuple[torch.Tensor, ...]
+) -> None:
+    latents, noise, sigma = clip
+    weights = torch.rand(latents[:, :, :1].shape)
+    velocity = torch.zeros_like(latents)
+    error = (velocity_target(latents, noise) ** 2 * weights)[:, :, :, 1:].mean()
+    torch.testing.assert_close(
+        flow_matching_loss(velocity, latents, noise, sigma, LossWeighting(), weights=weights), error
+    )
+    objective = FlowMatchingObjective(make_model(), sigma=SigmaSampling(), weighting=LossWeighting())
+    with torch.no_grad():
+        plain, doubled = (
+            objective.loss(Batch((), VIEWS, latents, weights=given), torch.Generator().manual_seed(0), 0)[0]
+            for given in (None, torch.full_like(weights, 2.0))
+        )
+    torch.testing.assert_close(doubled, 2 * plain)
+
+
 def test_motion_weights_favour_what_moves_and_keep_the_mean(clip: tuple[torch.Tensor, ...]) -> None:
     latents, noise, sigma = clip
     latents = latents[:, :, :, :1].repeat(1, 1, 1, 5, 1, 1)

@@ -158,6 +158,7 @@ class Batch:
 
     ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
     ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
+    ``weights``: of the squared error, where some places count more than others (what the task moves).
     """
 
     clips: tuple[Clip, ...]
@@ -168,6 +169,7 @@ class Batch:
     text_mask: Bool[Tensor, "b n"] | None = None
     frames: UInt8[Tensor, "b v frames height width 3"] | None = None
     fps: Float[Tensor, " b"] | None = None
+    weights: Float[Tensor, "b v 1 t h w"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -90,13 +90,19 @@ def flow_matching_loss(
     sigma: Tensor,
     weighting: LossWeighting,
     clean_frames: Bool[Tensor, "b t"] | None = None,
+    weights: Float[Tensor, "b v 1 t h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared velocity error over the noisy frames, in float32 (clean frames carry no loss)."""
+    """Mean squared velocity error over the noisy frames, in float32 (clean frames carry no loss).
+
+    ``weights``: further ones, as `Batch` carries them.
+    """
     error = (velocity.float() - velocity_target(latents, noise).float()) ** 2
     if weighting.kind == "sample":
         error = error * broadcast_sigma(sigma).float() ** 2
     if weighting.motion > 0:
         error = error * motion_weights(latents, weighting)
+    if weights is not None:
+        error = error * weights
     clean = first_frame(latents) if clean_frames is None else clean_frames
     noisy = rearrange(~clean, "b t -> b 1 1 t 1 1").to(error.dtype)
     per_frame_values = error.numel() / noisy.numel()
@@ -150,7 +156,7 @@ class FlowMatchingObjective:
             fps=batch.fps,
             features_at=None if self.relational is None else self.relational.layer,
         )
-        flow = flow_matching_loss(output.velocity, latents, noise, sigma, self.weighting)
+        flow = flow_matching_loss(output.velocity, latents, noise, sigma, self.weighting, weights=batch.weights)
         if self.relational is None or taught is None:
             return flow, {}
         if output.features is None:

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -121,6 +122,18 @@ class RelationalScales:
             self.ratios[name] = self.config.ema_decay * before + (1 - self.config.ema_decay) * ratio
 
 
+class ClipRelations(Protocol):
+    """Where the teacher's relations of clips come from; see `TeacherRelations`."""
+
+    def relations(
+        self,
+        clips: Sequence[Clip],
+        views: Sequence[str],
+        grid: tuple[int, int, int],
+        frames: UInt8[Tensor, "b v n height width 3"] | None = None,
+    ) -> Relations: ...
+
+
 class TeacherRelations:
     """The teacher's relations of clips, from the recordings' frames, kept in memory as they were computed."""
 
@@ -180,7 +193,7 @@ class TeacherRelations:
 class RelationalTerm:
     """The teacher's relations, student layer and running scales of the relational terms."""
 
-    def __init__(self, config: RelationalConfig, teacher: TeacherRelations, num_layers: int) -> None:
+    def __init__(self, config: RelationalConfig, teacher: ClipRelations, num_layers: int) -> None:
         self.config = config
         self.teacher = teacher
         self.layer = config.student_layer or max(1, num_layers // 2)

@@ -64,17 +64,18 @@ def video_batch(
 def disturb(latents: Tensor, amount: float, generator: torch.Generator) -> Tensor:
     """Codes as a world model might predict them: noisy or smoothed groups after an exact first frame."""
     batch, _, frames = latents.shape[:3]
+    device = generator.device
 
     def rand(probability: float) -> Tensor:
-        level = torch.rand(batch, 1, frames, 1, 1, generator=generator)
-        return level * (torch.rand(batch, 1, frames, 1, 1, generator=generator) < probability)
+        level = torch.rand(batch, 1, frames, 1, 1, generator=generator, device=device)
+        return level * (torch.rand(batch, 1, frames, 1, 1, generator=generator, device=device) < probability)
 
     flat = rearrange(latents, "b c t h w -> (b t) c h w")
     blurred = F.avg_pool2d(F.pad(flat, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     blurred = rearrange(blurred, "(b t) c h w -> b c t h w", t=frames)
     smooth = rand(0.3 if amount > 0 else 0.0)
     disturbed = latents + smooth * (blurred - latents)
-    disturbed = disturbed + amount * rand(0.7) * torch.randn(latents.shape, generator=generator)
+    disturbed = disturbed + amount * rand(0.7) * torch.randn(latents.shape, generator=generator, device=device)
     return torch.cat((latents[:, :, :1], disturbed[:, :, 1:]), dim=2)
 
 
