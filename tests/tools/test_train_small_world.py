@@ -249,7 +249,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
     ends = ["success", "failure", "success", "failure"]
     for number, (split, outcomes, frames) in enumerate(
-        [("train", ends, 33), ("test", ends, 33), ("train", ends[:2], 129), ("test", ends[:1], 129)]
+        [("train", ends, 33), ("test", ends[:2], 33), ("train", ends[:2], 129), ("test", ends[:1], 129)]
     ):
         arrays, header = recording(split, outcomes, number, frames)
         save_file(arrays, folder / f"{number:05d}.safetensors", metadata=header)
