@@ -118,7 +118,7 @@ def main() -> None:
         i = episodes.position(name)
         masks = {view: episodes.robot_masks(i, view) for view in episodes.rows[i].views}
         frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
-        return Clip(episodes.episode(i), frames, {view: m for view, m in masks.items() if m is not None})
+        return Clip(episodes.episode(i), frames, {view: np.asarray(m) for view, m in masks.items() if m is not None})
 
     only = {name for name in arguments.only.split(",") if name}
     makers: dict[str, Callable[[], np.ndarray]] = {

@@ -85,7 +85,9 @@ def healthy_clips(root: Path, part: str) -> list[Clip]:
     for i, row in healthy[:: -(-len(healthy) // LARGEST)]:
         masks = {view: episodes.robot_masks(i, view) for view in row.views}
         frames = {view: episodes.frames(i, view) for view in row.views}
-        clips.append(Clip(episodes.episode(i), frames, {view: m for view, m in masks.items() if m is not None}))
+        clips.append(
+            Clip(episodes.episode(i), frames, {view: np.asarray(m) for view, m in masks.items() if m is not None})
+        )
     return clips
 
 

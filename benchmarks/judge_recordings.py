@@ -161,12 +161,11 @@ def main() -> None:
             frames = denoiser(episodes.episode(position), frames)
         segmenter: Segmenter | None = learned
         if segmenter is None:
-            masks = episodes.robot_masks(position, "head")
-            if masks is None:
+            exact = episodes.robot_masks(position, "head")
+            if exact is None:
                 continue
-            late = [
-                cv2.resize(mask.astype(np.float32), IMAGE[::-1], interpolation=cv2.INTER_AREA) for mask in masks[chosen]
-            ]
+            masks = np.asarray(exact)[chosen].astype(np.float32)
+            late = [cv2.resize(mask, IMAGE[::-1], interpolation=cv2.INTER_AREA) for mask in masks]
             segmenter = KnownMasks(np.stack(late) >= 0.5)
         family = route(row.instruction)
         shown = {view: video[chosen] for view, video in frames.items()}

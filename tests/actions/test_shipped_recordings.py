@@ -61,7 +61,9 @@ def test_kinematic_masks_cover_the_rendered_robot(recordings, embodiment):
     for row, v in enumerate(views):
         exact = recordings[0].robot_masks(position, tracks.views[v])
         assert exact is not None
-        cells = torch.from_numpy(exact[:frames:4]).reshape(-1, GRID[0], height // GRID[0], GRID[1], width // GRID[1])
+        cells = torch.from_numpy(np.asarray(exact[:frames:4])).reshape(
+            -1, GRID[0], height // GRID[0], GRID[1], width // GRID[1]
+        )
         robot = cells.any(dim=4).any(dim=2)
         covered = masks[row]
         assert (covered & robot).sum() / robot.sum() > 0.75

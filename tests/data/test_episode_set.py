@@ -12,6 +12,8 @@ import pytest
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.video.frames import packed_images, unpacked_images
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]
@@ -226,3 +228,11 @@ def test_a_description_of_another_type_is_refused(sample: Make, field: str, valu
     assert EpisodeDescription.arguments(described)["state_names"] == sample(0)[0].state_names
     with pytest.raises(ValueError, match=field):
         EpisodeDescription.arguments({**described, field: value})
+
+
+def test_masks_of_other_bytes_are_refused_while_they_are_read() -> None:
+    packed = packed_images(np.ones((20, 5, 7), bool), bool, 9).tobytes()
+    assert all(mask.all() for mask in unpacked_images(packed, (20, 5, 7), bool, "here"))
+    for count, content in ((19, packed), (21, packed), (20, packed[:-9]), (20, b"none"), (20, b"")):
+        with pytest.raises(RejectedInputError, match=r"(?s)Content has another shape.*here.*packed bits"):
+            list(unpacked_images(content, (count, 5, 7), bool, "here"))

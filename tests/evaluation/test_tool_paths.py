@@ -38,7 +38,9 @@ def recorded(project_root: Path) -> list[tuple[EpisodeTracks, np.ndarray]]:
     for position in chosen.values():
         episode, masks = episodes.episode(position), episodes.robot_masks(position, "head")
         assert masks is not None
-        found.append((compute_tracks(episode, kinematics.get(episode.embodiment), controls="state")[0], masks))
+        found.append(
+            (compute_tracks(episode, kinematics.get(episode.embodiment), controls="state")[0], np.asarray(masks))
+        )
     return found
 
 

@@ -6,11 +6,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.evaluation.planning.evaluate_planning import candidate_loader
 from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
-from worldline_core.evaluation.recordings import VideoFrames
 from worldline_core.evaluation.video import episode_measurement
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -97,5 +97,5 @@ def test_longer_predictions_than_recordings_and_missing_frames_are_named(recordi
         evaluate_video(VIDEO, recordings.inputs | {"rollouts.longer": tmp_path / "longer"}, tmp_path / "out")
     video = VideoFrames(made.clip("ep-0", "head"), stride=4)
     assert (len(video), video[[0, 4]].shape[0]) == (5, 2)
-    assert [len(piece) for piece in video.pieces(2)] == [2, 2, 1]
+    assert [len(piece) for piece in pieces(video, 2)] == [2, 2, 1]
     assert (video[[4]][0] == frames[16]).all()

@@ -23,7 +23,7 @@ def recording(project_root: Path) -> Clip:
     i = episodes.position("ur5e_silver-test-s1-00002")
     masks = {view: episodes.robot_masks(i, view) for view in episodes.rows[i].views}
     frames = {view: episodes.frames(i, view) for view in episodes.rows[i].views}
-    return Clip(episodes.episode(i), frames, {view: m for view, m in masks.items() if m is not None})
+    return Clip(episodes.episode(i), frames, {view: np.asarray(m) for view, m in masks.items() if m is not None})
 
 
 def findings_of(clip: Clip) -> list[Finding]:

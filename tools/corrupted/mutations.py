@@ -129,7 +129,8 @@ def read_everything(config: SourceConfig, root: Path) -> None:
         loaded = source.load(episode_id)
         for view in loaded.views:
             loaded.frames(view)
-            loaded.robot_masks(view)
+            for _ in loaded.robot_masks(view) or ():
+                pass
 
 
 def attack(config: SourceConfig, root: Path, cases: int, seed: int) -> Iterator[Unexpected]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -13,8 +13,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.clip import VideoClip, read_clip
-from worldline_core.data.video.frame_decoder import decode_frames
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.rollout.rollout_set import RolloutSet
 
@@ -32,37 +31,6 @@ class Pictures(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, indices: list[int]) -> np.ndarray: ...
-
-
-class VideoFrames:
-    """Frames of an encoded video, decoded when they are asked for.
-
-    Args:
-        stride: every how many-th frame of the file is one of these.
-    """
-
-    def __init__(self, clip: VideoClip, stride: int = 1) -> None:
-        self._clip = clip
-        self._stride = stride
-
-    def __len__(self) -> int:
-        return 1 + (self._clip.num_frames - 1) // self._stride
-
-    def __getitem__(self, indices: list[int]) -> np.ndarray:
-        """uint8 (len, h, w, 3) of these frames."""
-        return decode_frames(self._clip, [self._stride * index for index in indices])
-
-    def pieces(self, size: int) -> Iterator[np.ndarray]:
-        """All frames in order, ``size`` (in the end fewer) at a time."""
-        wanted: list[np.ndarray] = []
-        for number, picture in enumerate(read_clip(self._clip)):
-            if number % self._stride == 0:
-                wanted.append(picture.rgb)
-            if len(wanted) == size:
-                yield np.stack(wanted)
-                wanted = []
-        if wanted:
-            yield np.stack(wanted)
 
 
 @dataclass(frozen=True)

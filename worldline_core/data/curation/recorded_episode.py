@@ -14,10 +14,11 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.scenes import with_split
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.instructions import with_instruction
-from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, says_droid
+from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, Masks, says_droid
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.clip import frame_times
+from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import ImageTransform
@@ -47,7 +48,7 @@ def trimmed(config: CurateConfig, loaded: LoadedEpisode) -> LoadedEpisode:
     found = ", ".join(f"{name} {count}" for name, count in {"states": episode.num_frames, **counts}.items())
     cut = episode.cut(0, common)
 
-    def shortened(read: Callable[[str], np.ndarray | None], view: str) -> np.ndarray | None:
+    def shortened(read: Callable[[str], Masks | None], view: str) -> Masks | None:
         values = read(view)
         return None if values is None else values[:common]
 
@@ -68,9 +69,9 @@ def prepare_episode(
 ) -> tuple[
     Episode,
     dict[str, RecordedView],
-    dict[str, np.ndarray],
+    dict[str, Frames],
     Callable[[Mapping[str, ViewThumbnails]], Episode],
-    dict[str, np.ndarray],
+    dict[str, Frames],
 ]:
     """The episode as the set will hold it. No image is decoded yet: that happens once, while the episode is written.
 
@@ -105,15 +106,14 @@ def prepare_episode(
         )
         for view in views
     }
-    masks: dict[str, np.ndarray] = {}
-    things: dict[str, np.ndarray] = {}
+    masks: dict[str, Frames] = {}
+    things: dict[str, Frames] = {}
     for view in views:
         mask, labels = loaded.robot_masks(view), loaded.thing_labels(view)
         if mask is not None:
-            masks[view] = ImageTransform.of(mask.shape[1:3]).fitted(config.image_size, config.fit).masks(mask[::step])
+            masks[view] = _fitted(config, mask[::step], ImageTransform.masks, bool)
         if labels is not None:
-            fitted = ImageTransform.of(labels.shape[1:3]).fitted(config.image_size, config.fit)
-            things[view] = fitted.labels(labels[::step])
+            things[view] = _fitted(config, labels[::step], ImageTransform.labels, np.uint8)
     cameras = {
         view: camera.transformed(ImageTransform.of((camera.height, camera.width)).fitted(config.image_size, config.fit))
         for view in views
@@ -126,6 +126,15 @@ def prepare_episode(
         cameras=cameras,
     )
     return prepared, frames, masks, partial(described, config, prepared, tuple(views)), things
+
+
+def _fitted(
+    config: CurateConfig, images: Frames, fit: Callable[[ImageTransform, np.ndarray], np.ndarray], dtype: type
+) -> Frames:
+    """Masks or labels (N, H, W), each brought to the configured size when it is asked for."""
+    transform = ImageTransform.of((images.shape[1], images.shape[2])).fitted(config.image_size, config.fit)
+    size = len(images), *transform.image_size
+    return MadeFrames(lambda: (fit(transform, image[None])[0] for image in images), size, dtype)
 
 
 def described(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from worldline_core.data.episodes.view_recording import (
 )
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.lerobot.v3_writer import EpisodeVideo
+from worldline_core.data.video.frames import Frames, packed_images
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
 
@@ -40,10 +40,10 @@ def write_part(
     folder: Path,
     episode: Episode,
     views: Mapping[str, RecordedView],
-    robot_masks: Mapping[str, np.ndarray],
+    robot_masks: Mapping[str, Frames],
     video: VideoSettings,
     described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None,
-    thing_labels: Mapping[str, np.ndarray],
+    thing_labels: Mapping[str, Frames],
 ) -> None:
     """Write one episode below `folder`, its videos as they are decoded; the part appears whole or not at all.
 
@@ -75,9 +75,8 @@ def write_part(
         for view, camera in episode.cameras.items():
             arrays[f"K.{view}"] = camera.K.astype(np.float64)
             arrays[f"pose.{view}"] = camera.T_base_camera.astype(np.float64)
-        arrays |= {f"mask.{view}": np.packbits(mask.astype(bool)) for view, mask in robot_masks.items()}
-        for view, labels in thing_labels.items():
-            arrays[f"things.{view}"] = np.frombuffer(zlib.compress(labels.astype(np.uint8).tobytes(), 6), np.uint8)
+        arrays |= {f"masks.{view}": packed_images(masks, bool, 9) for view, masks in robot_masks.items()}
+        arrays |= {f"things.{view}": packed_images(labels, np.uint8, 6) for view, labels in thing_labels.items()}
         arrays |= {f"histogram.{view}": kept.histogram for view, kept in stored.items()}
         with (working / "arrays.npz").open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
@@ -147,16 +146,9 @@ class Part:
             for view in sorted(found, key=lambda view: (VIEWS.index(view) if view in VIEWS else len(VIEWS), view))
         }
 
-    def masks(self) -> dict[str, np.ndarray]:
-        """bool (N, H, W) by view."""
-        return {
-            view: np.unpackbits(self._arrays[f"mask.{view}"], count=int(np.prod(shape))).reshape(shape).astype(bool)
-            for view, shape in self["masks"].items()
-        }
-
-    def things(self) -> dict[str, tuple[list[int], bytes]]:
-        """By view the shape (N, H, W) of the labels, and the labels as uint8, compressed with zlib."""
-        return {view: (shape, self._arrays[f"things.{view}"].tobytes()) for view, shape in self["things"].items()}
+    def packed(self, kind: Literal["masks", "things"]) -> dict[str, tuple[list[int], bytes]]:
+        """By view the shape (N, H, W) of its robot masks or labels of things, and themselves as `packed_images`."""
+        return {view: (shape, self._arrays[f"{kind}.{view}"].tobytes()) for view, shape in self[kind].items()}
 
     @property
     def signature(self) -> tuple[Any, ...]:
@@ -178,8 +170,8 @@ def read_parts(folder: Path) -> list[Part]:
 def _check_sizes(
     episode: Episode,
     stored: Mapping[str, EpisodeVideo],
-    robot_masks: Mapping[str, np.ndarray],
-    thing_labels: Mapping[str, np.ndarray],
+    robot_masks: Mapping[str, Frames],
+    thing_labels: Mapping[str, Frames],
 ) -> None:
     where = f"episode {episode.episode_id}"
     for view, kept in stored.items():

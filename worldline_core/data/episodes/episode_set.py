@@ -19,6 +19,7 @@ from worldline_core.data.guards.rejection import check_rate
 from worldline_core.data.guards.source_paths import inside
 from worldline_core.data.lerobot.dataset import IMAGE_PREFIX, LeRobotV3Dataset
 from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
 from worldline_core.store.remote import is_remote
@@ -195,13 +196,13 @@ class EpisodeSet:
             stored = maker.thumbnails()
         return stored.cut(row.start, row.start + row.video_frames)
 
-    def robot_masks(self, i: int, view: str) -> np.ndarray | None:
-        """bool (N, H, W) masks of a view where the recording has them, else None."""
+    def robot_masks(self, i: int, view: str) -> MadeFrames | None:
+        """bool (N, H, W) masks of a view where the recording has them, else None; a few of them are unpacked at a time."""
         row = self.rows[i]
-        mask = self._open(i)[1].mask(row.episode_index, view)
-        return None if mask is None else mask[row.start : row.start + row.video_frames]
+        masks = self._open(i)[1].masks(row.episode_index, view)
+        return None if masks is None else masks[row.start : row.start + row.video_frames]
 
-    def thing_labels(self, i: int, view: str) -> np.ndarray | None:
+    def thing_labels(self, i: int, view: str) -> MadeFrames | None:
         """uint8 (N, H, W): 1 what the task moves, 2 where it goes, 3.. other things, 0 none; None where not recorded."""
         row = self.rows[i]
         labels = self._open(i)[1].things(row.episode_index, view)

@@ -34,6 +34,7 @@ from worldline_core.data.guards.rejection import check_length
 from worldline_core.data.guards.source_paths import safe_name
 from worldline_core.data.lerobot.v3_writer import DatasetEpisode, write_dataset
 from worldline_core.data.video.encoder import PixelFormat
+from worldline_core.data.video.frames import Frames
 from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
@@ -102,9 +103,9 @@ class EpisodeSetWriter:
         self,
         episode: Episode,
         frames: Mapping[str, np.ndarray | RecordedView],
-        robot_masks: Mapping[str, np.ndarray] | None = None,
+        robot_masks: Mapping[str, Frames] | None = None,
         described: Callable[[Mapping[str, ViewThumbnails]], Episode] | None = None,
-        thing_labels: Mapping[str, np.ndarray] | None = None,
+        thing_labels: Mapping[str, Frames] | None = None,
     ) -> None:
         """Add one episode.
 

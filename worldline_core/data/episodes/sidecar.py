@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -14,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
 from worldline_core.data.guards.plain_files import read_json, read_table, well_formed
-from worldline_core.data.guards.rejection import MAX_ARRAY_BYTES, RejectedInputError, check_image_size, too_large
+from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import is_file
+from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
@@ -66,11 +66,9 @@ def write_sidecar(root: Path, parts: Sequence[Part]) -> None:
                     "T_base_camera": camera.T_base_camera.reshape(-1).tolist(),
                 }
             )
-        for view, mask in part.masks().items():
-            bits = zlib.compress(np.packbits(mask).tobytes(), 9)
-            masks.append({"episode_index": index, "view": view, "shape": list(mask.shape), "bits": bits})
-        for view, (shape, bits) in part.things().items():
-            things.append({"episode_index": index, "view": view, "shape": shape, "bits": bits})
+        for rows, packed in ((masks, part.packed("masks")), (things, part.packed("things"))):
+            for view, (shape, bits) in packed.items():
+                rows.append({"episode_index": index, "view": view, "shape": shape, "bits": bits})
         arms = 0 if episode.T_base_ee is None else episode.T_base_ee.shape[1]
         if arms or episode.num_video_frames != episode.num_frames:
             values = {name: array.reshape(-1).tolist() for name, array in episode.arrays().items()}
@@ -161,42 +159,31 @@ class Sidecar:
             )
         return result
 
-    def mask(self, episode_index: int, view: str) -> np.ndarray | None:
-        """bool (N, H, W) robot mask, or None where the recording has none.
+    def masks(self, episode_index: int, view: str) -> MadeFrames | None:
+        """bool (N, H, W) robot masks, or None where the recording has none; raises as `_images`."""
+        return self._images(episode_index, view, "robot_masks.parquet", bool)
 
-        Raises: RejectedInputError (unreadable, too_large) for bits that are no mask of their shape.
+    def things(self, episode_index: int, view: str) -> MadeFrames | None:
+        """uint8 (N, H, W) labels of things, or None where the recording has none; raises as `_images`."""
+        return self._images(episode_index, view, "thing_labels.parquet", np.uint8)
+
+    def _images(self, episode_index: int, view: str, name: str, dtype: type) -> MadeFrames | None:
+        """A view's row in a table of masks, unpacked while somebody goes through it.
+
+        Raises: RejectedInputError (unreadable, too_large), some of it only then, for bytes that are no images of their shape.
         """
-        found = self._image_bits(episode_index, view, "robot_masks.parquet", 1)
-        if found is None:
-            return None
-        shape, packed = found
-        return np.unpackbits(packed, count=int(np.prod(shape))).reshape(shape).astype(bool)
-
-    def things(self, episode_index: int, view: str) -> np.ndarray | None:
-        """uint8 (N, H, W) labels of things, or None where the recording has none.
-
-        Raises: RejectedInputError (unreadable, too_large) for bytes that are no labels of their shape.
-        """
-        found = self._image_bits(episode_index, view, "thing_labels.parquet", 8)
-        return None if found is None else found[1].reshape(found[0])
-
-    def _image_bits(
-        self, episode_index: int, view: str, name: str, bits_per_pixel: int
-    ) -> tuple[tuple[int, int, int], np.ndarray] | None:
-        """Shape (N, H, W) and unpacked bytes of a view's row in a table of masks."""
         where = f"{self.root}, episode {episode_index}, view {view}, {name}"
-        for row in self._of(name, _MASKS, episode_index, optional=True):
-            if row["view"] == view:
-                with well_formed(where, "packed bits of (N, H, W), compressed with zlib"):
-                    count, height, width = (int(size) for size in row["shape"])
-                    check_image_size(width, height, where)
-                    bits = count * height * width * bits_per_pixel
-                    if not 0 < bits <= 8 * MAX_ARRAY_BYTES:
-                        raise too_large(
-                            "Mask is too large", where=where, limit=8 * MAX_ARRAY_BYTES, got=bits, unit="bits"
-                        )
-                    return (count, height, width), np.frombuffer(_unpacked(row["bits"], -(-bits // 8)), np.uint8)
-        return None
+        rows = self._of(name, _MASKS, episode_index, optional=True)
+        row = next((row for row in rows if row["view"] == view), None)
+        if row is None:
+            return None
+        with well_formed(where, PACKED):
+            count, height, width = (int(size) for size in row["shape"])
+            check_image_size(width, height, where)
+            if not 0 < count <= MAX_FRAMES:
+                raise too_large("Not so many masks", where=where, limit=MAX_FRAMES, got=count, unit="masks")
+        shape = count, height, width
+        return MadeFrames(lambda: unpacked_images(row["bits"], shape, dtype, where), shape, dtype)
 
     def trajectory(self, episode_index: int) -> dict[str, Any]:
         """Full-length state, action and tool poses where they go beyond what the dataset holds, else nothing.
@@ -214,14 +201,3 @@ class Sidecar:
                 for name, stored in ARRAYS.items()
                 if name not in _PER_ARM or row[name] is not None
             }
-
-
-def _unpacked(packed: bytes, length: int) -> bytes:
-    """Exactly `length` bytes: a compressed kilobyte could become a gigabyte."""
-    try:
-        content = zlib.decompressobj().decompress(packed, length + 1)
-    except zlib.error as error:
-        raise ValueError(str(error)) from error
-    if len(content) != length:
-        raise ValueError(f"{len(content)} bytes or more instead of {length}")
-    return content

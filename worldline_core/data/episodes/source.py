@@ -24,11 +24,13 @@ from worldline_core.data.episodes.episode import (
 from worldline_core.data.guards.rejection import RejectedInputError, noted
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import CalibrationError, ConfigError
 from worldline_core.geometry.cameras import Fit
 from worldline_core.geometry.distortion import Distortion, DistortionModel
 from worldline_core.geometry.embodiment import check_embodiment_name
 
+Masks = np.ndarray | MadeFrames
 EVALUATION_LAYOUTS = ("droid annotation", "robotwin")
 """Layouts, as their readers note them in an episode's conventions, that never train or select a model."""
 EVALUATION_ONLY = "evaluation_only"
@@ -54,10 +56,10 @@ class LoadedEpisode:
     episode: Episode
     views: tuple[str, ...]
     images: Callable[[str], Iterable[np.ndarray]] = lambda view: ()
-    robot_masks: Callable[[str], np.ndarray | None] = lambda view: None
+    robot_masks: Callable[[str], Masks | None] = lambda view: None
     distortions: Mapping[str, Distortion] = field(default_factory=dict)
     clips: Mapping[str, VideoClip] = field(default_factory=dict)
-    thing_labels: Callable[[str], np.ndarray | None] = lambda view: None
+    thing_labels: Callable[[str], Masks | None] = lambda view: None
     absent: Mapping[str, RejectedInputError] = field(default_factory=dict)
 
     def each_image(self, view: str) -> Iterator[np.ndarray]:

@@ -22,6 +22,7 @@ from worldline_core.data.mcap.file import McapFile, Stream, read_streams
 from worldline_core.data.mcap.images import ImageTrack
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
 from worldline_core.data.mcap.writer import EPISODE_METADATA, FORMAT_VERSION, STATIC_TRANSFORMS
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 
 READABLE_VERSIONS = (1, FORMAT_VERSION)
@@ -114,8 +115,12 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
     )
     tracks = {view: _track(file, images[view], cameras.tracks.get(view)) for view in views}
 
-    def robot_masks(view: str) -> np.ndarray | None:
-        return np.stack([image[..., 0] > 127 for image in masks[view].frames()]) if view in masks else None
+    def robot_masks(view: str) -> MadeFrames | None:
+        if view not in masks:
+            return None
+        size = next(masks[view].frames()).shape[:2]
+        count = len(masks[view].chosen)
+        return MadeFrames(lambda: (image[..., 0] > 127 for image in masks[view].frames()), (count, *size), bool)
 
     return LoadedEpisode(episode, views, lambda view: tracks[view].frames(), robot_masks, cameras.lenses)
 

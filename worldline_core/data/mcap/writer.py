@@ -20,6 +20,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import check_length
 from worldline_core.data.mcap.encodings import Encoding, FoxgloveSchema, MessageFile, message_file
+from worldline_core.data.video.frames import Frames, in_step
 from worldline_core.errors import DataError
 from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
 from worldline_core.store.atomic import atomic_path
@@ -34,8 +35,8 @@ _JPEG_QUALITY = 95
 def write_episode_mcap(
     path: Path,
     episode: Episode,
-    frames: Mapping[str, np.ndarray],
-    robot_masks: Mapping[str, np.ndarray] | None = None,
+    frames: Mapping[str, Frames],
+    robot_masks: Mapping[str, Frames] | None = None,
     *,
     encoding: Encoding = "json",
 ) -> None:
@@ -47,10 +48,12 @@ def write_episode_mcap(
 
     Raises: RejectedInputError (length_mismatch) when frames and states differ in number.
     """
-    for view, images in frames.items():
-        check_length(
-            "Images", f"{path}, view {view}", states=episode.num_video_frames, unit="frames", found=len(images)
-        )
+    streams = {("image", view): images for view, images in frames.items()}
+    streams |= {("robot_mask", view): masks for view, masks in (robot_masks or {}).items()}
+    for (kind, view), images in streams.items():
+        where = f"{path}, {kind} of {view}"
+        check_length("Images", where, states=episode.num_video_frames, unit="frames", found=len(images))
+    pictures = in_step(streams)
     names = list(episode.state_names or (f"state_{i}" for i in range(episode.state.shape[1])))
     with _new_file(path, EPISODE_METADATA, _metadata(episode, list(frames)), encoding) as messages:
         for index, time in enumerate(episode.timestamps):
@@ -59,14 +62,12 @@ def write_episode_mcap(
                 joints = [{"name": n, "position": v} for n, v in zip(names, values[index].tolist(), strict=True)]
                 messages.add(topic, "JointStates", {"joints": joints})
             messages.add_poses(index, episode.cameras, episode.T_base_ee)
-            if index < episode.num_video_frames:
-                messages.add_images("image", index, frames, "png")
-                messages.add_images("robot_mask", index, robot_masks or {}, "png")
+            messages.add_images(next(pictures, {}), "png")
 
 
 def write_rollout_mcap(
     path: Path,
-    frames_by_view: Mapping[str, np.ndarray],
+    frames_by_view: Mapping[str, Frames],
     fps: float,
     *,
     metadata: Mapping[str, str] | None = None,
@@ -89,10 +90,11 @@ def write_rollout_mcap(
         raise DataError("Views of a rollout differ in length", where=str(path), expected="one length", got=lengths)
     record = {"fps": json.dumps(fps), "views": json.dumps(list(frames_by_view)), **(metadata or {})}
     with _new_file(path, "worldline.rollout", record, encoding) as messages:
-        for index in range(next(iter(lengths.values()))):
+        streams = {("image", view): images for view, images in frames_by_view.items()}
+        for index, pictures in enumerate(in_step(streams)):
             messages.time_ns = round(float(index / fps) * 1e9)
             messages.add_poses(index, cameras or {}, T_base_ee)
-            messages.add_images("image", index, frames_by_view, "jpeg")
+            messages.add_images(pictures, "jpeg")
 
 
 @contextmanager
@@ -131,10 +133,10 @@ class _Messages:
         for arm, pose in enumerate(T_base_ee[index] if T_base_ee is not None else ()):
             self.add("/tf", "FrameTransform", _transform(f"tool_{arm}", pose))
 
-    def add_images(self, kind: str, index: int, stacks: Mapping[str, np.ndarray], image_format: ImageFormat) -> None:
-        for view, stack in stacks.items():
-            message = _image(stack[index], f"{view}_camera", image_format)
-            self.add(f"/{view}/{kind}", "CompressedImage", message)
+    def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: ImageFormat) -> None:
+        """By kind (image, robot_mask) and view."""
+        for (kind, view), image in images.items():
+            self.add(f"/{view}/{kind}", "CompressedImage", _image(image, f"{view}_camera", image_format))
 
 
 def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:

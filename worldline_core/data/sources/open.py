@@ -15,7 +15,7 @@ from pydantic import Field
 
 from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, image_frames
 from worldline_core.data.episodes.recorded_poses import check_intrinsics, rejected_as
-from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, SourceConfigBase
+from worldline_core.data.episodes.source import EpisodeSource, LoadedEpisode, Masks, SourceConfigBase
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import AnyPath, content_of, exists
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
@@ -29,6 +29,7 @@ from worldline_core.data.sources.robomind import RobomindSource, RobomindSourceC
 from worldline_core.data.sources.robotwin import RobotwinSource, RobotwinSourceConfig
 from worldline_core.data.sources.unitree_h5 import UnitreeH5Source, UnitreeH5SourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSource, VideoFolderSourceConfig
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError
 
 SourceConfig = Annotated[
@@ -158,7 +159,7 @@ def repair(loaded: LoadedEpisode, conventions: RecordedConventions) -> LoadedEpi
                 yield image
         check_count(count, view)
 
-    def cut(found: np.ndarray | None, view: str) -> np.ndarray | None:
+    def cut(found: Masks | None, view: str) -> Masks | None:
         if found is not None:
             check_count(len(found), view)
         return None if found is None else found[kept.start : kept.stop]
@@ -206,26 +207,28 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
             lenses[view] = undistortion(distortion, camera.K, (camera.height, camera.width), None)
         cameras[view] = replace(camera, K=lenses[view].K)
 
-    def straightened(values: np.ndarray, view: str) -> np.ndarray:
-        """Images (N, H, W, 3) or masks (N, H, W) of a view with a lens."""
+    def straightened(image: np.ndarray, view: str) -> np.ndarray:
+        """An image (H, W, 3) or mask (H, W) of a view with a lens."""
         size = lenses[view].image_size
-        if values.shape[1:3] != size:
+        if image.shape[:2] != size:
             raise RejectedInputError(
                 "invalid_distortion",
                 "Images have another size than their lens was calibrated for",
                 where=f"{where}, view {view}",
                 expected=f"{size[0]}x{size[1]}",
-                got=f"{values.shape[1]}x{values.shape[2]}",
+                got=f"{image.shape[0]}x{image.shape[1]}",
             )
-        return lenses[view].masks(values) if values.ndim == 3 else lenses[view].frames(values)
+        return (lenses[view].masks if image.ndim == 2 else lenses[view].frames)(image[None])[0]
 
     def images(view: str) -> Iterator[np.ndarray]:
         for image in loaded.each_image(view):
-            yield straightened(image[None], view)[0] if view in lenses else image
+            yield straightened(image, view) if view in lenses else image
 
-    def robot_masks(view: str) -> np.ndarray | None:
+    def robot_masks(view: str) -> Masks | None:
         masks = loaded.robot_masks(view)
-        return straightened(masks, view) if masks is not None and view in lenses else masks
+        if masks is None or view not in lenses:
+            return masks
+        return MadeFrames(lambda: (straightened(mask, view) for mask in masks), masks.shape, bool)
 
     taken_out = "; ".join(f"{view}: {d.model} {list(d.coefficients)}" for view, d in loaded.distortions.items())
     conventions = {**loaded.episode.conventions, "undistorted": taken_out}

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit, video_iou
@@ -142,9 +143,11 @@ def _load(episodes: EpisodeSet, index: int, stride: int, size: tuple[int, int] |
     masks = episodes.robot_masks(index, HEAD)
     if masks is None:
         return None
-    frames = episodes.frames(index, HEAD)[::stride]
-    resized = ImageTransform.of((frames.shape[1], frames.shape[2])).fitted(size)
-    return MaskedVideo(episodes.rows[index].episode_id, resized.frames(frames), resized.masks(masks[::stride]))
+    recorded = VideoFrames(episodes.clip(index, HEAD), stride)
+    resized = ImageTransform.of((recorded.shape[1], recorded.shape[2])).fitted(size)
+    frames = np.stack([resized.frames(frame[None])[0] for frame in recorded])
+    fitted = np.stack([resized.masks(mask[None])[0] for mask in masks[::stride]])
+    return MaskedVideo(episodes.rows[index].episode_id, frames, fitted)
 
 
 def _measure(episodes: EpisodeSet, config: SegmenterConfig, state: Mapping[str, Tensor]) -> dict[str, Any]:

@@ -16,10 +16,11 @@ import torch
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import MadeFrames, VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metric_registry import Metric
 from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
-from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, VideoFrames, stride_of, tool_points
+from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, stride_of, tool_points
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
     OwnColour,
@@ -183,14 +184,14 @@ class EpisodeMeasurement:
                         got=len(predicted),
                     )
                 longest = max(longest, len(predicted))
-                videos[method, seed, view] = _Video(predicted.pieces(PIECE_FRAMES), segmenters, self.thing)
-        true = _Video(recording.pieces(PIECE_FRAMES), segmenters, self.thing)
+                videos[method, seed, view] = _Video(pieces(predicted, PIECE_FRAMES), segmenters, self.thing)
+        true = _Video(pieces(recording, PIECE_FRAMES), segmenters, self.thing)
         if not videos:
             return {}, {}, {}
         known = self._known(stride, longest) if view == HEAD else None
         for begin in range(0, longest, PIECE_FRAMES):
             frames = next(true.pieces)[: longest - begin]
-            piece = None if known is None else known.cut(begin, frames, true)
+            piece = None if known is None else known.next(begin, frames, true)
             if piece is not None:
                 true.add_object(frames, piece.moved)
                 if piece.exact is not None:
@@ -249,40 +250,37 @@ class EpisodeMeasurement:
 
         Raises: DataError when fewer exact masks than frames are there.
         """
-        frames = slice(0, stride * count, stride)
         exact, labels = (read(self.position, HEAD) for read in (self.episodes.robot_masks, self.episodes.thing_labels))
         for name, images in (("robot masks", exact), ("labels of things", labels)):
-            if images is not None and len(images[frames]) < count:
+            if images is not None and len(images[::stride]) < count:
                 raise DataError(
                     "A prediction is longer than its recording",
                     where=f"{name} of {self.episode_id}, view {HEAD}",
                     expected=f"<= {len(images[::stride])}",
                     got=count,
                 )
-        return _Known(
-            tool_points(self.tracks, self.episode_id, count, stride),
-            None if exact is None else exact[frames],
-            None if labels is None else labels[frames] == 1,
-        )
+        return _Known(tool_points(self.tracks, self.episode_id, count, stride), exact, labels, stride)
 
 
-@dataclass(frozen=True)
 class _Known:
-    """Of all frames of the recorded head view: projected tool centres, exact masks of the robot and of the moved thing."""
+    """Of the frames of the recorded head view: projected tool centres, exact masks of the robot and of the moved thing."""
 
-    points: np.ndarray
-    exact: np.ndarray | None
-    thing: np.ndarray | None
+    def __init__(self, points: np.ndarray, exact: MadeFrames | None, labels: MadeFrames | None, stride: int) -> None:
+        self.points = points
+        self._exact = None if exact is None else pieces(exact[::stride], PIECE_FRAMES)
+        self._labels = None if labels is None else pieces(labels[::stride], PIECE_FRAMES)
+        self._thing_at_first = np.zeros(0, dtype=bool)
 
-    def cut(self, begin: int, frames: np.ndarray, video: _Video) -> _Piece:
-        """What is known of the recorded ``frames`` that begin at ``begin``, with their segmenters' masks."""
-        part = slice(begin, begin + len(frames))
-        points, moved = self.points[part], None
-        if self.thing is not None:
-            now = self.thing[part]
-            stays = frame_iou(now, self.thing[:1].repeat(len(now), 0))
+    def next(self, begin: int, frames: np.ndarray, video: _Video) -> _Piece:
+        """What is known of the next recorded ``frames``, which begin at ``begin``, with their segmenters' masks."""
+        points, moved = self.points[begin : begin + len(frames)], None
+        if self._labels is not None:
+            now = next(self._labels)[: len(frames)] == 1
+            if begin == 0:
+                self._thing_at_first = now[:1]
+            stays = frame_iou(now, self._thing_at_first.repeat(len(now), 0))
             moved = now, (stays < MOVED_IOU) & now.any(axis=(1, 2))
-        exact = None if self.exact is None else self.exact[part]
+        exact = None if self._exact is None else next(self._exact)[: len(frames)]
         masks = video.masks(frames, points)
         if not video.first.size:
             video.first, video.first_mask = frames[0], masks[""][0]

@@ -26,17 +26,11 @@ import torch
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, requested
-from worldline_core.evaluation.recordings import (
-    HEAD,
-    TRUE_METHOD,
-    VideoFrames,
-    open_rollouts,
-    rows_of,
-    stride_of,
-)
+from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, open_rollouts, rows_of, stride_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
     Score,
