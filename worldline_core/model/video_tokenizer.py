@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from worldline_core.data.video.frames import Frames
 from worldline_core.errors import DataError
 
 
@@ -112,6 +113,14 @@ def resize_frame(frame: np.ndarray, size: tuple[int, int], *, out: np.ndarray) -
         return
     shrinking = size[0] <= frame.shape[0] and size[1] <= frame.shape[1]
     cv2.resize(frame, (size[1], size[0]), dst=out, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+
+
+def resized_video(frames: Frames, size: tuple[int, int]) -> UInt8[Tensor, "3 t h w"]:
+    """RGB frames ``(N, H, W, 3)``, gone through one by one, at ``size`` (H, W)."""
+    resized = np.empty((len(frames), *size, 3), np.uint8)
+    for frame, target in zip(frames, resized, strict=True):
+        resize_frame(frame, size, out=target)
+    return rearrange(torch.from_numpy(resized), "t h w c -> c t h w").contiguous()
 
 
 def frames_to_video(frames: np.ndarray, size: tuple[int, int] | None = None) -> Float[Tensor, "3 t h w"]:

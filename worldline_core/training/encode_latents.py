@@ -16,16 +16,17 @@ from typing import IO, Any, ClassVar, NoReturn, Protocol
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from safetensors.torch import save_file
 from torch import Tensor
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.video_tokenizer import resized_video
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
@@ -40,6 +41,8 @@ from worldline_core.training.latent_store import (
     single_key,
 )
 
+_SPAN = 2 * TEMPORAL_FACTOR + 1
+
 
 class Encoder(Protocol):
     """The part of a video tokenizer that is needed here."""
@@ -47,21 +50,25 @@ class Encoder(Protocol):
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]: ...
 
 
-def encode_clip(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h_l w_l"]:
-    """Latents of one clip (RGB in [-1, 1]), rounded to half precision as they are stored."""
+def encode_clip(tokenizer: Encoder, video: UInt8[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h_l w_l"]:
+    """Latents of one clip, rounded to half precision as they are stored."""
     with torch.no_grad():
-        return tokenizer.encode(video[None].to(device))[0].to("cpu", torch.float16)
+        return tokenizer.encode((video.float() / 127.5 - 1.0)[None].to(device))[0].to("cpu", torch.float16)
 
 
 def encode_episode(
     tokenizer: Encoder,
     episode_id: str,
-    videos: Float[Tensor, "v 3 n h w"],
+    videos: Sequence[UInt8[Tensor, "3 n h w"]],
     layout: Layout,
     config: EncodeLatentsConfig,
 ) -> dict[str, Float[Tensor, "v c t h_l w_l"]]:
-    """All tensors of one episode, by their names in the shard."""
-    count = videos.shape[2]
+    """All tensors of one episode, by their names in the shard.
+
+    Args:
+        videos: of its views.
+    """
+    count = videos[0].shape[1]
     tensors: dict[str, Tensor] = {}
 
     def stacked(indices: range) -> Tensor:
@@ -90,7 +97,7 @@ def encode_episode(
     return tensors
 
 
-def choose_layout(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
+def choose_layout(tokenizer: Encoder, video: UInt8[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
     """``groups`` where a latent frame depends on its own four frames alone, else ``clips``.
 
     Raises:
@@ -98,11 +105,10 @@ def choose_layout(tokenizer: Encoder, video: Float[Tensor, "3 n h w"], config: E
     """
     if config.layout == "clips":
         return "clips"
-    span = 2 * TEMPORAL_FACTOR + 1
-    if video.shape[1] < span:
-        raise DataError("An episode is too short to encode.", expected=f"{span} frames or more", got=video.shape[1])
-    whole = encode_clip(tokenizer, video[:, :span], config.device)[:, 2]
-    later = encode_clip(tokenizer, video[:, TEMPORAL_FACTOR:span], config.device)[:, 1]
+    if video.shape[1] < _SPAN:
+        raise DataError("An episode is too short to encode.", expected=f"{_SPAN} frames or more", got=video.shape[1])
+    whole = encode_clip(tokenizer, video[:, :_SPAN], config.device)[:, 2]
+    later = encode_clip(tokenizer, video[:, TEMPORAL_FACTOR:_SPAN], config.device)[:, 1]
     # One unit of half precision: different batch shapes may round the last bit differently.
     memoryless = bool(torch.allclose(whole.float(), later.float(), rtol=2e-3, atol=2e-3))
     if config.layout == "groups" and not memoryless:
@@ -261,7 +267,7 @@ def encode_latents(
     selected = _select(episodes, config)
     tokenizer = load_tokenizer(inputs["tokenizer"], config.device)
     with _one_thread():
-        layout = choose_layout(tokenizer, read_videos(episodes, selected[0], config)[0], config)
+        layout = choose_layout(tokenizer, read_videos(episodes, selected[0], config, _SPAN)[0], config)
     fingerprint = tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"]))
     del tokenizer  # each process that encodes loads its own
     (output / "run").mkdir(parents=True, exist_ok=True)
@@ -304,10 +310,13 @@ def encode_latents(
     }
 
 
-def read_videos(episodes: EpisodeSet, position: int, config: EncodeLatentsConfig) -> Float[Tensor, "v 3 n h w"]:
-    """The views of an episode that are encoded, RGB in [-1, 1]."""
-    views = _views(episodes.rows[position], config)
-    return torch.stack([frames_to_video(episodes.frames(position, view), config.image_size) for view in views])
+def read_videos(
+    episodes: EpisodeSet, position: int, config: EncodeLatentsConfig, most: int | None = None
+) -> list[UInt8[Tensor, "3 n h w"]]:
+    """The views of an episode that are encoded, at the size of training; of each ``most`` frames at most."""
+    clips = (episodes.clip(position, view) for view in _views(episodes.rows[position], config))
+    cut = (clip.cut(0, min(clip.num_frames, most or clip.num_frames)) for clip in clips)
+    return [resized_video(VideoFrames(clip), config.image_size) for clip in cut]
 
 
 def _views(row: EpisodeRow, config: EncodeLatentsConfig) -> tuple[str, ...]:

@@ -19,9 +19,10 @@ from torch import Tensor
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, resize_frame
+from worldline_core.model.video_tokenizer import VideoTokenizer, resize_frame, resized_video
 from worldline_core.progress import with_progress
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.clip_source import Clip, ClipRow, ClipSource
@@ -206,10 +207,9 @@ def load_views(
     for position in with_progress(positions, "reading episodes", "episode"):
         row = episodes.rows[position]
         for view in row.views:
-            frames = episodes.frames(position, view)
+            frames = VideoFrames(episodes.clip(position, view))
             if len(frames) >= minimum:
-                video = frames_to_video(frames, image_size)
-                views.append(RecordedView(f"{row.episode_id}/{view}", ((video + 1.0) * 127.5).round().to(torch.uint8)))
+                views.append(RecordedView(f"{row.episode_id}/{view}", resized_video(frames, image_size)))
     if not views:
         raise DataError("No episode is long enough to train on", where=episodes.root, expected=f">= {minimum} frames")
     return views
