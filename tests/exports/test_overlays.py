@@ -189,7 +189,7 @@ def four_frames(hand_tracks):
 
 def test_a_clip_shows_all_views_and_moves(four_frames) -> None:
     frames = {"head": grey(4), "right_wrist": grey(3)}
-    clip = overlay_clip(frames, four_frames, 8.0, tile_height=128, title="robot")
+    clip = np.stack(list(overlay_clip(frames, four_frames, 8.0, tile_height=128, title="robot")))
     # As long as the shortest; two tiles of 128 x 192, a gap, a heading and a legend; even sides.
     height, width = 128 + HEADING_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 192 + GAP_PX
     assert clip.shape == (3, height, width, 3)

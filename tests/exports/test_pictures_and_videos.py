@@ -20,7 +20,7 @@ from worldline_core.pictures.labels import (
     text_strip,
     text_width_px,
 )
-from worldline_core.pictures.side_by_side import GAP_PX, LABEL_HEIGHT_PX, compose_side_by_side, write_side_by_side
+from worldline_core.pictures.side_by_side import GAP_PX, LABEL_HEIGHT_PX, side_by_side, write_side_by_side
 
 
 def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray:
@@ -73,13 +73,13 @@ def test_contact_sheet_holds_every_picture() -> None:
 
 def test_columns_stay_in_step_and_end_with_the_shortest() -> None:
     columns = {"true": clip(9, 10), "Stage II": clip(5, 20), "causal": clip(7, 30, (32, 48))}
-    frames = compose_side_by_side(columns, tile_height=64)
+    frames = np.stack(list(side_by_side(columns, tile_height=64)))
     assert frames.shape == (5, 64 + LABEL_HEIGHT_PX, 3 * 96 + 2 * GAP_PX, 3)
     body = frames[:, LABEL_HEIGHT_PX:]
     starts = (0, 96 + GAP_PX, 2 * (96 + GAP_PX))
     assert [int(body[:, :, start : start + 96].mean()) for start in starts] == [10, 20, 30]
     with pytest.raises(ValueError, match="at least one column"):
-        compose_side_by_side({})
+        side_by_side({})
 
 
 def test_side_by_side_video_and_poster(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -24,6 +24,7 @@ from worldline_core.actions.overlays import (
     draw_overlay,
 )  # fmt: skip
 from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frames import Frames, in_step
 from worldline_core.errors import DataError
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
 from worldline_core.pictures.labels import INK, PAPER, Picture, font, text_strip, text_width_px
@@ -84,43 +85,45 @@ def legend_strip(
 
 
 def overlay_clip(
-    frames: Mapping[str, NDArray[np.uint8]],
+    frames: Mapping[str, Frames],
     tracks: EpisodeTracks,
     fps: float,
     *,
     tile_height: int = TILE_HEIGHT,
     style: OverlayStyle = DEFAULT_STYLE,
     title: str = "",
-) -> NDArray[np.uint8]:
+) -> Iterator[Picture]:
     """All views side by side, from the first frame on, as long as every view and the tracks have frames.
 
     Args:
         frames: by view, `n h w 3` RGB; views that are missing are left out.
         title: shown with the name of the first view.
 
-    Returns: `n H W 3`, H and W even.
+    Returns: pictures (H, W, 3) one after the other, H and W even.
 
     Raises:
         DataError: the tracks have none of these views.
     """
-    views = [view for view in tracks.views if view in frames]
-    if not views:
+    shown = {view: frames[view] for view in tracks.views if view in frames}
+    if not shown:
         raise DataError(
             "No view to draw",
             where=f"episode {tracks.episode_id}",
             expected=", ".join(tracks.views),
             got=", ".join(frames) or "no frames",
         )
-    count = min(tracks.num_frames, *(len(frames[view]) for view in views))
-    shown: list[Picture] = []
     headings: dict[str, Picture] = {}
-    for n in range(count):
-        tiles = [draw_overlay(frames[view][n], tracks, n, view, tile_height=tile_height, style=style) for view in views]
-        height = HEADING_HEIGHT_PX + max(tile.shape[0] for tile in tiles)
+
+    def picture(n: int, pictures: Mapping[str, Picture]) -> Picture:
+        tiles = {
+            view: draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
+            for view, frame in pictures.items()
+        }
+        height = HEADING_HEIGHT_PX + max(tile.shape[0] for tile in tiles.values())
         columns: list[Picture] = []
-        for view, tile in zip(views, tiles, strict=True):
+        for view, tile in tiles.items():
             if view not in headings:
-                name = view_name(view) + (f"  ·  {title}" if title and view == views[0] else "")
+                name = view_name(view) + (f"  ·  {title}" if title and not headings else "")
                 headings[view] = text_strip(name, tile.shape[1], HEADING_HEIGHT_PX, ink=STRIP_INK, paper=STRIP_PAPER)
             below = _blank(height - HEADING_HEIGHT_PX - tile.shape[0], tile.shape[1])
             columns += [np.concatenate([headings[view], tile, below], axis=0), _blank(height, GAP_PX)]
@@ -133,9 +136,10 @@ def overlay_clip(
             ink=STRIP_INK,
             paper=STRIP_PAPER,
         )
-        shown.append(np.concatenate([row, legend], axis=0))
-    clip = np.stack(shown)
-    return np.ascontiguousarray(clip[:, : clip.shape[1] // 2 * 2, : clip.shape[2] // 2 * 2])
+        whole = np.concatenate([row, legend], axis=0)
+        return np.ascontiguousarray(whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2])
+
+    return map(picture, range(tracks.num_frames), in_step(shown))
 
 
 def _blank(height: int, width: int) -> Picture:
@@ -144,7 +148,7 @@ def _blank(height: int, width: int) -> Picture:
 
 def write_overlay_video(
     path: Path,
-    frames: Mapping[str, NDArray[np.uint8]],
+    frames: Mapping[str, Frames],
     tracks: EpisodeTracks,
     fps: float,
     *,

@@ -28,6 +28,7 @@ from worldline_core.actions.tool_projection import TrackCounts, add_counts
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
@@ -251,7 +252,7 @@ def _previews(config: RenderActionsConfig, episodes: EpisodeSet, tracks: ActionT
         sheet_path, video_path = folder / f"{name}.png", folder / f"{name}.mp4"
         if sheet_path.is_file() and video_path.is_file():
             continue
-        frames = {view: episodes.frames(position, view) for view in row.views}
+        frames = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
         found, height = tracks.tracks(row.episode_id), config.preview_height
         style, title = OverlayStyle(config.sigma_px_ref), f"{row.embodiment}  ·  {row.instruction}"
         write_overlay_video(video_path, frames, found, row.fps, tile_height=height, style=style, title=title)

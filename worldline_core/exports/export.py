@@ -7,8 +7,6 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.curation.source_table import SOURCES_FILE
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -19,6 +17,7 @@ from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.video.encoder import PixelFormat
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
@@ -87,7 +86,7 @@ def _export_episodes(
         raise DataError("Two episodes would get one file name", where=output, got=twice, next_step="export them apart")
     for position in positions if {*MCAP_FORMATS, "rrd"} & set(formats) else ():
         row, episode = episodes.rows[position], episodes.episode(position)
-        frames = {view: np.asarray(episodes.frames(position, view)) for view in row.views}
+        frames = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
         stem = safe_stem(row.episode_id)
         for wanted in (each for each in MCAP_FORMATS if each in formats):
             masks = {view: mask for view in row.views if (mask := episodes.robot_masks(position, view)) is not None}
@@ -106,7 +105,7 @@ def _export_episodes(
 
 
 def export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> Path:
-    """Write rows of a set as a set of its own, whose datasets lie inside of it; one episode is in memory at a time.
+    """Write rows of a set as a set of its own, whose datasets lie inside of it; a few frames are in memory at a time.
 
     Videos are copied without encoding where a row begins at a key frame.
 
@@ -119,12 +118,9 @@ def export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int])
             if writer.has(row.episode_id):
                 continue
             views = {
-                view: RecordedView(
-                    lambda position=position, view=view: iter(episodes.frames(position, view)),
-                    row.video_frames,
-                    episodes.clip(position, view),
-                )
+                view: RecordedView(lambda clip=clip: iter(VideoFrames(clip)), row.video_frames, clip)
                 for view in row.views
+                for clip in (episodes.clip(position, view),)
             }
             masks = {view: mask for view in row.views if (mask := episodes.robot_masks(position, view)) is not None}
             writer.add(with_rigid_poses(episodes.episode(position)), views, masks or None)

@@ -24,6 +24,7 @@ from worldline_core.pictures.clip_strip import KEPT_COLOUR, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
+    from worldline_core.data.video.frames import Frames
     from worldline_core.filters.verdict import Finding
 
 _LARGEST_RATIO = 5.0
@@ -32,7 +33,7 @@ _LARGEST_RATIO = 5.0
 
 def write_filter_recording(
     path: Path,
-    frames: Mapping[str, NDArray[np.uint8]],
+    frames: Mapping[str, Frames],
     dropped: Mapping[str, NDArray[np.bool_]],
     findings: Sequence[Finding],
     fps: float,

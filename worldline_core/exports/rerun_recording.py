@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import hashlib
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import batched
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,10 +39,10 @@ from worldline_core.store.atomic import atomic_path
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.data.episodes.episode import Episode
+    from worldline_core.data.video.frames import Frames
 
-Clip = NDArray[np.uint8]
-"""`n h w 3` RGB frames."""
-
+PIECE_FRAMES = 64
+"""So many pictures are logged together."""
 FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
 """Depth at which a frustum ends: wrist cameras are near to what they see."""
 ROBOT_COLOUR = (190, 194, 202)
@@ -61,8 +62,8 @@ class RecordingContent:
     """
 
     episode: Episode
-    true_frames: Mapping[str, Clip]
-    predicted_frames: Mapping[str, Mapping[str, Clip]] = field(default_factory=dict)
+    true_frames: Mapping[str, Frames]
+    predicted_frames: Mapping[str, Mapping[str, Frames]] = field(default_factory=dict)
     tracks: EpisodeTracks | None = None
     joint_names: Sequence[str] = ()
     sigma_px_ref: float = SIGMA_PX_REFERENCE
@@ -91,18 +92,22 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
         stream.disconnect()
 
 
-def timeline(count: int, fps: float) -> list[rr.TimeColumn]:
+def timeline(count: int, fps: float, first: int = 0) -> list[rr.TimeColumn]:
     """The two time columns that every entity uses: frame number, and seconds since the episode's start."""
-    frames = np.arange(count)
+    frames = np.arange(first, first + count)
     return [rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("time", duration=frames / fps)]
 
 
-def log_frames(stream: rr.RecordingStream, entity: str, frames: Clip, fps: float) -> None:
-    """Log a clip as JPEG pictures, one per time step."""
-    columns = rr.EncodedImage.columns(
-        blob=[jpeg_bytes(frame, quality=92) for frame in frames], media_type=["image/jpeg"] * len(frames)
-    )
-    stream.send_columns(entity, timeline(len(frames), fps), columns)
+def log_frames(stream: rr.RecordingStream, entity: str, frames: Frames, fps: float) -> None:
+    """Log frames `n h w 3` as JPEG pictures, one per time step."""
+    _log_images(stream, entity, (jpeg_bytes(frame, quality=92) for frame in frames), "image/jpeg", fps)
+
+
+def _log_images(stream: rr.RecordingStream, entity: str, images: Iterable[bytes], kind: str, fps: float) -> None:
+    """Log encoded images, one per time step, in pieces."""
+    for number, part in enumerate(batched(images, PIECE_FRAMES)):
+        columns = rr.EncodedImage.columns(blob=list(part), media_type=[kind] * len(part))
+        stream.send_columns(entity, timeline(len(part), fps, number * PIECE_FRAMES), columns)
 
 
 def _log_cameras(stream: rr.RecordingStream, content: RecordingContent) -> None:
@@ -164,18 +169,15 @@ def _log_robot(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) ->
 
 
 def _log_overlay(
-    stream: rr.RecordingStream, tracks: EpisodeTracks, view: str, frames: Clip, fps: float, sigma_px_ref: float
+    stream: rr.RecordingStream, tracks: EpisodeTracks, view: str, frames: Frames, fps: float, sigma_px_ref: float
 ) -> None:
     """What `draw_overlay` draws over a view, as layers that can be shown and hidden one by one."""
     v, entity = tracks.views.index(view), f"world/cameras/{view}"
     count, size = min(len(frames), tracks.num_frames), (frames.shape[1], frames.shape[2])
     times = timeline(count, fps)
-    heat = rr.EncodedImage.columns(
-        blob=[png_bytes(heat_layer(tracks, n, view, size, sigma_px_ref)) for n in range(count)],
-        media_type=["image/png"] * count,
-        draw_order=[10.0] * count,
-    )
-    stream.send_columns(f"{entity}/actions", times, heat)
+    heat = (png_bytes(heat_layer(tracks, n, view, size, sigma_px_ref)) for n in range(count))
+    _log_images(stream, f"{entity}/actions", heat, "image/png", fps)
+    stream.log(f"{entity}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
     shown = [(n, a) for n in range(count) for a in range(len(tracks.arms)) if tracks.valid[n, v, a]]
     if not shown:
         return

@@ -17,6 +17,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.encodings import Encoding
 from worldline_core.data.mcap.writer import write_rollout_mcap
+from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -114,14 +115,13 @@ def recording_content(
     index = episode_set.position(episode_id)
     episode = episode_set.episode(index)
     views = [view for view in VIEWS if view in episode_set.rows[index].views]
-    predicted: dict[str, dict[str, np.ndarray]] = {}
-    for method, rollout in rollouts.items():
-        seed = rollout.seeds(episode_id)[0]
-        there = rollout.views(episode_id)
-        predicted[method] = {
-            view: np.asarray(rollout.frames(episode_id, view, seed)) for view in views if view in there
+    predicted = {
+        method: {
+            view: VideoFrames(rollout.clip(episode_id, view)) for view in views if view in rollout.views(episode_id)
         }
-    true_frames = {view: np.asarray(episode_set.frames(index, view)) for view in views}
+        for method, rollout in rollouts.items()
+    }
+    true_frames = {view: VideoFrames(episode_set.clip(index, view)) for view in views}
     return RecordingContent(episode, true_frames, predicted, tracks, episode.state_names or (), sigma_px_ref)
 
 
@@ -145,7 +145,7 @@ def write_mcap_recordings(content: RecordingContent, output: Path, stem: str, wa
         written.append(mcap_file(output, f"{stem}_{safe_stem(method)}", wanted))
         write_rollout_mcap(
             written[-1],
-            {view: frames[:count] for view, frames in views.items()},
+            {view: MadeFrames(frames.__iter__, frames.shape, np.uint8)[:count] for view, frames in views.items()},
             episode.fps,
             metadata={key: json.dumps(value) for key, value in facts.items()},
             cameras=cameras,

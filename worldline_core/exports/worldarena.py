@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
-
-import numpy as np
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.video.encoder import Encoding, VideoEncoder
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import DataError
 from worldline_core.pictures.labels import png_bytes
@@ -31,7 +31,6 @@ from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 
 HEAD = "head"
-_TRUTH = Encoding(8, "veryfast", "yuv444p")
 
 
 def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequence[str], output: Path) -> list[Path]:
@@ -62,12 +61,11 @@ def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequenc
         )
         with atomic_path(predicted) as temporary:
             shutil.copyfile(check_video_header(clip.path), temporary)
-        frames = np.asarray(episodes.frames(position, HEAD, [stride * n for n in range(clip.num_frames)]))
-        size = (int(frames.shape[1]), int(frames.shape[2]))
-        with atomic_path(true) as temporary, VideoEncoder(temporary, size, rollouts.fps, _TRUTH) as encoder:
-            for frame in frames:
-                encoder.add(frame)
-        write_bytes_atomic(first, png_bytes(frames[0]))
+        frames = VideoFrames(episodes.clip(position, HEAD), stride)
+        with atomic_path(true) as temporary:
+            shown = islice(frames, clip.num_frames)
+            encode_video(temporary, shown, rollouts.fps, crf=8, preset="veryfast", pixel_format="yuv444p")
+        write_bytes_atomic(first, png_bytes(frames[[0]][0]))
         written += [predicted, true, first]
         summary.append({"gt_path": f"{true.resolve()}", "image": f"{first.resolve()}", "prompt": [row.instruction]})
         ids[stem] = name

@@ -11,6 +11,7 @@ import numpy as np
 from worldline_core.config import validate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import inspect
 from worldline_core.filters.filter_config import FilterConfig
@@ -210,7 +211,7 @@ def write_episode(filtered: FilteredSet, episode_id: str, output: Path, *, rerun
     row = filtered.episodes.rows[i]
     findings = filtered.findings(episode_id)
     recording = output / f"{safe_stem(episode_id)}_filters.rrd"
-    frames = {view: np.asarray(filtered.episodes.frames(i, view)) for view in row.views}
+    frames = {view: VideoFrames(filtered.episodes.clip(i, view)) for view in row.views}
     dropped = filtered.dropped_frames(episode_id, findings)
     write_filter_recording(recording, frames, dropped, findings, row.fps, summary(episode, findings))
     return [path, recording]

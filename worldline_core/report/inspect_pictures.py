@@ -14,6 +14,7 @@ from worldline_core.actions.overlay_views import write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError, WorldLineError
 from worldline_core.exports.rollout import export_rollout, recording_content, shown_tracks
 from worldline_core.pages.page import render, words
@@ -218,7 +219,7 @@ class Subject:
 
     def _write_overlay(self, path: Path, position: int, tracks: EpisodeTracks) -> None:
         row = self.episodes.rows[position]
-        frames = {view: np.asarray(self.episodes.frames(position, view)) for view in row.views}
+        frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
         title = f"{row.embodiment}  ·  {row.instruction}"
         write_overlay_video(path, frames, tracks, row.fps, style=OverlayStyle(self.sigma_px_ref), title=title)
 
@@ -254,13 +255,13 @@ def rollout_sheet(rollouts: RolloutSet, episode_id: str | None) -> Picture | Non
                 got=episode_id,
             )
         for view in rollouts.views(episode_id):
-            frames = np.asarray(rollouts.frames(episode_id, view, rollouts.seeds(episode_id)[0]))
+            frames = VideoFrames(rollouts.clip(episode_id, view))
             rows.append(SheetRow(view, frames[evenly_spaced(len(frames), MOMENTS)]))
         return contact_sheet(rows, title=f"{rollouts.method}  ·  {episode_id}")
     views = {str(row["episode_id"]): str(row["view"]) for row in reversed(read_rows(rollouts.root / "index.parquet"))}
     names = sorted(rollouts.episode_ids)
     for episode_id in [names[i] for i in evenly_spaced(len(names), SHEET_ROWS)]:
-        frames = np.asarray(rollouts.frames(episode_id, views[episode_id], rollouts.seeds(episode_id)[0]))
+        frames = VideoFrames(rollouts.clip(episode_id, views[episode_id]))
         moments = evenly_spaced(len(frames), MOMENTS)
         rows.append(SheetRow(f"{rollouts.method}  ·  {episode_id}", frames[moments], views[episode_id]))
     return contact_sheet(rows) if rows else None

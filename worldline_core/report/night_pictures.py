@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.evaluation.recordings import HEAD, stride_of
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
 from worldline_core.pictures.labels import jpeg_bytes
@@ -45,7 +46,7 @@ def write_night_pictures(history: Path, compared: NightlyComparison, artifacts: 
             continue
         if HEAD not in rollout.views(recording):
             continue
-        predicted, position = rollout.frames(recording, HEAD), episodes.position(recording)
+        predicted, position = VideoFrames(rollout.clip(recording, HEAD)), episodes.position(recording)
         moments = evenly_spaced(len(predicted), MOMENTS)
         stride = stride_of(rollout, episodes.rows[position])
         true = episodes.frames(position, HEAD, [stride * moment for moment in moments])

@@ -6,9 +6,11 @@ Episodes are never picked by hand: shown are the best, the median and the worst 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,12 @@ import numpy as np
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import Frames, VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.exports.rollout import export_rollout
 from worldline_core.pages.page import words
 from worldline_core.pictures.labels import draw_tag
-from worldline_core.pictures.side_by_side import compose_side_by_side, write_side_by_side, write_video
+from worldline_core.pictures.side_by_side import side_by_side, write_side_by_side, write_video
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.video_scores import SPLIT_LABELS, Method, VideoScores, in_order
 
@@ -139,32 +142,43 @@ def methods_of_group(context: ReportContext, episode_id: str, group: str) -> lis
     return [*own, *[m for m in methods if m.group == "baseline"]][: context.config.max_columns - 1] if own else []
 
 
-def predicted_frames(context: ReportContext, name: str, episode_id: str, view: str) -> np.ndarray:
-    """The first seed's prediction of a view, `n h w 3`."""
-    rollout = context.rollouts[name]
-    return np.asarray(rollout.frames(episode_id, view, rollout.seeds(episode_id)[0]))
-
-
 def video(context: ReportContext, item: ChosenEpisode, view: str, group: str, number: int) -> dict[str, Any] | None:
-    """Truth and one group's predictions of one view, with a caption; None when the group has none."""
+    """Truth and one group's predictions of one view, with a caption; None when the group has none.
+
+    What is found to be unreadable while it is written is left out, and named.
+    """
     episodes, name = context.episodes, item.episode_id
     methods = [m for m in methods_of_group(context, name, group) if view in context.rollouts[m.name].views(name)]
     if episodes is None or not methods:
         return None
-    index = episodes.position(item.episode_id)
-    columns: dict[str, np.ndarray] = {"true": np.asarray(episodes.frames(index, view))}
-    unreadable: list[str] = []
-    for method in methods:
-        try:
-            columns[method.label] = predicted_frames(context, method.name, item.episode_id, view)
-        except DataError as error:
-            unreadable.append(f"{method.label}: {error.what}")
-    made = write_side_by_side(
-        context.media / f"episode{number}_{group}_{view}.mp4", columns, episodes.rows[index].fps,
-        tile_height=context.config.tile_height, upscale=context.config.upscale,
-    )  # fmt: skip
+    index = episodes.position(name)
+    path, fps = context.media / f"episode{number}_{group}_{view}.mp4", episodes.rows[index].fps
+    shape = {"tile_height": context.config.tile_height, "upscale": context.config.upscale}
+    columns = {"true": VideoFrames(episodes.clip(index, view))}
+    columns |= {method.label: VideoFrames(context.rollouts[method.name].clip(name, view)) for method in methods}
+    unreadable: dict[str, str] = {}
+    try:
+        made = write_side_by_side(path, columns, fps, **shape)
+    except DataError:
+        unreadable = {
+            label: fault for label, frames in columns.items() if label != "true" and (fault := _fault(frames))
+        }
+        if not unreadable:
+            raise
+        columns = {label: frames for label, frames in columns.items() if label not in unreadable}
+        made = write_side_by_side(path, columns, fps, **shape)
     caption = f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames). Columns: {', '.join(columns)}."
-    return {"video": made, "caption": caption, "unreadable": unreadable}
+    return {"video": made, "caption": caption, "unreadable": [f"{label}: {what}" for label, what in unreadable.items()]}
+
+
+def _fault(frames: Frames) -> str | None:
+    """What is wrong with a video that cannot be read to its end."""
+    try:
+        for _ in frames:
+            pass
+    except DataError as error:
+        return error.what
+    return None
 
 
 def recordings(context: ReportContext, item: ChosenEpisode, number: int) -> list[str]:
@@ -194,14 +208,15 @@ def overview_video(context: ReportContext) -> dict[str, Any] | None:
     method = next((m for m in methods if m.name == context.config.primary_method), methods[0])
     index = episodes.position(item.episode_id)
     row = episodes.rows[index]
-    rows: list[np.ndarray] = []
-    predicted_views = context.rollouts[method.name].views(item.episode_id)
-    for view in [v for v in VIEWS if v in row.views and v in predicted_views]:
-        true = np.asarray(episodes.frames(index, view))
-        predicted = predicted_frames(context, method.name, item.episode_id, view)
-        columns = {"recorded": true, f"predicted, {method.label}": predicted}
-        frames = compose_side_by_side(columns, tile_height=192, labels=not rows)
-        rows.append(np.stack([draw_tag(frame, words(view)) for frame in frames]))
-    count = min(len(frames) for frames in rows)
-    made = write_video(context.media / "overview.mp4", np.concatenate([f[:count] for f in rows], axis=1), row.fps)
+    rows: list[Iterator[np.ndarray]] = []
+    count = row.video_frames
+    rollout = context.rollouts[method.name]
+    for view in [v for v in VIEWS if v in row.views and v in rollout.views(item.episode_id)]:
+        predicted = VideoFrames(rollout.clip(item.episode_id, view))
+        columns = {"recorded": VideoFrames(episodes.clip(index, view)), f"predicted, {method.label}": predicted}
+        tagged = partial(draw_tag, text=words(view))
+        rows.append(map(tagged, side_by_side(columns, tile_height=192, labels=not rows)))
+        count = min(count, len(predicted))
+    pictures = (np.concatenate(tiles, axis=0) for tiles in islice(zip(*rows, strict=False), count))
+    made = write_video(context.media / "overview.mp4", pictures, count, row.fps)
     return {"video": made, "item": item, "row": row, "method": method}

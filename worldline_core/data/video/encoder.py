@@ -8,8 +8,8 @@ frame, and presentation order equals file order: clips can be joined without enc
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -223,7 +223,7 @@ class VideoEncoder:
 
 def encode_video(
     path: Path,
-    frames: np.ndarray,
+    frames: Iterable[np.ndarray],
     fps: float,
     *,
     crf: int = 18,
@@ -233,22 +233,28 @@ def encode_video(
     """Write frames as an H.264 mp4 whose bytes depend on the arguments alone.
 
     Args:
-        frames: uint8 (N, H, W, 3) RGB; H and W even for yuv420p.
+        frames: uint8 (H, W, 3) RGB one after the other; H and W even for yuv420p.
         crf: quality, 0 (exact up to the colour conversion) .. 51.
 
     Raises: DataError for empty, wrongly shaped or wrongly typed frames.
     """
-    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or frames.shape[0] == 0:
-        raise DataError(
-            "Cannot encode these frames as video",
-            where=path,
-            expected="uint8 (N > 0, H, W, 3)",
-            got=f"{frames.dtype} {frames.shape}",
-        )
-    size = frames.shape[1], frames.shape[2]
-    with VideoEncoder(path, size, fps, Encoding(crf, preset, pixel_format)) as encoder:
+    encoder: VideoEncoder | None = None
+    with ExitStack() as stack:
         for frame in frames:
+            if encoder is None and (frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8):
+                raise _not_frames(path, f"{frame.dtype} {frame.shape}")
+            if encoder is None:
+                encoding = Encoding(crf, preset, pixel_format)
+                encoder = stack.enter_context(VideoEncoder(path, (frame.shape[0], frame.shape[1]), fps, encoding))
             encoder.add(frame)
+    if encoder is None:
+        raise _not_frames(path, "none")
+
+
+def _not_frames(path: Path, got: str) -> DataError:
+    return DataError(
+        "Cannot encode these frames as video", where=path, expected="uint8 (H, W, 3), one or more", got=got
+    )
 
 
 def concatenate_videos(path: Path, parts: Sequence[tuple[Path, int]], fps: float) -> None:
