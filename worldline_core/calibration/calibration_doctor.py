@@ -6,7 +6,7 @@ scored by its evidence (`_Search`), and the scores decide (`verdict`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
@@ -57,14 +57,14 @@ _CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_si
 
 def diagnose(
     episode: Episode,
-    frames: Mapping[str, np.ndarray],
+    frames: Mapping[str, Iterable[np.ndarray]],
     kinematics: ArmKinematics | None,
     config: CalibrationDoctorConfig = DEFAULT_CONFIG,
 ) -> Diagnosis:
     """Whether an episode's calibration is consistent and, if not, which usual mistake explains it.
 
     Args:
-        frames: images by view, uint8 (n, H, W, 3) RGB or (n, h, w) grey; views without images are judged by poses.
+        frames: images by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; views without images are judged by poses.
         kinematics: of the embodiment; None where unknown (tool poses must then be recorded).
 
     Returns:

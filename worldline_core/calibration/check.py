@@ -29,6 +29,7 @@ from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.sources.open import nothing_found, open_source
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.labels import jpeg_bytes
@@ -159,8 +160,7 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
         return LoadedEpisode(
             episodes.episode(position),
             tuple(episodes.rows[position].views),
-            lambda view: episodes.frames(position, view),
-            lambda view: episodes.robot_masks(position, view),
+            clips={view: episodes.clip(position, view) for view in episodes.rows[position].views},
         )
 
     return [ListedEpisode(row.episode_id, row.source, partial(load, i)) for i, row in enumerate(episodes.rows)]
@@ -261,19 +261,26 @@ def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmK
     return None, f"without kinematics of {episode.embodiment}: it has other arms than the recording"
 
 
-def _images(loaded: LoadedEpisode, view: str) -> np.ndarray:
-    images = np.asarray(loaded.frames(view))
+def _images(loaded: LoadedEpisode, view: str) -> MadeFrames:
+    """A view's pictures, read each time somebody goes through them: an episode may be too long to be held."""
     expected = loaded.episode.num_video_frames
-    if len(images) != expected:
-        raise RejectedInputError(
-            "length_mismatch",
-            "Video and states differ in length",
-            where=f"episode {loaded.episode.episode_id}, view {view}",
-            expected=f"{expected} frames",
-            got=f"{len(images)} frames",
-            evidence={"states": expected, "frames": len(images)},
-        )
-    return images
+
+    def counted() -> Iterator[np.ndarray]:
+        found = 0
+        for image in loaded.each_image(view):
+            yield image
+            found += 1
+        if found != expected:
+            raise RejectedInputError(
+                "length_mismatch",
+                "Video and states differ in length",
+                where=f"episode {loaded.episode.episode_id}, view {view}",
+                expected=f"{expected} frames",
+                got=f"{found} frames",
+                evidence={"states": expected, "frames": found},
+            )
+
+    return MadeFrames(counted, (expected,), np.uint8)
 
 
 def _one_line(error: DataError) -> str:

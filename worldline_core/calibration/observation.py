@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -19,6 +19,7 @@ GRAY_WIDTH = 96
 CELL_PX = 4
 STILL_CHANGE = 4.0
 """Grey levels: compression and sensor noise stay below."""
+_STEPS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -109,11 +110,13 @@ class Observation:
         return {} if kinematics is None else kinematics.embodiment.noted_posture(self.episode.conventions)
 
 
-def observe(episode: Episode, frames: Mapping[str, np.ndarray], kinematics: ArmKinematics | None) -> Observation:
+def observe(
+    episode: Episode, frames: Mapping[str, Iterable[np.ndarray]], kinematics: ArmKinematics | None
+) -> Observation:
     """Measure an episode.
 
     Args:
-        frames: by view, uint8 (n, H, W, 3) RGB or (n, h, w) grey; resized to GRAY_WIDTH.
+        frames: by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; resized to GRAY_WIDTH.
 
     Raises: DataError when images have another shape or the kinematics belong to another number of arms.
     """
@@ -121,19 +124,21 @@ def observe(episode: Episode, frames: Mapping[str, np.ndarray], kinematics: ArmK
     return Observation(episode, gray, arms_of(episode, kinematics), kinematics)
 
 
-def small_gray(images: np.ndarray) -> np.ndarray:
-    """uint8 (n, h, GRAY_WIDTH) of RGB (n, H, W, 3) or grey (n, H, W) images."""
-    if images.ndim not in (3, 4) or images.dtype != np.uint8 or (images.ndim == 4 and images.shape[3] != 3):
+def small_gray(images: Iterable[np.ndarray]) -> np.ndarray:
+    """uint8 (n, h, GRAY_WIDTH) of RGB (H, W, 3) or grey (H, W) images, one after the other."""
+    return np.stack([_small(image) for image in images])
+
+
+def _small(image: np.ndarray) -> np.ndarray:
+    if image.ndim not in (2, 3) or image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
         raise DataError(
-            "Images have a wrong shape",
-            expected="uint8 (n, H, W, 3) or (n, H, W)",
-            got=f"{images.dtype} {images.shape}",
+            "Images have a wrong shape", expected="uint8 (H, W, 3) or (H, W)", got=f"{image.dtype} {image.shape}"
         )
-    if images.ndim == 3 and images.shape[2] == GRAY_WIDTH:
-        return images
-    height = max(2, round(images.shape[1] * GRAY_WIDTH / images.shape[2]))
-    gray = images if images.ndim == 3 else [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-    return np.stack([cv2.resize(image, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA) for image in gray])
+    gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if image.ndim == 2 and image.shape[1] == GRAY_WIDTH:
+        return image
+    height = max(2, round(image.shape[0] * GRAY_WIDTH / image.shape[1]))
+    return cv2.resize(gray, (GRAY_WIDTH, height), interpolation=cv2.INTER_AREA)
 
 
 def cell_centres(height: int, width: int) -> np.ndarray:
@@ -153,16 +158,23 @@ def cell_means(values: np.ndarray) -> np.ndarray:
 
 
 def _motion(gray: np.ndarray) -> Motion:
-    value = gray.astype(np.float32)
     if len(gray) < 2:
         empty = np.zeros((0, gray.shape[1] // CELL_PX, gray.shape[2] // CELL_PX), dtype=np.float32)
         return Motion(np.zeros((*empty.shape, 2), dtype=np.float32), empty, empty)
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     engine.setFinestScale(1)
-    flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(gray)])  # type: ignore[call-overload]
-    across = np.abs(np.diff(value[:-1], axis=2, append=value[:-1, :, -1:]))
-    down = np.abs(np.diff(value[:-1], axis=1, append=value[:-1, -1:]))
-    return Motion(cell_means(flow), cell_means(np.abs(np.diff(value, axis=0))), cell_means(np.maximum(across, down)))
+    parts: list[tuple[np.ndarray, ...]] = []
+    # Cells alone are kept of an episode: flow of every pixel of some minutes would fill gigabytes.
+    for begin in range(0, len(gray) - 1, _STEPS_AT_ONCE):
+        part = gray[begin : begin + _STEPS_AT_ONCE + 1]
+        value = part.astype(np.float32)
+        flow = np.stack([engine.calc(a, b, None) for a, b in pairwise(part)])  # type: ignore[call-overload]
+        across = np.abs(np.diff(value[:-1], axis=2, append=value[:-1, :, -1:]))
+        down = np.abs(np.diff(value[:-1], axis=1, append=value[:-1, -1:]))
+        change = np.abs(np.diff(value, axis=0))
+        parts.append((cell_means(flow), cell_means(change), cell_means(np.maximum(across, down))))
+    flow, change, texture = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Motion(flow, change, texture)
 
 
 def arms_of(episode: Episode, kinematics: ArmKinematics | None) -> tuple[Arm, ...]:

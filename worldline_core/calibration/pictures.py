@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from worldline_core.calibration.diagnosis import Diagnosis, ViewMeasures
     from worldline_core.data.episodes.conventions import RecordedConventions
     from worldline_core.data.episodes.episode import Episode
+    from worldline_core.data.video.frames import Frames
     from worldline_core.geometry.kinematics import ArmKinematics
 
 TILE_HEIGHT = 256
@@ -102,7 +104,7 @@ def telling_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, cou
 def diagnosis_picture(
     diagnosis: Diagnosis,
     recorded: Episode,
-    frames: Mapping[str, np.ndarray],
+    frames: Mapping[str, Frames],
     kinematics: ArmKinematics | None,
     *,
     moments: int = MOMENTS,
@@ -151,9 +153,10 @@ def diagnosis_picture(
         outlined |= view == HEAD_VIEW
         # A note on one side keeps its line on the other: the two sheets must stay level.
         note = measures_note(measures.get(view)) or " "
-        left.append(SheetRow(view_name(view), _drawn(frames[view], before, view, chosen, 0, tile_height), note))
+        shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
+        left.append(SheetRow(view_name(view), _drawn(shown, before, view, 0, tile_height), note))
         if repaired is not None:
-            tiles = _drawn(frames[view], after, view, chosen, lag, tile_height)
+            tiles = _drawn(shown, after, view, lag, tile_height)
             right.append(SheetRow(view_name(view), tiles, _seen_note(after)))
     if not left:
         raise DataError(
@@ -176,12 +179,13 @@ def diagnosis_picture(
 
 
 def _drawn(
-    images: np.ndarray, tracks: EpisodeTracks, view: str, chosen: Sequence[int], lag: int, tile_height: int
+    images: Mapping[int, np.ndarray], tracks: EpisodeTracks, view: str, lag: int, tile_height: int
 ) -> np.ndarray:
+    """Tiles of images by number."""
     style = OverlayStyle(SIGMA_PX_REF, heat=0.5, outline=view == HEAD_VIEW)
     tiles = []
-    for n in chosen:
-        tile = draw_overlay(images[n], tracks, n - lag, view, tile_height=tile_height, style=style)
+    for n, image in images.items():
+        tile = draw_overlay(image, tracks, n - lag, view, tile_height=tile_height, style=style)
         tiles.append(draw_tag(tile, f"frame {n}", size_px=11))
     return np.stack(tiles)
 
