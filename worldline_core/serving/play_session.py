@@ -14,12 +14,15 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
+from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError, WorldLineError
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.policies.openpi import OpenpiPolicy
@@ -295,7 +298,13 @@ class PlaySession:
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3]
         start, config = self._start, self._host.config
         drivers = ", ".join(dict.fromkeys(node.driver for node in way[1:]))
-        frames = {view: np.concatenate([node.frames[view] for node in way]) for view in way[0].frames}
+        blocks = {view: [node.frames[view] for node in way] for view in way[0].frames}
+        frames = {
+            view: MadeFrames(
+                partial(chain.from_iterable, videos), (sum(map(len, videos)), *videos[0].shape[1:]), np.uint8
+            )
+            for view, videos in blocks.items()
+        }
         states, commands = (np.concatenate([getattr(node, name) for node in way]) for name in ("states", "commands"))
         paths = await asyncio.to_thread(
             save_played, config.output, f"{start.episode.episode_id}-played-{stamp}", start, frames, states, commands,

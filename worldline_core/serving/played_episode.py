@@ -9,7 +9,9 @@ import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
+from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
+from worldline_core.data.video.frames import Frames
 from worldline_core.errors import DataError
 from worldline_core.exports.export import export
 from worldline_core.geometry.rotations import nearest_rotation
@@ -23,7 +25,7 @@ def save_played(
     folder: Path,
     name: str,
     start: RecordedStart,
-    frames: Mapping[str, np.ndarray],
+    frames: Mapping[str, Frames],
     states: np.ndarray,
     commands: np.ndarray,
     *,
@@ -64,6 +66,7 @@ def save_played(
     )  # fmt: skip
     root = folder / safe_stem(name)
     with EpisodeSetWriter(root / "episodes", fps=fps, pixel_format="yuv444p", video_preset="veryfast") as writer:
-        writer.add(episode, frames)
+        views = {view: RecordedView(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
+        writer.add(episode, views)
     others = [wanted for wanted in formats if wanted != "episodes"]
     return [root / "episodes", *(export(root / "episodes", root, others) if others else [])]
