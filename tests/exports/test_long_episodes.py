@@ -1,0 +1,176 @@
+"""What reads a whole episode holds a few of its frames: three times the frames take no more memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from worldline_core.actions.overlay_views import write_overlay_video
+from worldline_core.config import validate
+from worldline_core.data.curation.curate import curate
+from worldline_core.data.curation.curate_config import CurateConfig
+from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap.file import McapFile
+from worldline_core.data.video.clip import Picture
+from worldline_core.data.video.frames import VideoFrames, packed_images, pieces, unpacked_images
+from worldline_core.evaluation.segmenters.colour import ColourSegmenter
+from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
+from worldline_core.exports.export import export
+from worldline_core.exports.rollout import shown_tracks
+from worldline_core.pictures.side_by_side import write_side_by_side
+from worldline_core.report.inspect_pictures import rollout_sheet, write_pictures
+from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
+
+SHORT, LONG = 80, 240
+HEIGHT, WIDTH = 96, 128
+FRAME_BYTES = 3 * HEIGHT * WIDTH
+FPS = 10.0
+
+
+def write_set(root: Path, count: int) -> None:
+    """One episode with masks and labels, and a prediction of it that is the recording."""
+    time = np.arange(count) / FPS
+    poses = np.tile(np.diag([1.0, -1, -1, 1]), (count, 1, 1, 1))
+    poses[:, 0, :3, 3] = np.stack([0.2 * np.sin(time), 0.1 * np.cos(time), np.full(count, 0.8)], axis=1)
+    K = np.array([[90.0, 0, 63.5], [0, 91.0, 47.5], [0, 0, 1]])
+    state = np.stack([np.sin(time), np.cos(time)], axis=1).astype(np.float32)
+    episode = Episode(
+        episode_id="long", source="toy", embodiment="none", scene="s", task_family="lift", instruction="lift the red cube",
+        outcome="success", split="test", fps=FPS, state=state, action=state, timestamps=time, T_base_ee=poses, gripper=state[:, 1:],
+        cameras={view: CameraTrack(view, K, np.eye(4)[None], WIDTH, HEIGHT) for view in VIEWS}, state_names=("right/a", "right/gripper"),
+    )  # fmt: skip
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    shade = ((columns + rows)[None] + 3 * np.arange(count)[:, None, None]) % 200
+    frames = np.stack([shade, 200 - shade, shade // 2], axis=-1).astype(np.uint8)
+    with EpisodeSetWriter(root / "episodes", FPS, video_preset="ultrafast", pixel_format="yuv444p") as writer:
+        writer.add(
+            episode, dict.fromkeys(VIEWS, frames), {"head": shade < 60}, None, {"head": (shade < 20).astype(np.uint8)}
+        )
+    writer = RolloutSetWriter(root / "rollouts", "stage2", FPS)
+    writer.add("long", 0, dict.fromkeys(VIEWS, frames))
+    writer.close()
+
+
+class Recorded:
+    """A set that `write_set` wrote, as the outputs below take it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.episodes, self.rollouts = EpisodeSet.open(root / "episodes"), RolloutSet.open(root / "rollouts")
+        self.tracks_of_episode = shown_tracks(self.episodes.episode(0))
+        self.videos = {view: VideoFrames(self.episodes.clip(0, view)) for view in VIEWS}
+
+    def tracks(self, _: str) -> Any:
+        return self.tracks_of_episode
+
+
+class Still(ColourSegmenter):
+    """Masks every frame by itself, at no cost."""
+
+    def stream(self) -> Callable[[np.ndarray, np.ndarray | None], np.ndarray]:
+        return lambda video, _: video[..., 0] < 60
+
+
+def measured(recorded: Recorded, _: Path) -> None:
+    tracks: Any = recorded
+    measurement = EpisodeMeasurement(
+        recorded.episodes, tracks, recorded.episodes.rows[0], ("head",), {"": Still()}, None, {}
+    )
+    values = measurement.measure({"stage2": recorded.rollouts})["true"]["measured"][0]["frames"]
+    assert len(values["robot_iou_exact"]) == len(recorded.videos["head"])
+
+
+def curated(recorded: Recorded, output: Path) -> None:
+    source = {"kind": "episode_set", "name": "again", "path": str(recorded.root / "episodes")}
+    curate(validate(CurateConfig, {"sources": [source], "image_size": [48, 64]}, where="test"), {}, output)
+    assert EpisodeSet.open(output).robot_masks(0, "head") is not None
+
+
+def read_mcap(recorded: Recorded, output: Path) -> None:
+    (path,) = export(recorded.root / "episodes", output, ["mcap"])
+    loaded = read_exported_episode(McapFile(path))
+    exact = recorded.episodes.robot_masks(0, "head")
+    read = loaded.robot_masks("head")
+    assert exact is not None
+    assert read is not None
+    for one, other in zip(exact, read, strict=True):
+        assert np.array_equal(one, other)
+
+
+WITH_THUMBNAILS = ("episode as mcap", "episode as lerobot", "curate")
+"""Thumbnails of each view grow, and messages are collected in chunks: together less than the frames of one view."""
+OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
+    "side by side": lambda recorded, output: write_side_by_side(
+        output / "a.mp4", {"true": recorded.videos["head"], "again": recorded.videos["head"]}, FPS, tile_height=96
+    ),
+    "overlay": lambda recorded, output: write_overlay_video(
+        output / "a.mp4", recorded.videos, recorded.tracks_of_episode, FPS, tile_height=96
+    ),
+    "episode as mcap": read_mcap,
+    "episode as rrd": lambda recorded, output: export(recorded.root / "episodes", output, ["rrd"]),
+    "episode as lerobot": lambda recorded, output: export(recorded.root / "episodes", output, ["lerobot"]),
+    "rollout as mcap and rrd": lambda recorded, output: export(
+        recorded.root / "rollouts", output, ["mcap", "rrd"], episodes=recorded.root / "episodes"
+    ),
+    "worldarena": lambda recorded, output: export(
+        recorded.root / "rollouts", output, ["worldarena"], episodes=recorded.root / "episodes"
+    ),
+    "sheet of a rollout": lambda recorded, _: rollout_sheet(recorded.rollouts, None),
+    "inspect": lambda recorded, output: write_pictures(
+        "EpisodeSet", recorded.root / "episodes", output, None, "long", video=False, rerun=True, page=None
+    ),
+    "exact masks": measured,
+    "curate": curated,
+}
+
+
+@pytest.fixture(scope="module")
+def lengths(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Recorded]:
+    root = tmp_path_factory.mktemp("lengths")
+    for count in (SHORT, LONG):
+        write_set(root / str(count), count)
+    return {count: Recorded(root / str(count)) for count in (SHORT, LONG)}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_memory_does_not_grow_with_the_frames(
+    lengths: dict[int, Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    whole = Picture.rgb.fget
+    assert whole is not None
+    # Decoded frames lie in FFmpeg's memory, which is not traced; their copies are.
+    monkeypatch.setattr(Picture, "rgb", property(lambda picture: np.array(whole(picture))))
+    OUTPUTS[name](lengths[SHORT], tmp_path / "first")  # imports, fonts and tables that are read once
+    peaks: dict[int, int] = {}
+    for count, recorded in lengths.items():
+        tracemalloc.start()
+        try:
+            OUTPUTS[name](recorded, tmp_path / str(count))
+            peaks[count] = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+    one_view = (LONG - SHORT) * FRAME_BYTES
+    assert peaks[LONG] - peaks[SHORT] < (one_view if name in WITH_THUMBNAILS else one_view / 4)
+
+
+def test_packed_masks_are_those_of_one_piece_and_read_in_pieces() -> None:
+    """Of any size: the bits of eight images end with a byte, those of one need not."""
+    import zlib
+
+    random = np.random.default_rng(0)
+    for count, height, width in ((1, 1, 1), (7, 3, 5), (33, 13, 11), (300, 48, 64)):
+        masks = random.random((count, height, width)) < 0.1
+        masks[:, : height // 2] = False
+        labels = masks.astype(np.uint8) * random.integers(1, 4, (count, 1, 1), dtype=np.uint8)
+        for values, dtype, raw in ((masks, bool, np.packbits(masks)), (labels, np.uint8, labels)):
+            packed = packed_images(values, dtype, 9).tobytes()
+            assert packed == zlib.compress(raw.tobytes(), 9)
+            read = unpacked_images(packed, (count, height, width), dtype, "here")
+            assert np.array_equal(np.concatenate(list(pieces(read, 10))), values)
