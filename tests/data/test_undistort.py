@@ -58,7 +58,7 @@ def seen_through(lens: Distortion | None, camera: CameraTrack) -> tuple[np.ndarr
         found = cv2.fisheye.undistortPoints(pixels, camera.K, np.array(lens.coefficients), criteria=criteria)
     else:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
-        found = cv2.undistortPointsIter(pixels, camera.K, np.array(lens.coefficients), None, None, criteria)
+        found = cv2.undistortPointsIter(pixels, camera.K, np.array(lens.coefficients), None, None, criteria)  # type: ignore[call-overload]
     x, y = found.reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
     return x, y
 
@@ -81,7 +81,7 @@ def write_mcap_of_lens(
     masks: dict[str, np.ndarray] | None = None,
 ) -> None:
     """A file whose head camera states a lens; this project's own recordings have none."""
-    stated = lens
+    stated: Any = lens
     if isinstance(lens, Distortion):
         names = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
         model = "rational_polynomial" if len(lens.coefficients) > 5 else names[lens.model]

@@ -32,7 +32,7 @@ LINE = np.stack([np.linspace(10, 60, 17), np.full(17, 30.0)], axis=-1)[:, None]
 def recorded(project_root: Path) -> list[tuple[EpisodeTracks, np.ndarray]]:
     """Tracks and exact head masks of a recording of each shipped robot."""
     episodes = EpisodeSet.open(project_root / "artifacts/shipped/recordings")
-    kinematics = KinematicsByName(RenderActionsConfig().description_paths)
+    kinematics = KinematicsByName(RenderActionsConfig().description_paths)  # type: ignore[call-arg]
     chosen = {row.embodiment: position for position, row in enumerate(episodes.rows) if row.split == "test"}
     found = []
     for position in chosen.values():
@@ -100,7 +100,7 @@ def test_time_warping_follows_the_definition():
     assert time_warping_distance(a, b) == pytest.approx(recursive(4, 5))
     delayed = LINE[np.maximum(np.arange(17) - 1, 0)]
     assert time_warping_score(LINE, delayed) == 1.0  # a delay is warped away, but for the end
-    assert time_warping_score(LINE, LINE[::-1]) < 0.1
+    assert time_warping_score(LINE, LINE[::-1]) < 0.1  # type: ignore[operator]
 
 
 def test_dynamics_compare_speeds_and_accelerations():

@@ -58,7 +58,7 @@ def changed(picture: np.ndarray) -> np.ndarray:
 
 
 def near(picture: np.ndarray, colour: tuple[int, int, int], tolerance: int = 40) -> np.ndarray:
-    return (np.abs(picture.astype(int) - colour) <= tolerance).all(axis=-1)
+    return np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=-1)
 
 
 def test_heat_is_channel_zero_of_the_action_maps(hand_tracks) -> None:
