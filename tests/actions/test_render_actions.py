@@ -247,6 +247,16 @@ def test_a_set_without_any_tracks_is_an_error(tmp_path):
     assert not (tmp_path / "tracks" / "index.parquet").exists()
 
 
+def test_of_a_robot_that_nobody_describes_it_is_said_what_it_is_good_for(tmp_path):
+    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(64, 96)) as writer:
+        episode = replace(episode_of("so101", 0), embodiment="none")
+        writer.add(episode, {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras})
+    with pytest.raises(
+        DataError, match=r"unknown_embodiment\)[\s\S]*embodiment list[\s\S]*got: embodiment: none[\s\S]*Stage I"
+    ):
+        render_actions(CONFIG, {"episodes": tmp_path / "set"}, tmp_path / "tracks")
+
+
 def test_input_is_needed(tmp_path):
     with pytest.raises(ConfigError, match="needs an EpisodeSet"):
         render_actions(CONFIG, {}, tmp_path)

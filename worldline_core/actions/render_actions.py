@@ -25,12 +25,13 @@ from worldline_core.actions.episode_tracks import (
 from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
+from worldline_core.data.episodes.episode import UNDESCRIBED
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
-from worldline_core.geometry.kinematics import KinematicsByName
+from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
 from worldline_core.scale.account import InputRow, check_account, write_account
@@ -79,6 +80,15 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
     def _kinematics(self) -> KinematicsByName:
         return KinematicsByName(self.config.description_paths)
 
+    def _kinematics_of(self, embodiment: str) -> ArmKinematics:
+        if embodiment == UNDESCRIBED:
+            raise ConfigError(
+                "Nobody describes the robot of the recording", got=f"embodiment: {UNDESCRIBED}",
+                expected="a robot of `worldline embodiment list`",
+                next_step="declare the robot and its arms in the source; without, Stage I alone learns from it",
+            )  # fmt: skip
+        return self._kinematics.get(embodiment)
+
     def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
         done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()
         return () if done else episodes
@@ -91,7 +101,7 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
             needed = recorded.T_base_ee is None if controls == "state" else recorded.commanded
             tracks, counts = compute_tracks(
                 recorded,
-                self._kinematics.get(recorded.embodiment) if needed and recorded.state_kind == "joints" else None,
+                self._kinematics_of(recorded.embodiment) if needed and recorded.state_kind == "joints" else None,
                 controls=controls,
                 without_mount=self.config.without_mount,
             )
