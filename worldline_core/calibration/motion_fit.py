@@ -35,6 +35,8 @@ DEPTH_START_PER_M, MOST_PER_M, DEPTH_PRIOR = 4.0, 15.0, np.array([4.0, 20.0, 20.
 """Inverse depth of the scene before a wrist camera: a plane, its value in the middle and its slopes (priors)."""
 FLOW_ERROR_PX, FLOW_ERROR_SHARE, FAINT_EDGE = 0.5, 0.1, 20.0
 HAND_MARGIN_CELLS = 2.0
+LEAST_INFORMATION = 1e-20
+"""Of what a view could show and does not, since its camera rests: it is bounded by the priors alone, and named."""
 _STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.02, 0.02, 0.25])
 
 
@@ -66,16 +68,26 @@ class StillView:
         self.camera, self.points, self.radii = camera, points, radii
         change = np.log1p(np.maximum(motion.change - NOISE_CHANGE, 0.0))
         self.measured = np.concatenate([motion.flow, change[..., None]], axis=-1).astype(np.float32)
-        rows, columns = change.shape[1:]
-        self.cells = np.mgrid[:rows, :columns].reshape(2, -1)[::-1].astype(np.float32)
+        self._by_blur: dict[float, np.ndarray] = {}
+        self._maps: dict[tuple[bytes, int, int], tuple[np.ndarray, ...]] = {}
 
-    def equations(self, theta: np.ndarray, blur: float) -> Equations:
-        """The predicted maps move where the parameters move their points, and change where these change speed."""
-        value, shift, growth, cover = self._predicted(theta)
-        measured, value = _blurred(self.measured, blur), _blurred(value, blur)
+    def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
+        """The predicted maps move where the parameters move their points, and change where these change speed.
+
+        Args:
+            wanted: parameters whose equations are computed; those of the others are zero.
+        """
+        parameters, size = np.arange(PARAMETERS)[wanted], PARAMETERS + 1
+        key = theta.tobytes(), wanted.start, wanted.stop
+        if key not in self._maps:  # the start is looked at with more than one blur
+            self._maps[key] = self._predicted(theta, parameters)
+        value, shift, growth, cover = self._maps[key]
+        if blur not in self._by_blur:
+            self._by_blur[blur] = _blurred(self.measured, blur)
+        measured, value = self._by_blur[blur], _blurred(value, blur)
         active = (cover > 0.1) | (np.abs(measured).max(axis=-1) > 0.3)
         down, across = np.gradient(value, axis=(1, 2))
-        size = PARAMETERS + 1
+        columns = np.append(parameters, PARAMETERS)
         information, gradient, likelihood = np.zeros((size + 2, size + 2)), np.zeros(size + 2), 0.0
         for gain_index, channels in ((size, (0, 1)), (size + 1, (2,))):
             predicted, seen = value[..., channels], measured[..., channels]
@@ -89,23 +101,25 @@ class StillView:
                     across[..., channel, None] * shift[..., 0, :] + down[..., channel, None] * shift[..., 1, :]
                 )
                 if channel < 2:
-                    slope[..., :PARAMETERS] += gain * cover[..., None] * growth[..., channel, :]
-                slope = slope.reshape(-1, size)
+                    slope[..., :-1] += gain * cover[..., None] * growth[..., channel, :]
+                slope = slope.reshape(-1, len(columns))
                 scaled = gain * predicted[..., c].reshape(-1)
                 residual = error[..., c].reshape(-1)
-                information[:size, :size] += weight * (slope.T @ slope)
+                information[np.ix_(columns, columns)] += weight * (slope.T @ slope)
                 cross = weight * (slope.T @ scaled)
-                information[:size, gain_index] += cross
-                information[gain_index, :size] += cross
+                information[columns, gain_index] += cross
+                information[gain_index, columns] += cross
                 information[gain_index, gain_index] += weight * float(scaled @ scaled)
-                gradient[:size] += weight * (slope.T @ residual)
+                gradient[columns] += weight * (slope.T @ residual)
                 gradient[gain_index] += weight * float(scaled @ residual)
         samples = SAMPLE_CELLS_STILL
         return _without_nuisance(Equations(information / samples, gradient / samples, likelihood / samples))
 
-    def _predicted(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Maps in cells: motion (n, r, c, 3), shift by each parameter and the links' thickness (n, r, c, 2, k + 1) [cells],
-        growth of the step by each parameter (n, r, c, 2, k) [px], cover (n, r, c)."""
+    def _predicted(
+        self, theta: np.ndarray, wanted: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Maps in cells: motion (n, r, c, 3), shift by each of k wanted parameters and the links' thickness
+        (n, r, c, 2, k + 1) [cells], growth of the step by each parameter (n, r, c, 2, k) [px], cover (n, r, c)."""
         camera = moved_camera(self.camera, theta)
         uv, depth, ahead, slope = _projected(self.points, camera)
         uv = _delayed(uv, float(theta[9]))
@@ -113,45 +127,53 @@ class StillView:
         length = lengths(step)
         alive = ahead[1:] & ahead[:-1] & (length > STILL_STEP_PX)
         kept = (length * alive).max(axis=0) > MIN_STEP_PX
-        step, length, alive = step[:, kept].astype(np.float32), length[:, kept], alive[:, kept]
+        step, length, alive = step[:, kept].astype(np.float32), length[:, kept].astype(np.float32), alive[:, kept]
         start = ((uv[:-1, kept] - (CELL_PX - 1) / 2) / CELL_PX).astype(np.float32)
         reach = (camera.K[0, 0] * self.radii[kept] / depth[:-1, kept] / CELL_PX).astype(np.float32)
-        late = np.stack([step, np.gradient(step, axis=0) if len(step) > 1 else 0 * step])
-        moves = np.concatenate([(slope[:-1, kept] + slope[1:, kept]) / 2, -late[0][..., None]], axis=-1)
-        grows = np.concatenate([np.diff(slope[:, kept], axis=0), -late[1][..., None]], axis=-1)
-        pushes = np.concatenate([moves / CELL_PX, grows], axis=-1).astype(np.float32)
-        count, cells = len(step), self.cells.shape[1]
-        value, cover = np.zeros((count, cells, 3), np.float32), np.zeros((count, cells), np.float32)
-        shift = np.zeros((count, cells, 2, PARAMETERS + 1), np.float32)
-        growth = np.zeros((count, cells, 2, PARAMETERS), np.float32)
+        faster = np.gradient(step, axis=0) if len(step) > 1 else 0 * step
+        slope = slope[:, kept]
+        moves = np.concatenate([(slope[:-1] + slope[1:]) / 2, -step[..., None]], axis=-1)[..., wanted]
+        grows = np.concatenate([np.diff(slope, axis=0), -faster[..., None]], axis=-1)[..., wanted]
+        # What a cell takes over from the points: their step, and how the parameters change where it begins and itself; the
+        # fastest point is what is seen.
+        weight = (length + 0.1) ** 2
+        taken = np.concatenate([step[..., None], moves / CELL_PX, grows], axis=-1).reshape(*step.shape[:2], -1)
+        taken = np.concatenate([taken * weight[..., None], weight[..., None]], axis=-1).astype(np.float32)
+        thickness, way = (weight * reach).astype(np.float32), step / CELL_PX
+        square = (way**2).sum(axis=-1, keepdims=True) + 1e-6
+        lines = np.concatenate([way, -(start * way).sum(axis=-1, keepdims=True)], axis=-1) / square
+        count, (rows, columns) = len(step), self.measured.shape[1:3]
+        row, column = np.mgrid[:rows, :columns].reshape(2, -1).astype(np.float32)
+        cells = np.stack([column, row, np.ones_like(row)])
+        value, cover = np.zeros((count, rows, columns, 3), np.float32), np.zeros((count, rows, columns), np.float32)
+        shift = np.zeros((count, rows, columns, 2, len(wanted) + 1), np.float32)
+        growth = np.zeros((count, rows, columns, 2, len(wanted)), np.float32)
         for i in range(count):
             on = np.flatnonzero(alive[i])
             if not len(on):
                 continue
-            way, far, wide = (step[i, on] / CELL_PX).T[..., None], start[i, on].T[..., None], reach[i, on, None]
-            x, y = self.cells[0] - far[0], self.cells[1] - far[1]  # (p, m)
-            along = np.clip((x * way[0] + y * way[1]) / (way[0] ** 2 + way[1] ** 2 + 1e-6), 0.0, 1.0)
-            x -= along * way[0]
-            y -= along * way[1]
+            (across, down), far = way[i, on].T[..., None], start[i, on].T[..., None]
+            along = lines[i, on] @ cells  # (p, m): the place on a point's step that is nearest to a cell
+            np.clip(along, 0.0, 1.0, out=along)
+            x, y = column - far[0], row - far[1]
+            x -= along * across
+            y -= along * down
             distance = np.sqrt(x * x + y * y)
-            inside = 1.0 / (1.0 + np.exp(np.clip((distance - wide) / EDGE_CELLS, -20.0, 20.0)))
-            share = inside * (length[i, on, None].astype(np.float32) + 0.1) ** 2  # the fastest is what is seen
-            share /= share.sum(axis=0) + 1e-9
-            cover[i] = 1.0 - np.prod(1.0 - inside, axis=0)
-            motion = share.T @ step[i, on]
-            value[i, :, :2] = cover[i, :, None] * motion
-            value[i, :, 2] = cover[i] * np.log1p(np.minimum(lengths(motion), LONGEST_STEP_PX))
-            pushed = (share.T @ pushes[i, on].reshape(len(on), -1)).reshape(cells, 2, 2 * PARAMETERS)
-            shift[i, ..., :PARAMETERS], growth[i] = pushed[..., :PARAMETERS], pushed[..., PARAMETERS:]
-            share *= wide / np.maximum(distance, 0.3)
-            shift[i, :, 0, PARAMETERS], shift[i, :, 1, PARAMETERS] = (share * x).sum(axis=0), (share * y).sum(axis=0)
-        shape = (count, *self.measured.shape[1:3])
-        return (
-            value.reshape(*shape, 3),
-            shift.reshape(*shape, 2, -1),
-            growth.reshape(*shape, 2, -1),
-            cover.reshape(shape),
-        )
+            inside = (distance - reach[i, on, None]) / EDGE_CELLS
+            inside = 1.0 / (1.0 + np.exp(np.clip(inside, -20.0, 20.0, out=inside), out=inside))
+            covered = (1.0 - np.prod(1.0 - inside, axis=0)).reshape(rows, columns)
+            found = inside.T @ taken[i, on]
+            total = found[:, -1:] + 1e-9
+            inside /= np.clip(distance, 0.3, None, out=distance)
+            thicker = np.stack([thickness[i, on] @ np.multiply(inside, away, out=away) for away in (x, y)], axis=-1)
+            shift[i, ..., -1] = (thicker / total).reshape(rows, columns, 2)
+            found = (found[:, :-1] / total).reshape(rows, columns, 2, -1)
+            motion = found[..., 0]
+            cover[i] = covered
+            value[i, ..., :2] = covered[..., None] * motion
+            value[i, ..., 2] = covered * np.log1p(np.minimum(lengths(motion), LONGEST_STEP_PX))
+            shift[i, ..., :-1], growth[i] = found[..., 1 : 1 + len(wanted)], found[..., 1 + len(wanted) :]
+        return value, shift, growth, cover
 
 
 def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -209,11 +231,12 @@ class WristView:
         """camera of n + 1 poses, gray (n + 1, h, w), motion of the n steps; hand (n + 1, p, 3), radii (p,) [m]."""
         self.camera = camera
         self._steps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-        self._found: dict[bytes, Equations] = {}
+        self._found: dict[tuple[bytes, int, int], Equations] = {}
         shows = (motion.texture > MIN_TEXTURE) & (motion.change > MIN_CHANGE)
         shows &= ~_covered(camera, hand, radii, shows.shape)
         step, row, column = np.nonzero(shows)
         self.step, self.flow = step, motion.flow[step, row, column].astype(np.float64)
+        _, self._first, self._of = np.unique(step, return_index=True, return_inverse=True)
         self.uv = cell_centres(camera.height, camera.width)[row, column]
         across = (self.uv - ((camera.width - 1) / 2, (camera.height - 1) / 2)) / camera.width
         self.plane = np.c_[np.ones(len(step)), across]
@@ -224,63 +247,84 @@ class WristView:
         error_px = FLOW_ERROR_PX + FLOW_ERROR_SHARE * lengths(self.flow)
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
-    def equations(self, theta: np.ndarray, blur: float) -> Equations:
-        """With one plane of inverse depth for each step, fitted as well."""
-        del blur
-        if theta.tobytes() not in self._found:
-            self._found[theta.tobytes()] = self._equations(theta)
-        return self._found[theta.tobytes()]
+    def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
+        """With one plane of inverse depth for each step, fitted as well.
 
-    def _equations(self, theta: np.ndarray) -> Equations:
+        Args:
+            wanted: parameters whose equations are computed; those of the others are zero.
+        """
+        del blur
+        key = theta.tobytes(), wanted.start, wanted.stop
+        if key not in self._found:
+            self._found[key] = self._equations(theta, np.arange(PARAMETERS)[wanted])
+        return self._found[key]
+
+    def _equations(self, theta: np.ndarray, wanted: np.ndarray) -> Equations:
+        information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         if len(self.step) < MIN_CELLS:
-            return Equations(np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0)
+            return Equations(information, gradient, 0.0)
+        seen = self._seen(theta)
         depth = np.full(len(self.step), DEPTH_START_PER_M)
         for _ in range(2):
-            error, by_depth, weight, _ = self._errors(theta, depth)
+            error, by_depth, weight, _ = self._errors(seen, depth)
             fitted = self._per_step(by_depth, weight, error[..., None])[1]
-            depth = np.clip(depth + (self.plane * fitted[self.step, :, 0]).sum(-1), 0.0, MOST_PER_M)
-        error, by_depth, weight, now = self._errors(theta, depth)
-        both = np.zeros((*self.flow.shape, PARAMETERS + 1))
+            depth = np.clip(depth + (self.plane * fitted[self._of, :, 0]).sum(-1), 0.0, MOST_PER_M)
+        error, by_depth, weight, distance = self._errors(seen, depth)
+        wanted = wanted[_STEPS[wanted] > 0]
+        both = np.empty((*self.flow.shape, len(wanted) + 1))
         both[..., -1] = error
-        for i in np.flatnonzero(_STEPS):
+        now = self._flow(seen, depth)
+        for column, i in enumerate(wanted):
             changed = theta.copy()
             changed[i] += _STEPS[i]
-            both[..., i] = (self._predicted(changed, depth) - now) / _STEPS[i]
+            both[..., column] = (self._flow(self._seen(changed), depth) - now) / _STEPS[i]
         cross, fitted = self._per_step(by_depth, weight, both)
-        found = np.einsum("mik,mil->kl", both, weight @ both) - np.einsum("nbk,nbl->kl", cross, fitted)
-        likelihood = -float(np.log1p(np.einsum("mi,mij,mj->m", error, self.certainty, error)).sum())
-        found, likelihood = found / SAMPLE_CELLS_WRIST, likelihood / SAMPLE_CELLS_WRIST
-        return Equations(found[:-1, :-1], found[:-1, -1], likelihood)
+        found = np.tensordot(both, weight @ both, ((0, 1), (0, 1)))
+        found -= np.tensordot(cross, fitted, ((0, 1), (0, 1)))
+        found /= SAMPLE_CELLS_WRIST
+        information[np.ix_(wanted, wanted)] = found[:-1, :-1] + LEAST_INFORMATION * np.eye(len(wanted))
+        gradient[wanted] = found[:-1, -1]
+        return Equations(information, gradient, -float(np.log1p(distance).sum()) / SAMPLE_CELLS_WRIST)
 
-    def _errors(self, theta: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Measured less predicted flow (m, 2), its slope by the plane of inverse depths (m, 2, 3), weights (m, 2, 2), and
-        the predicted flow (m, 2)."""
-        now = self._predicted(theta, depth)
-        slope = (self._predicted(theta, depth + 0.5) - now) / 0.5
+    def _errors(
+        self, seen: tuple[np.ndarray, np.ndarray], depth: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Measured less predicted flow (m, 2), its slope by the inverse depth (m, 2), weights (m, 2, 2), and the squared
+        error in its deviations (m,)."""
+        now = self._flow(seen, depth)
+        slope = (self._flow(seen, depth + 0.5) - now) / 0.5
         error = self.flow - now
-        distance = np.einsum("mi,mij,mj->m", error, self.certainty, error)
-        return error, slope[..., None] * self.plane[:, None], self.certainty / (1 + distance)[:, None, None], now
+        distance = (error * (self.certainty @ error[..., None])[..., 0]).sum(-1)
+        return error, slope, self.certainty / (1 + distance)[:, None, None], distance
 
     def _per_step(self, by_depth: np.ndarray, weight: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each step: projections (n, 3, l) of values (m, 2, l) on the plane of inverse depths, and that plane fitted."""
-        count = len(self.camera.T_base_camera) - 1
-        square, cross = np.zeros((count, 3, 3)), np.zeros((count, 3, values.shape[-1]))
-        weighted = np.swapaxes(weight @ by_depth, 1, 2)
-        np.add.at(square, self.step, weighted @ by_depth)
-        np.add.at(cross, self.step, weighted @ values)
+        """Of each step that has cells: projections (s, 3, l) of values (m, 2, l) on the plane of inverse depths, and that
+        plane fitted."""
+        weighted = (weight @ by_depth[..., None])[..., 0]
+        square = self._sums((weighted * by_depth).sum(-1)[:, None, None] * self.plane[:, :, None] * self.plane[:, None])
+        cross = self._sums(self.plane[:, :, None] * (weighted[..., None] * values).sum(1)[:, None])
         return cross, np.linalg.solve(square + np.diag(DEPTH_PRIOR**-2), cross)
 
-    def _predicted(self, theta: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """(m, 2) flow [px] at the inverse depths (m,) [1/m]."""
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        """(s, ...) of values (m, ...), whose cells lie step by step."""
+        return np.add.reduceat(values, self._first, axis=0)
+
+    def _seen(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the cells' rays end after the step, as homogeneous pixels (m, 3), and by how much a unit of inverse depth
+        moves these (m, 3)."""
         camera = moved_camera(self.camera, theta)
         moves = theta[[0, 1, 2, 3, 4, 5, 9]].tobytes()  # the others change K alone
         if moves not in self._steps:
             self._steps[moves] = _steps_between(camera.T_base_camera, float(theta[9]))
         turns, places = self._steps[moves]
-        rays = np.c_[self.uv, np.ones(len(self.uv))] @ np.linalg.inv(camera.K).T
-        moved = (turns[self.step] @ rays[:, :, None])[..., 0] + depth[:, None] * places[self.step]
-        seen = moved @ camera.K.T
-        return seen[:, :2] / np.maximum(seen[:, 2:], 0.1) - self.uv
+        turned = camera.K @ turns @ np.linalg.inv(camera.K)
+        pixels = np.c_[self.uv, np.ones(len(self.uv))]
+        return np.einsum("mij,mj->mi", turned[self.step], pixels), (places @ camera.K.T)[self.step]
+
+    def _flow(self, seen: tuple[np.ndarray, np.ndarray], depth: np.ndarray) -> np.ndarray:
+        """(m, 2) flow [px] at the inverse depths (m,) [1/m]."""
+        pixels = seen[0] + depth[:, None] * seen[1]
+        return pixels[:, :2] / np.maximum(pixels[:, 2:], 0.1) - self.uv
 
 
 def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.ndarray]:
@@ -295,11 +339,12 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
 
 def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Bool (n, r, c): cells near what these points (n + 1, p, 3) hide at either end of a step."""
-    centres = cell_centres(camera.height, camera.width)
+    rows, columns = (np.arange(count) * CELL_PX + (CELL_PX - 1) / 2 for count in shape[1:])
     hidden = np.zeros((shape[0] + 1, *shape[1:]), dtype=bool)
     for i, pose in enumerate(camera.T_base_camera):
         uv, depth = project_points(points[i], camera.K, pose[None])
         ahead = depth > NEAR_M
         reach = camera.K[0, 0] * radii[ahead] / depth[ahead] + HAND_MARGIN_CELLS * CELL_PX
-        hidden[i] = (lengths(centres[:, :, None] - uv[ahead]) < reach).any(-1)
+        down, across = (rows[:, None] - uv[ahead, 1]) ** 2, (columns[:, None] - uv[ahead, 0]) ** 2
+        hidden[i] = (down[:, None] + across < reach**2).any(-1)
     return hidden[1:] | hidden[:-1]

@@ -145,7 +145,7 @@ def _of_view(view: str, evidence: StillView | WristView, shape: float = 1.0) -> 
             if size < kind.linear:
                 break
             theta[kind.parameters] += change * min(1.0, 2 * kind.prior / size)
-            last = evidence.equations(theta, blur)
+            last = evidence.equations(theta, blur, kind.parameters)
             information, change = kind.solved(last, theta)
         estimate = (theta[kind.parameters] + change) * kind.scale
         shared = kind.shared_wrist if isinstance(evidence, WristView) else kind.shared_still * shape

@@ -150,7 +150,8 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
         lines = found.model_copy(update=lags).config_lines() if other is None else (": ".join(other),)
         numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(lines)}
     for r in diagnosis.residuals:
-        numbers |= {f"{r.view} {r.kind} [{r.unit}]": r.size, f"{r.view} {r.kind} unseen up to": r.within}
+        kind = f"{r.view} {r.kind}"
+        numbers |= {f"{kind} [{r.unit}]": round(r.size, 3), f"{kind} unseen up to": round(r.within, 3)}
     if diagnosis.off:
         numbers |= {"off": "; ".join(map(off_text, diagnosis.off))}
     if diagnosis.verdict == "unexplained":

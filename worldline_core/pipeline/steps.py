@@ -140,7 +140,7 @@ _STEPS = (
     ),
     Step(
         "filter",
-        5,
+        6,
         "worldline_core.filters.filter",
         "filter_episodes",
         "filters.filter_config.FilterConfig",
