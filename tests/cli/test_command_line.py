@@ -115,7 +115,9 @@ def test_a_node_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.CaptureFix
     changed = ["--set", f"curate_banks.sources=[{{kind: episode_set, path: {missing}, name: banks}}]"]
     with pytest.raises(SystemExit, match="1"):
         main(["task", "curate", "--node", "curate.banks", "--artifacts", str(tmp_path), *changed])
-    assert str(missing) in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert str(missing) in said
+    assert "sources[].path" in said
 
 
 def test_a_node_of_another_step_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

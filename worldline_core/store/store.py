@@ -203,7 +203,11 @@ class ArtifactStore:
         if is_remote(path):
             return remote_digest(path)
         if not path.is_dir():
-            raise ArtifactError("An input folder does not exist", where=path, next_step="run the step that makes it")
+            raise ArtifactError(
+                "An input folder does not exist",
+                where=path,
+                next_step="correct the path (of recordings: sources[].path), or run the step that makes it",
+            )
         if not is_artifact(path):
             return digest_folder(path, everything=True)
         if not is_stored(path) and self.verify != "off":
