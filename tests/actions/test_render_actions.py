@@ -67,7 +67,9 @@ def episode_set(tmp_path_factory) -> Path:
     return root
 
 
-CONFIG = RenderActionsConfig(previews=2, preview_height=128, preview_rows=2, episodes_per_shard=2)
+CONFIG = RenderActionsConfig.model_validate(
+    {"previews": 2, "preview_height": 128, "preview_rows": 2, "episodes_per_shard": 2}
+)
 
 
 def digests(root: Path) -> dict[str, str]:
