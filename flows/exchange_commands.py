@@ -27,6 +27,7 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument(
         "--episode", action="append", default=[], metavar="ID", dest="episodes", help="only this one (repeatable)"
     )
+    export.add_argument("--outcome", help="only recordings that ended so: success, failure, ..; EpisodeSets only")
     export.add_argument(
         "--episodes", type=Path, metavar="FOLDER", dest="episode_set", help="the EpisodeSet of predictions"
     )
@@ -101,6 +102,7 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.output,
         arguments.formats,
         episode_ids=arguments.episodes,
+        outcome=arguments.outcome,
         episodes=arguments.episode_set,
     ):
         print(f"wrote {path}")

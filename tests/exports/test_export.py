@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +59,8 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
     assert export(linked, tmp_path / "out", ["lerobot"]) == [tmp_path / "out"]
-    before, after = EpisodeSet.open(linked), EpisodeSet.open(tmp_path / "out")
+    before: Any = EpisodeSet.open(linked)
+    after: Any = EpisodeSet.open(tmp_path / "out")
     assert [row.episode_id for row in after.rows] == ["e0", "e1#5-15", "e2"]
     for i in range(3):
         assert np.array_equal(after.episode(i).state, before.episode(i).state)
@@ -76,7 +79,7 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
     root = tmp_path / "out/datasets/toy"
     for backend in ("pyav", "torchcodec"):
         offsets = {"observation.images.head": [-0.1, 0.0], "action": [0.0, 0.1, 0.2]}
-        opened = LeRobotDataset("local/set", root=root, video_backend=backend, delta_timestamps=offsets)
+        opened: Any = LeRobotDataset("local/set", root=root, video_backend=backend, delta_timestamps=offsets)
         assert (opened.num_episodes, len(opened), opened.fps) == (3, 50, 10)
         item = opened[22]  # frame 2 of the second episode
         assert np.array_equal(item["action"].numpy(), after.episode(1).action[[2, 3, 4]])
@@ -87,11 +90,11 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
     everything = np.concatenate([after.episode(i).state for i in range(3)])
     assert np.allclose(stats["mean"], everything.mean(axis=0), atol=1e-6)
     assert np.allclose(stats["std"], everything.std(axis=0), atol=1e-6)
-    whole = LeRobotDataset("local/set", root=root, video_backend="pyav")
+    whole: Any = LeRobotDataset("local/set", root=root, video_backend="pyav")
     fewer = delete_episodes(whole, [1], output_dir=tmp_path / "fewer", repo_id="local/fewer")
     assert (fewer.num_episodes, len(fewer)) == (2, 40)
     parts = split_dataset(whole, {"a": [0], "b": [1, 2]}, output_dir=tmp_path / "parts")
-    merged = merge_datasets(list(parts.values()), output_repo_id="local/all", output_dir=tmp_path / "all")
+    merged: Any = merge_datasets(list(parts.values()), output_repo_id="local/all", output_dir=tmp_path / "all")
     assert (merged.num_episodes, len(merged)) == (3, 50)
     assert np.array_equal(merged[45]["observation.state"].numpy(), after.episode(2).state[15])
 
@@ -100,9 +103,9 @@ def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
     written = export(linked, tmp_path, ["mcap-ros2", "mcap-protobuf", "mcap", "rrd"], episode_ids=["e1#5-15"])
     names = ["e1_5-15.mcap", "e1_5-15.protobuf.mcap", "e1_5-15.ros2.mcap", "e1_5-15.rrd"]
     assert [path.name for path in written] == names
-    episodes = EpisodeSet.open(linked)
+    episodes: Any = EpisodeSet.open(linked)
     for name in names[:3]:
-        read = read_exported_episode(McapFile(tmp_path / name))
+        read: Any = read_exported_episode(McapFile(tmp_path / name))
         assert np.array_equal(read.frames("head"), episodes.frames(1, "head"))
         assert np.array_equal(read.robot_masks("head"), episodes.robot_masks(1, "head"))
         assert np.array_equal(read.episode.state, episodes.episode(1).state)
@@ -152,3 +155,19 @@ def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:
         export(linked, tmp_path, ["mp4"])
     with pytest.raises(DataError, match=r"(?s)No such episode.*nothing"):
         export(linked, tmp_path, ["mcap"], episode_ids=["nothing"])
+
+
+def test_demonstrations_alone_are_exported(linked: Path, tmp_path: Path) -> None:
+    """Recordings that ended in success; their datasets have these episodes and no others."""
+    (tmp_path / "mixed").mkdir()
+    rows = [
+        replace(row, dataset=f"{linked.parent}/mixed/../curated/datasets/toy", outcome=outcome)
+        for row, outcome in zip(read_index(linked), ("success", "failure", "success"), strict=True)
+    ]
+    relative = [replace(row, dataset=os.path.relpath(row.dataset, tmp_path / "mixed")) for row in rows]
+    write_index(tmp_path / "mixed", relative)
+    export(tmp_path / "mixed", tmp_path / "out", ["lerobot"], outcome="success")
+    assert [row.episode_id for row in EpisodeSet.open(tmp_path / "out").rows] == ["e0", "e2"]
+    assert json.loads((tmp_path / "out/datasets/toy/meta/info.json").read_text())["total_episodes"] == 2
+    with pytest.raises(DataError, match=r"(?s)No episode is exported.*failure.*success.*partial"):
+        export(tmp_path / "mixed", tmp_path / "other", ["lerobot"], outcome="partial")

@@ -42,6 +42,7 @@ def export(
     formats: Sequence[str],
     *,
     episode_ids: Sequence[str] = (),
+    outcome: str | None = None,
     episodes: Path | None = None,
 ) -> list[Path]:
     """Write episodes of an EpisodeSet, or predictions of a RolloutSet, below a folder.
@@ -52,6 +53,7 @@ def export(
             `rrd` (one file per episode); of a RolloutSet all but `lerobot`, and `mp4` and
             `worldarena` (`exports/worldarena.py`).
         episode_ids: which episodes; none: all.
+        outcome: of an EpisodeSet only recordings that ended so (``success``: demonstrations to train a policy on).
         episodes: the EpisodeSet that predictions belong to; default: the one that their manifest names.
 
     Returns: the files, or the folder of the new set.
@@ -66,16 +68,24 @@ def export(
     unknown = [wanted for wanted in formats if wanted not in offered]
     if unknown or not formats:
         raise ConfigError(f"Not a format of {kind}", expected=", ".join(offered), got=", ".join(unknown) or "none")
+    if outcome is not None and kind != "EpisodeSet":
+        raise ConfigError(
+            "Predictions are not chosen by outcome", where=artifact, got=outcome, next_step="name episodes"
+        )
     with alone_in(output, "exporting"):
         if kind == "EpisodeSet":
-            return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids)
+            return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids, outcome)
         return _export_rollouts(artifact, output, formats, episode_ids, episodes)
 
 
 def _export_episodes(
-    episodes: EpisodeSet, output: Path, formats: Sequence[str], episode_ids: Sequence[str]
+    episodes: EpisodeSet, output: Path, formats: Sequence[str], episode_ids: Sequence[str], outcome: str | None
 ) -> list[Path]:
     positions = [episodes.position(name) for name in episode_ids] if episode_ids else list(range(len(episodes)))
+    positions = [position for position in positions if outcome in (None, episodes.rows[position].outcome)]
+    if not positions:
+        ended = sorted({row.outcome for row in episodes.rows})
+        raise DataError("No episode is exported", where=episodes.root, expected=f"an outcome of {ended}", got=outcome)
     written: list[Path] = []
     if "lerobot" in formats:
         written.append(export_lerobot(episodes, output / "lerobot" if len(formats) > 1 else output, positions))
