@@ -94,9 +94,63 @@ def test_lerobot_eval_runs_a_policy_inside_the_simulator(
 
     for number in range(2):
         root = next((tmp_path / "out" / "recordings").rglob(f"env_{number}"))
-        written = LeRobotDataset("eval", root=root)
+        written: Any = LeRobotDataset("eval", root=root)
         assert (written.num_episodes, written.num_frames, written.fps) == (1, 16, 8)
         assert {"action", "observation.state", "observation.images.head", "next.success"} <= set(written.features)
+
+
+@pytest.mark.slow
+def test_lerobot_eval_runs_the_same_policy_in_mujoco(
+    lerobot: Callable[..., str], policy: Path, project_root: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("mujoco")
+    lerobot(
+        tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline", "--env.world=mujoco",
+        "--env.episode_length=3", "--eval.n_episodes=2", "--eval.batch_size=1", "--eval.recording=true", "--output_dir=out",
+        "--seed=1",
+    )  # fmt: skip
+    report = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    assert report["per_task"][0]["metrics"]["successes"] == [False, False]
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob("meta")).parent)
+    recordings = project_root / "artifacts" / "shipped" / "recordings"
+    starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
+    begun = [written[written.meta.episodes[number]["dataset_from_index"]] for number in range(2)]
+    for number, row in enumerate(begun, start=1):
+        np.testing.assert_allclose(row["observation.state"], starts[number].state, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_trained_policy_is_compared_in_both_worlds(policy: Path, project_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    recordings = project_root / "artifacts" / "shipped" / "recordings"
+    command = [
+        sys.executable,
+        "benchmarks/policies_inside.py",
+        "--recordings",
+        str(recordings),
+        "--embodiment",
+        "ur5e_silver",
+    ]
+    command += [
+        "--output",
+        str(tmp_path),
+        "--starts",
+        "2",
+        "--batch",
+        "2",
+        "--policies",
+        str(policy.parents[1] / "000020/pretrained_model"),
+    ]
+    subprocess.run(
+        command, cwd=project_root, env={**os.environ, "PYTHONPATH": str(project_root)}, check=True, timeout=400
+    )
+    attempts = [json.loads(line) for line in (tmp_path / "attempts.jsonl").read_text().splitlines()]
+    assert [(one["policy"], one["learned"], one["mujoco"], one["simulator"]) for one in attempts] == [
+        ("act_000020", True, False, False)
+    ] * 2
+    assert len({one["start"] for one in attempts}) == 2
 
 
 RECORDED = (
@@ -110,7 +164,7 @@ def check_recorded(project_root: Path, root: Path, views: tuple[str, ...], *, lo
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     shipped, driven = project_root / "artifacts" / "shipped", []
-    written = LeRobotDataset("local/any", root=root)
+    written: Any = LeRobotDataset("local/any", root=root)
     assert (written.num_episodes, written.fps, written.meta.robot_type) == (2, 8, "worldline")
     starts = EpisodeStarts(shipped / "recordings", embodiment="ur5e_silver", splits=["test"], views=views, fps=8)
     names = [f"{name.replace('/', '_')}.pos" for name in load_embodiment("ur5e_silver").state_names]

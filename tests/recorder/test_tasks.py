@@ -45,7 +45,7 @@ def layout_of(recorder: EpisodeRecorder, task: str, random: np.random.Generator)
 
 
 def judged(recorder: EpisodeRecorder, layout: Layout, qpos: np.ndarray) -> tuple[str, str]:
-    return outcome(recorder.scene, recorder._data, layout, qpos, recorder._tool_positions(layout.arm, qpos))
+    return outcome(recorder.scene, recorder._data, layout, qpos, recorder.tool_positions(layout.arm, qpos))
 
 
 def joint_of(recorder: EpisodeRecorder, name: str) -> int:

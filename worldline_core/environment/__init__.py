@@ -1,4 +1,5 @@
-"""The simulator as a Gymnasium environment; importing this registers ``worldline/Simulator-v0`` (extra ``gym``).
+"""The simulator as a Gymnasium environment; importing this registers ``worldline/Simulator-v0`` (extra ``gym``) and, with the
+extra ``sim``, its twin in MuJoCo, ``worldline/Mujoco-v0``.
 
 ``gymnasium.make("worldline_core.environment:worldline/Simulator-v0", embodiment="ur5e_silver")``, ``make_vec`` alike.
 """
@@ -6,6 +7,7 @@
 import gymnasium
 
 ENVIRONMENT = "worldline/Simulator-v0"
+MUJOCO_ENVIRONMENT = "worldline/Mujoco-v0"
 
 if ENVIRONMENT not in gymnasium.registry:
     gymnasium.register(
@@ -13,3 +15,5 @@ if ENVIRONMENT not in gymnasium.registry:
         entry_point="worldline_core.environment.environment:WorldLineEnv",
         vector_entry_point="worldline_core.environment.environment:WorldLineVectorEnv",
     )
+if MUJOCO_ENVIRONMENT not in gymnasium.registry:
+    gymnasium.register(MUJOCO_ENVIRONMENT, entry_point="worldline_core.environment.mujoco_world:MujocoEnv")

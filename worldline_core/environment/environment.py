@@ -23,11 +23,20 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worldline_core.environment.episodes import RunningEpisode, Success, Together, TrustedJudge, each_seed, judge_of
+from worldline_core.environment.episodes import (
+    RunningEpisode,
+    Success,
+    Together,
+    TrustedJudge,
+    checked_commands,
+    each_seed,
+    judge_of,
+    robot_spaces,
+)
 from worldline_core.environment.starts import EpisodeStarts, Start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.recordings import simulated_points
-from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, load_embodiment
+from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.rollout.robot import Response
 from worldline_core.rollout.simulation import Simulation
@@ -117,25 +126,11 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 "An environment cannot be stepped so",
                 expected=f"observe_every a divisor of {self.frames_per_step}", got=f"observe_every {self.observe_every}",
             )  # fmt: skip
-        self._spaces()
-
-    def _spaces(self) -> None:
-        arms = self.kinematics.embodiment
-        low, high = (np.full(arms.state_size, bound, np.float32) for bound in (-np.inf, np.inf))
-        for arm in arms.arms:
-            low[arms.joint_columns(arm)], high[arms.joint_columns(arm)] = np.array(arm.limits, np.float32).T
-            low[arms.gripper_column(arm)], high[arms.gripper_column(arm)] = sorted(
-                (arm.gripper.closed, arm.gripper.open)
-            )
-        picture = gymnasium.spaces.Box(0, 255, (*self.world.image_size, 3), np.uint8)
-        # A recording may begin a little beyond a limit, and stays where it is.
-        state = gymnasium.spaces.Box(low - LIMIT_TOLERANCE_RAD, high + LIMIT_TOLERANCE_RAD, dtype=np.float32)
-        self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        self.single_observation_space = gymnasium.spaces.Dict(
-            {"pixels": gymnasium.spaces.Dict(dict.fromkeys(self.views, picture)), "agent_pos": state}
+        self.single_action_space, self.single_observation_space = robot_spaces(
+            self.kinematics.embodiment, self.views, self.world.image_size
         )
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -160,7 +155,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         Raises:
             DataError: the commands have another shape or are not finite, or an episode has ended or not begun.
         """
-        commands = self._checked(actions)
+        commands = checked_commands(actions, self.action_space.shape, self.kinematics.embodiment)
         restarted: list[int] = []
         if self._autoreset == AutoresetMode.NEXT_STEP and self._episodes:
             restarted = [slot for slot in range(self.num_envs) if self._done[slot]]
@@ -274,20 +269,6 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                 episode.success = bool(found)
                 if isinstance(self._succeeds, TrustedJudge):
                     episode.trust = self._succeeds.told(episode.tracks)
-
-    def _checked(self, actions: np.ndarray) -> np.ndarray:
-        try:
-            given = np.asarray(actions)
-        except ValueError:  # rows of different lengths
-            given = np.empty(0)
-        numbers = given.dtype.kind in "fiu" and given.shape == self.action_space.shape
-        if not numbers or not np.isfinite(commands := given.astype(np.float64)).all():
-            raise DataError(
-                "Not the commands of one step",
-                expected=f"finite {self.action_space.shape}: {', '.join(self.kinematics.embodiment.state_names)}",
-                got="numbers that are not finite" if numbers else f"{given.dtype} {given.shape}",
-            )
-        return commands
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import gymnasium
 import numpy as np
 
 from worldline_core.actions.episode_tracks import EpisodeTracks
@@ -19,6 +20,7 @@ from worldline_core.evaluation.policy.saved_trust import JudgedBy, PredictedBy, 
 from worldline_core.evaluation.policy.trust import Calibration, reasons
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
+from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.rollout.samplers import FULL_STEPS
 from worldline_core.rollout.session import Frames
@@ -197,3 +199,38 @@ def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int 
     if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
         raise DataError("Not the seeds of the episodes", expected=f"{count}, from 0 to 2^63 - 1, or one", got=given)
     return seeds
+
+
+def robot_spaces(
+    robot: Embodiment, views: Sequence[str], image_size: tuple[int, int]
+) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Dict]:
+    """Commands of a robot, and observations of it: pictures ``uint8 (H, W, 3)`` by view, and its state."""
+    low, high = (np.full(robot.state_size, bound, np.float32) for bound in (-np.inf, np.inf))
+    for arm in robot.arms:
+        low[robot.joint_columns(arm)], high[robot.joint_columns(arm)] = np.array(arm.limits, np.float32).T
+        column = robot.gripper_column(arm)
+        low[column], high[column] = sorted((arm.gripper.closed, arm.gripper.open))
+    picture = gymnasium.spaces.Box(0, 255, (*image_size, 3), np.uint8)
+    # A recording may begin a little beyond a limit, and stays where it is.
+    state = gymnasium.spaces.Box(low - LIMIT_TOLERANCE_RAD, high + LIMIT_TOLERANCE_RAD, dtype=np.float32)
+    seen = gymnasium.spaces.Dict({"pixels": gymnasium.spaces.Dict(dict.fromkeys(views, picture)), "agent_pos": state})
+    return gymnasium.spaces.Box(low, high, dtype=np.float32), seen
+
+
+def checked_commands(actions: Any, shape: tuple[int, ...] | None, robot: Embodiment) -> np.ndarray:
+    """Commands of one step as float64.
+
+    Raises: DataError: they have another shape or are not finite.
+    """
+    try:
+        given = np.asarray(actions)
+    except ValueError:  # rows of different lengths
+        given = np.empty(0)
+    numbers = given.dtype.kind in "fiu" and given.shape == shape
+    if not numbers or not np.isfinite(commands := given.astype(np.float64)).all():
+        raise DataError(
+            "Not the commands of one step",
+            expected=f"finite {shape}: {', '.join(robot.state_names)}",
+            got="numbers that are not finite" if numbers else f"{given.dtype} {given.shape}",
+        )
+    return commands

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from worldline_core.config import read_yaml
+from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.sources.calibration_file import add_calibrated_view, read_calibration
@@ -37,7 +38,8 @@ class Start:
 
 
 class EpisodeStarts:
-    """Starts of the recordings of one robot that a model can go on from, in the order of the set.
+    """Starts of the recordings of one robot that a model can go on from, in the order of the set; each bank (attempts from
+    one initial state) is one start, that of its first recording.
 
     Args:
         embodiment: of the recordings; None where all that fit have one.
@@ -57,6 +59,7 @@ class EpisodeStarts:
         self._positions: list[int] = []
         left_out: Counter[str] = Counter()
         robots: set[str] = set()
+        banks: set[str] = set()
         for position, row in enumerate(self._episodes.rows):
             reasons = {
                 "of another robot": embodiment is not None and row.embodiment != embodiment,
@@ -64,11 +67,13 @@ class EpisodeStarts:
                 "without all views": not set(views) <= set(row.views),
                 "of another rate": row.fps != fps,
                 "without calibration or commands": not row.stage2_ok,
+                "from the same start as another": row.bank in banks,
             }
             reason = next((reason for reason, holds in reasons.items() if holds), None)
             if reason is None:
                 self._positions.append(position)
                 robots.add(row.embodiment)
+                banks |= {row.bank} if row.bank else set()
             else:
                 left_out[reason] += 1
         if len(robots) != 1:
@@ -88,6 +93,10 @@ class EpisodeStarts:
 
     def __getitem__(self, number: int) -> Start:
         return self._read(self._positions[number])
+
+    def row(self, number: int) -> EpisodeRow:
+        """The recording of a start, as the set lists it."""
+        return self._episodes.rows[self._positions[number]]
 
     def commands(self, number: int) -> np.ndarray:
         """``(n, state size)``: what was commanded after the first frame of the recording of a start."""

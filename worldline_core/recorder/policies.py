@@ -79,6 +79,11 @@ def draw_start(
     raise DataError("No initial state is in reach of every policy", where=f"start {start.name}")
 
 
+def camera_draws(config: RecordPoliciesConfig, start: BankSpec) -> np.random.Generator:
+    """Of the same small camera shift for all policies: they share the first picture."""
+    return np.random.default_rng((config.seed, start.layout))
+
+
 def _record_start(task: tuple[BankSpec, RecordPoliciesConfig, Path]) -> None:
     """Record what is missing of a start; runs in a worker process."""
     start, config, output = task
@@ -95,8 +100,7 @@ def _record_start(task: tuple[BankSpec, RecordPoliciesConfig, Path]) -> None:
             episode_id=name,
             scene_id=start.scene,
             split="test",
-            # The same small camera shift for all policies: they share the first picture.
-            jitter=np.random.default_rng((config.seed, start.layout)),
+            jitter=camera_draws(config, start),
             bank=start.name,
             candidate=number,
         )

@@ -90,37 +90,54 @@ def fingers_to_opening(robot: Robot, fingers: np.ndarray) -> np.ndarray:
     return np.clip((np.mean(fingers, axis=-1) - closed) / (opened - closed), 0.0, 1.0)
 
 
+def motor_targets(scene: SceneModel, action: np.ndarray) -> np.ndarray:
+    """(N, nu) targets of all servos for actions (N, J)."""
+    control, column = np.zeros((len(action), scene.model.nu)), 0
+    for arm in scene.arms:
+        count = len(arm.joint_names)
+        # Actions are stored as float32; the simulator is driven by exactly what is stored.
+        control[:, arm.actuators] = action[:, column : column + count].astype(np.float64)
+        fingers = opening_to_fingers(scene.robot, action[:, column + count].astype(np.float64))
+        control[:, arm.finger_actuators] = fingers[:, None]
+        column += count + 1
+    return control
+
+
+def place_arms(scene: SceneModel, data: Any, command: np.ndarray) -> None:
+    """Put the arms where a command (J,) sends them; things stay."""
+    import mujoco
+
+    column = 0
+    for arm in scene.arms:
+        count = len(arm.joint_names)
+        data.qpos[arm.qpos] = command[column : column + count]
+        data.qpos[arm.finger_qpos] = opening_to_fingers(scene.robot, command[column + count].astype(np.float64))
+        column += count + 1
+    mujoco.mj_forward(scene.model, data)
+
+
+def drive(scene: SceneModel, data: Any, before: np.ndarray, after: np.ndarray) -> None:
+    """Simulate one frame, in which the servos' targets (nu,) go evenly from ``before`` to ``after``."""
+    import mujoco
+
+    for substep in range(SUBSTEPS):
+        blend = (substep + 1) / SUBSTEPS
+        data.ctrl[:] = (1 - blend) * before + blend * after
+        mujoco.mj_step(scene.model, data)
+
+
 def execute(scene: SceneModel, data: Any, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Drive the simulator with the recorded actions (N, J); ``data`` holds the things at their places.
 
     Returns: states (N, J) float32 and full positions (N, nq); ``data`` is left at the last frame.
     """
-    import mujoco
-
-    model, robot = scene.model, scene.robot
-    # Actions are stored as float32; the simulator is driven by exactly what is stored.
-    control = np.zeros((len(action), model.nu))
-    column = 0
-    for arm in scene.arms:
-        count = len(arm.joint_names)
-        joints = action[:, column : column + count].astype(np.float64)
-        fingers = opening_to_fingers(robot, action[:, column + count].astype(np.float64))
-        control[:, arm.actuators] = joints
-        control[:, arm.finger_actuators] = fingers[:, None]
-        data.qpos[arm.qpos] = joints[0]
-        data.qpos[arm.finger_qpos] = fingers[0]
-        column += count + 1
-    mujoco.mj_forward(model, data)
-    states, snapshots = [], []
-    for frame in range(len(action)):
+    control = motor_targets(scene, action)
+    place_arms(scene, data, action[0])
+    states, snapshots = [read_state(scene, data)], [data.qpos.copy()]
+    for frame in range(1, len(action)):
+        drive(scene, data, control[frame - 1], control[frame])
         states.append(read_state(scene, data))
         snapshots.append(data.qpos.copy())
-        if frame + 1 == len(action):
-            break
-        for substep in range(SUBSTEPS):
-            blend = (substep + 1) / SUBSTEPS
-            data.ctrl[:] = (1 - blend) * control[frame] + blend * control[frame + 1]
-            mujoco.mj_step(model, data)
     return np.array(states, dtype=np.float32), np.array(snapshots)
 
 
@@ -140,17 +157,21 @@ class EpisodeRecorder:
     """
 
     def __init__(self, body: str, cameras: Cameras = "training") -> None:
-        import mujoco
-
         if body not in BODIES:
             raise DataError("Unknown body", expected=" | ".join(sorted(BODIES)), got=body)
         self.scene = build_scene(BODIES[body])
         self.cameras: Cameras = cameras
         self._solver = InverseKinematics(self.scene)
-        self._data: Any = mujoco.MjData(self.scene.model)
-        self._kinematics: Any = mujoco.MjData(self.scene.model)
+        self._data = self.new_data()
+        self._kinematics = self.new_data()
         self._own_colours = self.scene.model.geom_rgba[self.scene.robot_geoms].copy()
         self._renderer: SceneRenderer | None = None
+
+    def new_data(self) -> Any:
+        """A state of the world of its own (MuJoCo's ``MjData``), which recording does not touch."""
+        import mujoco
+
+        return mujoco.MjData(self.scene.model)
 
     def close(self) -> None:
         if self._renderer is not None:
@@ -184,7 +205,7 @@ class EpisodeRecorder:
         """Execute recorded actions (N, J) from the layout's initial state."""
         apply_layout(self.scene, self._data, layout)
         state, qpos = execute(self.scene, self._data, action)
-        tool = self._tool_positions(layout.arm, qpos)
+        tool = self.tool_positions(layout.arm, qpos)
         return Motion(state, action, qpos, *outcome(self.scene, self._data, layout, qpos, tool))
 
     def film(
@@ -277,7 +298,7 @@ class EpisodeRecorder:
         )
         return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
 
-    def _tool_positions(self, arm: int, qpos: np.ndarray) -> np.ndarray:
+    def tool_positions(self, arm: int, qpos: np.ndarray) -> np.ndarray:
         """(N, 3) of an arm's tool."""
         import mujoco
 

@@ -1,0 +1,195 @@
+"""MuJoCo's twin of the simulator's environment, and policies compared in both."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+pytest.importorskip("mujoco")
+
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.environment import MUJOCO_ENVIRONMENT
+from worldline_core.environment.environment import WorldLineEnv
+from worldline_core.environment.mujoco_world import MujocoEnv
+from worldline_core.environment.starts import EpisodeStarts
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.recorder.banks import BankGrid
+from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.policies import RecordPoliciesConfig, record_policies
+from worldline_core.recorder.record import record_with_manifest
+
+ROBOT = "ur5e_silver"
+POLICIES = {
+    "expert": ScriptedPolicy(),
+    "blind": ScriptedPolicy(bias_m=(0.0, 0.12)),
+    "late": ScriptedPolicy(delay_frames=28),
+}
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Path:
+    return Path(__file__).resolve().parents[2] / "artifacts" / "shipped"
+
+
+@pytest.fixture(scope="module")
+def world() -> Any:
+    environment = gymnasium.make(MUJOCO_ENVIRONMENT, embodiment=ROBOT, episode_frames=32).unwrapped
+    yield environment
+    environment.close()
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three policies at two starts."""
+    folder = tmp_path_factory.mktemp("policies") / "recordings"
+    grid = BankGrid(embodiments=(ROBOT,), families=("press",), scenes=("scene_12", "scene_13"), count=2)
+    config = RecordPoliciesConfig(policies=POLICIES, starts=grid, seed=3, num_frames=33, workers=1)
+    record_with_manifest("record_policies", record_policies, config, folder)
+    return folder
+
+
+def driven(world: MujocoEnv, number: int, commands: np.ndarray) -> tuple[np.ndarray, bool, dict[str, Any]]:
+    """States, whether the episode ended in success, and the last information."""
+    observed, info = world.reset(seed=number)
+    states, ended = [observed["agent_pos"]], False
+    for index, command in enumerate(commands, start=1):
+        observed, reward, ended, truncated, info = world.step(command)
+        states.append(observed["agent_pos"])
+        assert (reward == 1.0) == ended == info["is_success"]
+        assert (ended or truncated) == (index == len(commands))
+    return np.array(states), ended, info
+
+
+def test_recorded_commands_lead_where_they_led(world: MujocoEnv, shipped: Path) -> None:
+    """Of every task: the recorded first picture, the same states, the same end; twice, because a start leaves nothing behind."""
+    recordings = EpisodeSet.open(shipped / "recordings")
+    for number in [*range(len(world.starts)), 0]:
+        row, start = world.starts.row(number), world.starts[number]
+        first = world.reset(seed=number)[0]["pixels"]
+        for view, picture in first.items():
+            recorded = np.empty_like(picture)
+            resize_frame(start.images[view], picture.shape[:2], out=recorded)
+            # What differs is the encoder's noise: another place of the camera would cost ten times as much.
+            assert np.abs(recorded.astype(int) - picture).mean() < 2.5
+        states, success, info = driven(world, number, world.starts.commands(number))
+        episode = recordings.episode(recordings.position(row.episode_id))
+        np.testing.assert_allclose(states, episode.state, atol=1e-5)
+        assert success == (row.outcome == "success")
+        assert bool(info["failure"]) == (row.outcome == "failure")
+    with pytest.raises(DataError, match="ended or not begun"):
+        world.step(world.starts.commands(0)[0])
+
+
+def test_pictures_are_new_at_every_step_unless_told_otherwise(
+    world: MujocoEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, _ = world.reset(seed=0)
+    after = world.step(world.starts.commands(0)[8])[0]
+    assert any(not np.array_equal(after["pixels"][view], before["pixels"][view]) for view in world.views)
+    np.testing.assert_array_equal(world.render(), np.concatenate(list(after["pixels"].values()), axis=1))
+    monkeypatch.setattr(world, "_observe_every", 4)
+    world.reset(seed=0)
+    seen = [world.step(command)[0]["pixels"]["head"] for command in world.starts.commands(0)[8:13]]
+    changed = [
+        not np.array_equal(one, other) for one, other in zip([before["pixels"]["head"], *seen], seen, strict=False)
+    ]
+    assert changed == [False, False, False, True, False]
+
+
+def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv) -> None:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_env(world)
+    assert not [str(one.message) for one in found if "symmetric and normalized space" not in str(one.message)]
+    inside = WorldLineEnv(embodiment=ROBOT, success=None)
+    assert (world.action_space, world.observation_space) == (inside.action_space, inside.observation_space)
+    world.reset(seed=0)
+    with pytest.raises(DataError, match=r"finite \(14,\): left/shoulder"):
+        world.step(np.zeros(13))
+
+
+def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
+    starts = EpisodeStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
+    assert len(EpisodeSet.open(compared)) == 6
+    assert len({starts.row(number).bank for number in range(len(starts))}) == len(starts) == 2
+
+
+def test_recordings_whose_starts_are_not_known_are_refused(
+    world: MujocoEnv, shipped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(DataError, match=r"(?s)Nobody knows where things stand.*record_banks"):
+        MujocoEnv(shipped / "banks", embodiment=ROBOT, splits=("bank", "test"))
+    with pytest.raises(ConfigError, match="observe_every 0"):
+        MujocoEnv(embodiment=ROBOT, observe_every=0)
+    drawn = world._drawn
+    monkeypatch.setattr(world, "_drawn", lambda number: (*drawn(number)[:3], drawn(number)[3] + 0.01))
+    with pytest.raises(DataError, match="cannot be drawn again as it was recorded"):
+        world.reset(seed=0)
+
+
+def policies_inside(project: Path) -> ModuleType:
+    path = project / "benchmarks" / "policies_inside.py"
+    spec = importlib.util.spec_from_file_location("policies_inside", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_recorded_policies_are_compared_in_both_worlds(
+    shipped: Path, compared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = policies_inside(shipped.parents[1])
+    arguments = ["policies_inside.py", "--recordings", str(compared), "--output", str(tmp_path), "--batch", "2"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    script.main()
+    lines = (tmp_path / "attempts.jsonl").read_text()
+    attempts = [json.loads(line) for line in lines.splitlines()]
+    assert len(attempts) == 6
+    ended = {(row.bank, row.source): row.outcome == "success" for row in EpisodeSet.open(compared).rows}
+    assert {(one["start"], one["policy"]): one["mujoco"] for one in attempts} == ended
+    found = json.loads((tmp_path / "table.json").read_text())["scripted"]
+    rates = {name: [one["simulator"] for one in attempts if one["policy"] == name] for name in POLICIES}
+    assert {name: facts["predicted"] for name, facts in found["policies"].items()} == {
+        name: np.mean(ends) for name, ends in rates.items()
+    }
+    assert "| blind | 2 | 0.00 |" in capsys.readouterr().out
+    script.main()
+    assert (tmp_path / "attempts.jsonl").read_text() == lines
+
+
+def test_a_learned_policy_meets_the_same_start_in_both_worlds(shipped: Path, compared: Path) -> None:
+    """Its first commands follow from what the cameras saw there, in MuJoCo and inside alike."""
+    script = policies_inside(shipped.parents[1])
+    seen: list[dict[str, Any]] = []
+
+    def act(observed: dict[str, Any]) -> np.ndarray:
+        seen.append(observed)
+        return observed["agent_pos"]
+
+    inside = script.WorldLineVectorEnv(
+        1, recordings=compared, success=None, episode_frames=32, autoreset_mode="Disabled"
+    )
+    world = MujocoEnv(compared, embodiment=ROBOT)
+    physics = script.SyncVectorEnv([lambda: world], autoreset_mode="Disabled")
+    for env in (inside, physics):
+        assert script.attempt(env, [1], act) == [False]
+    physics.close()
+    assert len(seen) == 2 * script.FRAMES
+    first = seen[0], seen[script.FRAMES]
+    np.testing.assert_allclose(first[0]["agent_pos"], first[1]["agent_pos"], atol=1e-4)
+    for view in world.views:
+        predicted, real = (one["pixels"][view].astype(int) for one in first)
+        assert np.abs(predicted - real).mean() < 8
