@@ -186,10 +186,8 @@ def main() -> None:
     )
     physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
     starts = Starts(options.recordings, world, options.starts)
-    policies: dict[str, LearnedPolicy | None] = dict.fromkeys(starts.recorded)
-    for folder in options.policies:
-        learned = LearnedPolicy(folder)
-        policies[learned.name] = learned
+    policies: dict[str, LearnedPolicy | None] = {one.name: one for one in map(LearnedPolicy, options.policies)}
+    policies |= dict.fromkeys(starts.recorded)
     for name, learned in policies.items():
         done = {a["start"] for a in attempts if a["policy"] == name}
         missing = [number for number, start in enumerate(starts.names) if start not in done]
