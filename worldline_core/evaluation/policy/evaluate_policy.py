@@ -84,7 +84,8 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
     judge = open_judge(config, inputs.get("segmenter"))
     asked = None if config.trust is None else config.trust.calibration
     saved = None if asked is None else SavedTrust.read(asked)
-    known = None if config.trust is None else KnownSetting.of(episodes, tracks, config.trust, saved)
+    recordings = None if saved is None else (saved.controls, saved.setups, saved.training_recordings)
+    known = None if config.trust is None else KnownSetting.of(episodes, tracks, config.trust, recordings)
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
     times = Counter(name for names in predicted.values() for name in names)
     rows = rows_of(episodes, times)

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -29,9 +28,6 @@ from worldline_core.data.episodes.episode import TRAINING_SPLITS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import TrustConfig
-
-if TYPE_CHECKING:
-    from worldline_core.evaluation.policy.saved_trust import SavedTrust
 
 PLACE_M, SPEED_M, OPENING = 0.1, 0.05, 0.5
 """Differences that count as much as each other: of place, of the way in a latent frame, of a gripper's opening (share)."""
@@ -183,9 +179,13 @@ class KnownSetting:
 
     @classmethod
     def of(
-        cls, episodes: EpisodeSet, tracks: ActionTracks | None, config: TrustConfig, saved: SavedTrust | None = None
+        cls,
+        episodes: EpisodeSet,
+        tracks: ActionTracks | None,
+        config: TrustConfig,
+        saved: tuple[KnownRecordings, KnownRecordings, int] | None = None,
     ) -> KnownSetting:
-        """Reads the recordings of the training splits, or takes those that were saved.
+        """Reads the recordings of the training splits, or takes those that were ``saved``: controls, setups, count.
 
         Raises: ConfigError without action tracks; DataError where there are too few training recordings.
         """
@@ -195,7 +195,7 @@ class KnownSetting:
                 next_step="run render_actions and give its folder as --input tracks=FOLDER",
             )  # fmt: skip
         if saved is not None:
-            return cls(tracks, saved.controls, saved.setups, saved.training_recordings)
+            return cls(tracks, *saved)
         names = [row.episode_id for row in episodes.rows if row.split in TRAINING_SPLITS and row.episode_id in tracks]
         known = [tracks.tracks(name) for name in names]
         level = config.novelty_level
