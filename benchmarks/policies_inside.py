@@ -180,6 +180,7 @@ def main() -> None:
     )  # fmt: skip
     world = MujocoEnv(
         options.recordings,
+        embodiment=options.embodiment,
         image_size=inside.world.image_size,
         episode_frames=FRAMES,
         observe_every=inside.observe_every,

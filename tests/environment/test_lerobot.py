@@ -106,19 +106,19 @@ def test_lerobot_eval_runs_the_same_policy_in_mujoco(
     pytest.importorskip("mujoco")
     lerobot(
         tmp_path, "lerobot_eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=worldline", "--env.world=mujoco",
-        "--env.episode_length=3", "--eval.n_episodes=2", "--eval.batch_size=1", "--eval.recording=true", "--output_dir=out",
+        "--env.episode_length=3", "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.recording=true", "--output_dir=out",
         "--seed=1",
     )  # fmt: skip
     report = json.loads((tmp_path / "out" / "eval_info.json").read_text())
     assert report["per_task"][0]["metrics"]["successes"] == [False, False]
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob("meta")).parent)
     recordings = project_root / "artifacts" / "shipped" / "recordings"
     starts = EpisodeStarts(recordings, embodiment="ur5e_silver", splits=["test"], views=["head"], fps=8)
-    begun = [written[written.meta.episodes[number]["dataset_from_index"]] for number in range(2)]
-    for number, row in enumerate(begun, start=1):
-        np.testing.assert_allclose(row["observation.state"], starts[number].state, atol=1e-4)
+    for number in range(2):
+        written: Any = LeRobotDataset("eval", root=next((tmp_path / "out" / "recordings").rglob(f"env_{number}")))
+        assert (written.num_episodes, written.num_frames) == (1, 3)
+        np.testing.assert_allclose(written[0]["observation.state"], starts[number + 1].state, atol=1e-4)
 
 
 @pytest.mark.slow
