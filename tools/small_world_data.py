@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 from einops import rearrange
 from safetensors import safe_open
-from safetensors.numpy import save
 from tqdm import tqdm
 
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
@@ -37,7 +36,7 @@ from worldline_core.model.world_model_config import VIEWS
 from worldline_core.recorder.record import Job, RecordConfig, open_recorder, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.simulate import EpisodeRecorder, Recording
-from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.store.atomic import write_arrays_atomic
 
 SIZE, GRID, SIGMA_PX_REF = (64, 96), (8, 12), 36.0
 SHORT = 33
@@ -168,7 +167,7 @@ def record_file(task: FileTask) -> None:
     # The next file is of another body: its renderers need the memory of these.
     recorder.close()
     header = {"facts": json.dumps([asdict(fact) for fact in facts])}
-    write_bytes_atomic(task.path, save({name: np.stack(values) for name, values in arrays.items()}, metadata=header))
+    write_arrays_atomic(task.path, {name: np.stack(values) for name, values in arrays.items()}, header)
 
 
 def _recorded(recorder: EpisodeRecorder, job: Job, num_frames: int) -> Recording:

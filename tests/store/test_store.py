@@ -11,14 +11,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from safetensors import safe_open
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.pipeline.steps import get_step
 from worldline_core.store import verification
 from worldline_core.store.artifact_files import digest_folder, digest_value
-from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import ArtifactStore, alone_in
 
 
@@ -251,6 +253,20 @@ def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     (folder / "link").symlink_to(tmp_path / "secret")
     with pytest.raises(ArtifactError, match="leads out of the folder"):
         digest_folder(folder)
+
+
+def test_arrays_come_back_as_they_were_however_their_memory_lies(tmp_path: Path) -> None:
+    array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    arrays = {
+        "transposed": array.transpose(2, 0, 1),
+        "every second": array[:, :, ::2],
+        "one": np.float32(7).reshape(()),
+    }
+    write_arrays_atomic(tmp_path / "x.safetensors", arrays, {"unit": "m"})
+    with safe_open(tmp_path / "x.safetensors", framework="numpy") as file:
+        assert file.metadata() == {"unit": "m"}
+        for name, expected in arrays.items():
+            np.testing.assert_array_equal(file.get_tensor(name), expected)
 
 
 def test_atomic_write_leaves_nothing_behind_on_error(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from tools import small_world_steps
-from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, plan_files
-from tools.small_world_measures import Measuring, Shown, gradient_energy, judged
+from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, Recorded, plan_files, record_file
+from tools.small_world_measures import Measuring, Predictor, Shown, gradient_energy, judged
 from tools.small_world_memory import Episodes, KnownRelations, Memory, joined, videos
 from tools.small_world_runs import Plan
 from tools.small_world_steps import controls_of, object_weights
@@ -30,6 +30,7 @@ from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.recorder.bodies import BODIES
+from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.relational import TeacherRelations
 from worldline_core.training.training_config import RelationalConfig
@@ -105,6 +106,22 @@ def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     assert all(len({(job.embodiment, job.split, job.held_out_camera) for job in task.jobs}) == 1 for task in everything)
     assert {job.embodiment for task in everything for job in task.jobs} == set(BODIES) - {"xarm7_single"}
     assert len({job.episode_id for task in everything for job in task.jobs}) == sum(len(t.jobs) for t in everything)
+
+
+def test_the_shipped_model_predicts_what_the_tool_records(tmp_path: Path) -> None:
+    prepare_rendering()
+    mujoco = pytest.importorskip("mujoco")
+    task = plan_files(tmp_path, 3000, ["small_world_test"])[0]
+    try:
+        record_file(replace(task, jobs=task.jobs[:2]))
+    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
+        pytest.skip(f"off-screen OpenGL is not available here: {error}")
+    memory = Memory(tmp_path, [task.path.name], PatchTokenizer.load(MODELS / "tokenizer"), None)
+    file = Recorded.read(task.path)
+    latents, model = memory.encode(videos(file.frames, "cpu")), Predictor.open(MODELS / "stage2", "cpu")
+    controls = model.controls(torch.from_numpy(file.maps), torch.from_numpy(file.native))
+    error, copying = ((model(latents, controls) - latents) ** 2).mean(), ((latents[:, :, :, :1] - latents) ** 2).mean()
+    assert error < 0.5 * copying, (float(error), float(copying))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,6 @@ import torch
 from jaxtyping import Bool, Float
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 from torch import Tensor
 
 from worldline_core.actions.actions_config import WristProjection
@@ -32,7 +31,7 @@ from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.store.artifact_files import how_to_rebuild
-from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
+from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_json_atomic
 
 HEAD_VIEW = "head"
 INDEX_FILE, DESCRIPTION_FILE = "index.parquet", "tracks.json"
@@ -199,7 +198,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
     for episode in tracks:
         for name in ARRAYS:
             value = getattr(episode, name)
-            arrays[f"{episode.episode_id}/{name}"] = np.ascontiguousarray(value, dtype=_DTYPES.get(name, np.float32))
+            arrays[f"{episode.episode_id}/{name}"] = np.asarray(value, dtype=_DTYPES.get(name, np.float32))
         rows.append(
             {
                 "episode_id": episode.episode_id,
@@ -214,7 +213,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
                 "camera_motion": list(episode.camera_motion),
             }
         )
-    write_bytes_atomic(root / shard_name(number), save(arrays))
+    write_arrays_atomic(root / shard_name(number), arrays)
     return rows
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
     import pyarrow as pa
 
 
@@ -39,6 +40,16 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
 def write_json_atomic(path: Path, value: Any) -> None:
     """Write JSON with sorted keys (equal values give equal bytes); NaN and infinities are refused."""
     write_bytes_atomic(path, (json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_arrays_atomic(path: Path, arrays: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
+    """Write arrays as safetensors, with text beside them."""
+    import numpy as np
+    from safetensors.numpy import save
+
+    # `save` copies memory as it lies: the values of a transposed view would be read back in another order.
+    ordered = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
+    write_bytes_atomic(path, save(ordered, metadata))
 
 
 def write_table_atomic(path: Path, table: pa.Table, *, rows_per_group: Sequence[int] | None = None) -> None:

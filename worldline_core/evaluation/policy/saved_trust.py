@@ -15,14 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.policy.novelty import KnownRecordings
 from worldline_core.evaluation.policy.trust import Calibration
 from worldline_core.store.artifact_files import digest_folder, is_artifact, read_manifest
-from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.store.atomic import write_arrays_atomic
 
 TRUST_FILE = "trust.safetensors"
 _HEADER = "worldline_trust"
@@ -85,7 +84,7 @@ class SavedTrust:
         )  # fmt: skip
         known = {"controls": self.controls, "setups": self.setups}
         arrays = {f"{what}/{name}": array for what, found in known.items() for name, array in found.arrays().items()}
-        write_bytes_atomic(folder / TRUST_FILE, save(arrays, {_HEADER: header.model_dump_json()}))
+        write_arrays_atomic(folder / TRUST_FILE, arrays, {_HEADER: header.model_dump_json()})
 
     @classmethod
     def read(cls, path: Path) -> SavedTrust:
