@@ -24,7 +24,7 @@ from worldline_core.data.episodes.conventions import (
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.rotations import (
-    euler_moving_xyz_from_rotation,
+    euler_fixed_xyz_from_rotation,
     quaternion_wxyz_from_rotation,
     rotation_from_euler_fixed_xyz,
     rotation_from_quaternion_xyzw,
@@ -102,4 +102,5 @@ def written_as_wxyz(rotation: np.ndarray) -> np.ndarray:
 
 def written_as_moving(rotation: np.ndarray) -> np.ndarray:
     """What rotations (..., 3, 3) become when their angles are written about moving axes and read about fixed ones."""
-    return rotation_from_euler_fixed_xyz(euler_moving_xyz_from_rotation(rotation))
+    moving = -euler_fixed_xyz_from_rotation(np.swapaxes(rotation, -1, -2))
+    return rotation_from_euler_fixed_xyz(moving)

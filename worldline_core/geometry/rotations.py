@@ -109,11 +109,6 @@ def euler_fixed_xyz_from_rotation(rotation: np.ndarray) -> np.ndarray:
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
-def euler_moving_xyz_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) -> angles (..., 3) [rad] about moving axes; the second in -pi/2..pi/2."""
-    return -euler_fixed_xyz_from_rotation(np.swapaxes(np.asarray(rotation, np.float64), -1, -2))
-
-
 def rotation_about_axis(axis: np.ndarray, angle: float) -> np.ndarray:
     """(3, 3) rotation by an angle [rad] about an axis (3,) of any length (Rodrigues); the identity for a zero axis."""
     length = float(np.linalg.norm(axis))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.action_branch import new_action_branch
-from worldline_core.model.checkpoint import check_fit, fill, save_checkpoint
+from worldline_core.model.checkpoint import check_fit, save_checkpoint
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.weight_files import read_weights
 from worldline_core.model.world_model import WorldModel
@@ -92,34 +92,21 @@ def config_from_diffusers(config: Mapping[str, Any], *, where: object, fps: floa
         raise CheckpointError("The Cosmos3 config is not valid", where=where, got=str(error)) from error
 
 
-def load_cosmos3(
-    folder: Path,
-    *,
-    towers: Literal["both", "generation"] = "both",
-    fps: float | None = None,
-    changes: Mapping[str, object] | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> tuple[WorldModel, Cosmos3Report]:
-    """Load ``folder`` (a transformer, or a pipeline with a ``transformer`` subfolder) into a world model.
+def read_cosmos3(
+    folder: Path, *, fps: float | None = None, changes: Mapping[str, object] | None = None
+) -> tuple[WorldModel, dict[str, Tensor], Cosmos3Report]:
+    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new.
 
     The action branch is new: its output layer is zero, so the model starts as the pretrained one.
 
     Args:
-        changes: fields of the config to set besides (view slots, their unit).
+        folder: a transformer in diffusers format, or a pipeline with a ``transformer`` subfolder.
+        changes: fields of the config to set besides (view slots, their unit, the generation tower alone).
 
     Raises:
         UnavailableError: there is no such folder.
         ArtifactError: the folder is incomplete, damaged, or holds another architecture.
     """
-    model, kept, report = _read_cosmos3(folder, towers=towers, fps=fps, changes=changes)
-    fill(model, kept, where=folder, dtype=dtype)
-    return model, report
-
-
-def _read_cosmos3(
-    folder: Path, *, towers: Literal["both", "generation"], fps: float | None, changes: Mapping[str, object] | None
-) -> tuple[WorldModel, dict[str, Tensor], Cosmos3Report]:
-    """A model on the meta device, and all of its weights: views of the mapped files, and those that are new."""
     root = folder / "transformer" if (folder / "transformer").is_dir() else folder
     if not (root / "config.json").is_file():
         raise UnavailableError(
@@ -130,9 +117,9 @@ def _read_cosmos3(
         )
     raw = read_json(root / "config.json")
     config = config_from_diffusers(raw, where=root / "config.json", fps=fps)
-    config = WorldModelConfig.model_validate(config.model_dump() | {"towers": towers} | dict(changes or {}))
+    config = WorldModelConfig.model_validate(config.model_dump() | dict(changes or {}))
     tensors = read_weights(root / SINGLE, None)
-    without_text = towers == "generation"
+    without_text = config.towers == "generation"
     ignored = {
         name for name in tensors if name.startswith(UNUSED_PARAMETERS) or (without_text and is_text_parameter(name))
     }
@@ -160,7 +147,7 @@ def import_backbone(config: ImportBackboneConfig, inputs: Mapping[str, Path], ou
         ArtifactError: the folder is damaged, or holds another architecture.
     """
     dtype = {"bfloat16": torch.bfloat16, "float16": torch.float16}[config.dtype]
-    model, tensors, report = _read_cosmos3(inputs["diffusers"], towers="both", fps=config.fps, changes=config.changes)
+    model, tensors, report = read_cosmos3(inputs["diffusers"], fps=config.fps, changes=config.changes)
     metadata = {"source": "Cosmos3 in diffusers format", "ignored": list(report.ignored), "new": list(report.new)}
     save_checkpoint(
         output, model, kind="base", action_contract=None, metadata=metadata, dtype=dtype, state_dict=tensors

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from worldline_core.errors import DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import check_embodiment_name
@@ -80,7 +80,6 @@ class SessionRequest(_Request):
 
 
 Request = StartRequest | StepRequest | ForkRequest | SessionRequest
-_REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 
 
 @dataclass
