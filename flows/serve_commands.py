@@ -26,7 +26,7 @@ def add_serve_commands(commands: argparse._SubParsersAction[argparse.ArgumentPar
 def serve_command(arguments: argparse.Namespace) -> None:
     """Load the model and serve until interrupted."""
     from worldline_core.config import apply_overrides, load_config, validate
-    from worldline_core.errors import UnavailableError
+    from worldline_core.errors import UnavailableError, installing
     from worldline_core.serving.serve_config import ServeConfig
 
     overrides = tuple(arguments.overrides)
@@ -40,7 +40,7 @@ def serve_command(arguments: argparse.Namespace) -> None:
         from worldline_core.serving.app import listening_socket, make_server, server_token
     except ImportError as error:
         raise UnavailableError(
-            "The server needs packages that are not here", got=str(error), next_step="pip install 'worldline[serve]'"
+            "The server needs packages that are not here", got=str(error), next_step=installing("serve")
         ) from error
     from worldline_core.rollout.worldline import WorldLine
     from worldline_core.shipped import project_path

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tasks.temporary_server import set_up_temporary_server
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import UnavailableError, installing
 from worldline_core.scale.mapping import (
     RunnerConfig,
     SerialMapper,
@@ -235,7 +235,7 @@ def _missing(extra: str, error: ImportError) -> UnavailableError:
         where="runner.kind",
         expected=f"the extra `{extra}`",
         got=str(error),
-        next_step=f"uv sync --extra {extra} (or pip install 'worldline[{extra}]'), or runner.kind=processes",
+        next_step=f"{installing(extra)}, or runner.kind=processes",
     )
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from worldline_core.errors import installing
 from worldline_core.shipped import SHIPPED, project_path
 
 
@@ -123,11 +124,17 @@ def _decoder() -> Finding:
 
 
 def _packages() -> list[Finding]:
-    extras = {"mujoco": "sim (worldline record)", "h5py": "hdf5 (HDF5 sources)"}
+    extras = {
+        "mujoco": "sim (worldline record)",
+        "h5py": "hdf5 (HDF5 sources)",
+        "s3fs": "s3 (S3 object stores)",
+        "gymnasium": "gym (Gymnasium environments)",
+        "msgpack": "serve (worldline serve, play)",
+    }
     findings = []
     for package, purpose in extras.items():
         present = importlib.util.find_spec(package) is not None
-        advice = "" if present else f"uv sync --extra {purpose.split()[0]}"
+        advice = "" if present else installing(purpose.split()[0])
         findings.append(
             Finding(f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice)
         )

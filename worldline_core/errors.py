@@ -81,3 +81,8 @@ class RegressionError(WorldLineError):
 
 class UnavailableError(WorldLineError):
     """Something optional (weights, an extra, a device, a server) is needed but not there."""
+
+
+def installing(extra: str) -> str:
+    """How to install an extra of this package, for the next step of a message."""
+    return f"pip install 'worldline[{extra}]' (in a checkout: uv sync --extra {extra})"

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from worldline_core.errors import ConfigError, UnavailableError
+from worldline_core.errors import ConfigError, UnavailableError, installing
 from worldline_core.geometry.description import RigidOffset
 from worldline_core.geometry.embodiment import Embodiment, read_description
 from worldline_core.geometry.kinematic_tree import TreeBody, parse_xml
@@ -86,7 +86,7 @@ def check_embodiment(embodiment: Embodiment, samples: int = 1000, seed: int = 0)
         raise UnavailableError(
             "The check compares with MuJoCo, which is not installed",
             expected="the extra `sim`",
-            next_step="uv sync --extra sim (or pip install 'worldline[sim]')",
+            next_step=installing("sim"),
         )
     mujoco = importlib.import_module("mujoco")
     from worldline_core.geometry.kinematics import ArmKinematics  # torch, which the other commands do without

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from worldline_core.errors import DataError, UnavailableError
+from worldline_core.errors import DataError, UnavailableError, installing
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -35,7 +35,7 @@ def _msgpack() -> ModuleType:
         import msgpack
     except ImportError as error:
         raise UnavailableError(
-            "Messages of policies and of the server need msgpack", next_step="pip install 'worldline[serve]'"
+            "Messages of policies and of the server need msgpack", next_step=installing("serve")
         ) from error
     return msgpack
 

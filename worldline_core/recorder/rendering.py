@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import UnavailableError, installing
 from worldline_core.recorder.bodies import Colour
 from worldline_core.recorder.scene_model import SceneModel
 
@@ -101,7 +101,7 @@ def prepare_rendering() -> None:
         raise UnavailableError(
             "Recording needs MuJoCo",
             got=str(error),
-            next_step="install the extra: uv sync --extra sim; on Debian also libegl1 libegl-mesa0 libgl1-mesa-dri",
+            next_step=f"{installing('sim')}; on Debian also libegl1 libegl-mesa0 libgl1-mesa-dri",
         ) from error
     if not chosen:
         # MuJoCo reads the variable once, when it is imported: what was imported earlier has chosen a window.

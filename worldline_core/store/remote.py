@@ -25,7 +25,7 @@ from fsspec.asyn import AsyncFileSystem
 from upath import UPath
 from upath.implementations.local import FilePath
 
-from worldline_core.errors import ArtifactError, ConfigError, UnavailableError
+from worldline_core.errors import ArtifactError, ConfigError, UnavailableError, installing
 from worldline_core.store.artifact_files import digest_value
 from worldline_core.untrusted_text import carries_credentials
 
@@ -174,7 +174,7 @@ def file_system(path: AnyPath) -> Any:
             f"Locations of the form {cast('UPath', path).protocol}:// need a library that is not installed",
             where=path,
             got=str(error),
-            next_step="uv sync --extra s3 (for s3://), or install the fsspec library of that store",
+            next_step=f"for s3:// {installing('s3')}; otherwise install the fsspec library of that store",
         ) from error
 
 

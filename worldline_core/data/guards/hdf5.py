@@ -30,7 +30,7 @@ from worldline_core.data.guards.rejection import (
     unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
-from worldline_core.errors import UnavailableError
+from worldline_core.errors import UnavailableError, installing
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
 _MAX_TEXT = 1 << 20
@@ -48,7 +48,7 @@ def require_h5py() -> Any:
         raise UnavailableError(
             "Sources of HDF5 files need h5py, which is not installed",
             expected="the extra `hdf5`",
-            next_step="uv sync --extra hdf5 (or pip install 'worldline[hdf5]')",
+            next_step=installing("hdf5"),
         )
     return importlib.import_module("h5py")
 
