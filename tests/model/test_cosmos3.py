@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from tests.model.test_weight_memory import most_bytes
+from tests.model.test_weight_memory import most_bytes  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import CheckpointError, UnavailableError
 from worldline_core.model.checkpoint import fill, load_checkpoint
 from worldline_core.model.cosmos3 import Cosmos3Report, config_from_diffusers, import_backbone, read_cosmos3
@@ -25,7 +25,7 @@ def load_cosmos3(folder: Path, **options: Any) -> tuple[WorldModel, Cosmos3Repor
     return model, report
 
 
-SHAPE = {
+SHAPE: dict[str, Any] = {
     "head_dim": 12,
     "hidden_size": 24,
     "intermediate_size": 40,
@@ -40,7 +40,7 @@ SHAPE = {
 
 
 @pytest.fixture(scope="module")
-def diffusers_model() -> torch.nn.Module:
+def diffusers_model() -> Any:
     from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
 
     torch.manual_seed(3)
@@ -83,7 +83,7 @@ def reference_velocity(
 
 
 @torch.no_grad()
-def test_diffusers_weights_give_the_same_velocity(diffusers_model: torch.nn.Module, tmp_path: Path) -> None:
+def test_diffusers_weights_give_the_same_velocity(diffusers_model: Any, tmp_path: Path) -> None:
     diffusers_model.save_pretrained(tmp_path / "transformer", max_shard_size="40KB")
     assert len(list((tmp_path / "transformer").glob("*.safetensors"))) > 1
     model, report = load_cosmos3(tmp_path, fps=16.0)
@@ -104,8 +104,9 @@ def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
     """No model in float32 beside the weights, and the same bytes whatever was drawn before."""
     from diffusers.models.transformers.transformer_cosmos3 import Cosmos3OmniTransformer
 
-    shape = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
-    pretrained = Cosmos3OmniTransformer(**shape).to(torch.bfloat16)
+    shape: dict[str, Any] = SHAPE | {"hidden_size": 256, "intermediate_size": 1024, "num_hidden_layers": 6}
+    pretrained: Any = Cosmos3OmniTransformer(**shape)
+    pretrained.to(torch.bfloat16)
     pretrained.save_pretrained(tmp_path / "pretrained")
     inputs = {"diffusers": tmp_path / "pretrained"}
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
@@ -126,9 +127,7 @@ def test_the_import_holds_one_file_of_the_result(tmp_path: Path) -> None:
 
 
 @torch.no_grad()
-def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(
-    diffusers_model: torch.nn.Module, tmp_path: Path
-) -> None:
+def test_clips_of_two_rates_in_one_batch_stand_where_diffusers_puts_each(diffusers_model: Any, tmp_path: Path) -> None:
     """Cosmos3's fps modulation: a latent frame advances by 24 / fps; a stride of three shows 30 fps as 10."""
     diffusers_model.save_pretrained(tmp_path)
     model, _ = load_cosmos3(tmp_path, fps=30.0)
@@ -155,7 +154,7 @@ def test_a_model_without_a_rate_counts_latent_frames_whatever_the_clips_rate(
 
 
 @torch.no_grad()
-def test_the_generation_tower_alone_equals_both_without_text(diffusers_model: torch.nn.Module, tmp_path: Path) -> None:
+def test_the_generation_tower_alone_equals_both_without_text(diffusers_model: Any, tmp_path: Path) -> None:
     diffusers_model.save_pretrained(tmp_path)
     both, _ = load_cosmos3(tmp_path)
     alone, report = load_cosmos3(tmp_path, changes={"towers": "generation"})
@@ -165,7 +164,7 @@ def test_the_generation_tower_alone_equals_both_without_text(diffusers_model: to
     assert torch.equal(both(latents, sigma).velocity, alone(latents, sigma).velocity)
 
 
-def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model: torch.nn.Module, tmp_path: Path) -> None:
+def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model: Any, tmp_path: Path) -> None:
     with pytest.raises(UnavailableError, match="Cosmos3 weights are not here"):
         load_cosmos3(tmp_path / "nothing")
     diffusers_model.save_pretrained(tmp_path / "t", max_shard_size="40KB")
@@ -180,7 +179,7 @@ def test_a_missing_folder_and_damaged_folders_are_named(diffusers_model: torch.n
         load_cosmos3(tmp_path / "u")
 
 
-def test_another_architecture_is_refused(diffusers_model: torch.nn.Module, tmp_path: Path) -> None:
+def test_another_architecture_is_refused(diffusers_model: Any, tmp_path: Path) -> None:
     diffusers_model.save_pretrained(tmp_path)
     path = tmp_path / "config.json"
     config = json.loads(path.read_text())

@@ -146,6 +146,6 @@ class TextConfig(StrictModel):
 class ImportBackboneConfig(StrictModel):
     """How the pretrained weights are read and stored."""
 
-    fps: float = Field(30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
+    fps: float = Field(default=30.0, gt=0, description="rate of clips that state none: positions advance by 24 / fps")
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
-    changes: dict[str, Any] = Field({}, description="fields of the model's config to set besides (view slots)")
+    changes: dict[str, Any] = Field(default={}, description="fields of the model's config to set besides (view slots)")
