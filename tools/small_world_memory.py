@@ -67,11 +67,11 @@ class Episodes:
             raise DataError("No recording ended so", expected=outcomes, got=sorted({f.outcome for f in self.facts}))
         return torch.tensor(rows)
 
-    def clips(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Latents, action maps and robot masks of whole episodes, in single precision."""
-        return self.latents[rows].float(), self.maps[rows].float(), self.robot[rows].float()
+    def clips(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Latents, action maps, robot masks and shares of things of whole episodes, in single precision."""
+        return self.latents[rows].float(), self.maps[rows].float(), self.robot[rows].float(), self.things[rows].float()
 
-    def cuts(self, rows: Tensor, starts: Tensor, blocks: int) -> tuple[Tensor, Tensor, Tensor]:
+    def cuts(self, rows: Tensor, starts: Tensor, blocks: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The same of parts of long episodes: `starts` alone as first frames, then blocks of four.
 
         Raises: DataError for short recordings, whose frames are not coded alone.
@@ -83,7 +83,8 @@ class Episodes:
         first = rearrange(self.singles[rows, :, :, starts], "n v c h w -> n v c 1 h w")
         maps = rearrange(self.maps[rows[:, None], :, :, frames], "n t v c h w -> n v c t h w")
         robot = rearrange(self.robot[rows[:, None], :, frames], "n t v h w -> n v t h w")
-        return torch.cat((first, later), dim=3).float(), maps.float(), robot.float()
+        things = rearrange(self.things[rows[:, None], :, :, frames], "n t v c h w -> n v c t h w")
+        return torch.cat((first, later), dim=3).float(), maps.float(), robot.float(), things.float()
 
 
 def joined(parts: list[Episodes]) -> Episodes:

@@ -116,7 +116,7 @@ class Stage2Settings(Timed):
 
 
 class ForcingSettings(Timed):
-    """Teacher forcing. ``history_noise``: largest standard deviation of noise on the clean blocks that a block sees.
+    """Teacher forcing. ``things``: as in Stage II. ``history_noise``: largest standard deviation of noise on the clean blocks that a block sees.
 
     ``long_every``: every so many batches are a third as many cuts of 65 frames of long recordings, so that the model meets
     a window that moves; 0 does without them.
@@ -125,6 +125,7 @@ class ForcingSettings(Timed):
     batch: int = Field(default=192, ge=3)
     lr: float = Field(default=1e-3, gt=0)
     sigma: SigmaSampling = SigmaSampling(shift=5.0)
+    things: tuple[float, float] = (0.0, 0.0)
     history_noise: float = Field(default=0.0, ge=0)
     long_every: int = Field(default=4, ge=0)
     compile: bool = False

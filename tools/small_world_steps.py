@@ -237,20 +237,27 @@ def is_long(number: int, every: int) -> bool:
     return every > 0 and number % every == every - 1
 
 
-def recorded_batch(memory: Memory, size: int, draws: torch.Generator, *, long: bool) -> TrajectoryBatch:
-    """Clips and where the robot is; long ones are a third as many. The nodes are the recording itself."""
+def recorded_batch(
+    memory: Memory, size: int, draws: torch.Generator, *, long: bool, things: tuple[float, float] = (0.0, 0.0)
+) -> TrajectoryBatch:
+    """Clips and where the robot is; long ones are a third as many. The nodes are the recording itself.
+
+    Args:
+        things: extra weight of what the task moves, and of other things.
+    """
     episodes = memory.episodes(short=not long)
     rows = drawn(len(episodes), size // 3 if long else size, draws)
     if long:
         starts = drawn(episodes.latents.shape[3] - 4 * LONG_BLOCKS, len(rows), draws)
-        latents, maps, robot = episodes.cuts(rows, starts, LONG_BLOCKS)
+        latents, maps, robot, shares = episodes.cuts(rows, starts, LONG_BLOCKS)
     else:
-        latents, maps, robot = episodes.clips(rows)
+        latents, maps, robot, shares = episodes.clips(rows)
     return TrajectoryBatch(
         clips=named(episodes, rows),
         views=VIEWS,
         latents=latents,
         action_maps=maps,
+        weights=object_weights(shares, *things),
         nodes=latents[:, None],
         history=latents,
         mask=robot,
@@ -279,6 +286,7 @@ class ForcingObjective(CausalObjective[Batch]):
             spec=self.spec,
             sampling=self.settings.sigma,
             weighting=LossWeighting(motion=1.0),
+            weights=batch.weights,
             generator=generator,
         )
         return loss, {}
@@ -302,7 +310,8 @@ def causal_step(start: Start, settings: ForcingSettings | RegressionSettings | M
             compile_pass(model, "forward_teacher_forcing")
 
         def forcing(index: int) -> Batch:
-            return recorded_batch(memory, settings.batch, start.draws(index), long=is_long(index, settings.long_every))
+            long = is_long(index, settings.long_every)
+            return recorded_batch(memory, settings.batch, start.draws(index), long=long, things=settings.things)
 
         return Step(ForcingObjective(model, config, settings), groups, forcing, saved)
     if isinstance(settings, MatchingSettings):

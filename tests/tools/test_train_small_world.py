@@ -75,13 +75,14 @@ def test_weights_of_things_have_mean_one_and_are_larger_where_the_moved_thing_is
 
 def test_cuts_begin_with_the_frame_that_was_coded_alone_and_hold_its_maps() -> None:
     long = episodes(3, 33, long=True)
-    latents, maps, robot = long.cuts(torch.tensor([2, 0]), torch.tensor([16, 3]), blocks=4)
+    latents, maps, robot, things = long.cuts(torch.tensor([2, 0]), torch.tensor([16, 3]), blocks=4)
     assert latents.shape == (2, 3, 4, 17, 2, 2)
     assert maps.shape == (2, 3, 9, 17, 2, 2)
     for row, start in ((0, 216.0), (1, 3.0)):
         assert (latents[row, :, :, 0] == start + 0.5).all()
         assert latents[row, 1, 2, 1:, 0, 1].tolist() == [start + step for step in range(1, 17)]
         assert maps[row, 1, 8, :, 0, 1].tolist() == [start + step + 0.25 for step in range(17)]
+        assert things[row, 1, 1, :, 0, 1].tolist() == [start + step for step in range(17)]
         assert robot[row, 1, :, 0, 1].tolist() == [start + step + 0.75 for step in range(17)]
 
 

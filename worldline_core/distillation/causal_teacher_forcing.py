@@ -43,6 +43,7 @@ class TeacherForcingObjective(CausalObjective[Batch]):
             spec=self.config.training_spec,
             sampling=settings.sigma,
             weighting=settings.weighting,
+            weights=batch.weights,
             generator=generator,
         )
         return loss, {}
@@ -59,12 +60,14 @@ def teacher_forcing_loss(
     spec: CausalSpec,
     sampling: SigmaSampling,
     weighting: LossWeighting,
+    weights: Float[Tensor, "b v 1 t h w"] | None = None,
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
     """Flow-matching loss of every block of `latents`, given the clean blocks that `spec` keeps before it.
 
     Args:
         history: clean blocks the model sees instead of `latents` themselves.
+        weights: further ones of the squared error, as `Batch` carries them.
 
     Raises:
         DataError: the clip does not divide into blocks.
@@ -82,4 +85,4 @@ def teacher_forcing_loss(
         views=views,
         fps=fps,
     )
-    return flow_matching_loss(velocity, latents, noise, levels, weighting)
+    return flow_matching_loss(velocity, latents, noise, levels, weighting, weights=weights)
