@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections import defaultdict
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -51,8 +53,12 @@ def test_the_core_needs_neither_prefect_nor_what_is_above_it(imports: dict[str, 
     assert {module: names for module, names in found.items() if names and module.startswith("worldline_core")} == {}
 
 
-def test_the_architecture_names_every_room(project_root: Path) -> None:
+def test_the_architecture_shows_the_layers_in_their_order(project_root: Path) -> None:
+    contracts = tomllib.loads((project_root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    (layers,) = (c["layers"] for c in contracts["contracts"] if c.get("containers") == ["worldline_core"])
+    level = {room: n for n, layer in enumerate(layers) for room in layer.split(" | ")}
     text = (project_root / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rooms = [path.parent.name for path in sorted((project_root / "worldline_core").glob("*/__init__.py"))]
-    assert len(rooms) > 10
-    assert [room for room in rooms if f"`{room}/`" not in text] == []
+    rows = [row.split("|")[1] for row in text.split("\n## ")[1].splitlines() if row.startswith("| `")]
+    shown = [room for row in rows for room in re.findall(r"`(\w+)(?:/|\.py)`", row)]
+    assert sorted(shown) == sorted(level)
+    assert [level[room] for room in shown] == sorted(level[room] for room in shown)
