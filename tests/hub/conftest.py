@@ -53,9 +53,10 @@ def blob_oid(content: bytes) -> str:
 def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = True  # the body would wait 40 ms for the client to acknowledge the headers
 
-        def log_message(self, *arguments: Any) -> None:
-            del arguments
+        def log_message(self, format: str, *args: Any) -> None:
+            del format, args
 
         def answer(self, content: Any = None, status: int = 200, headers: dict[str, str] | None = None) -> None:
             data = (
@@ -228,7 +229,7 @@ def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> Iterator[Hub]:
     state = Hub()
     server = _Server(("127.0.0.1", 0), handler_of(state))
     state.url = f"http://127.0.0.1:{server.server_address[1]}"
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
     thread.start()
     monkeypatch.setenv("HF_ENDPOINT", state.url)
     monkeypatch.setenv("HF_TOKEN", "hf_test")

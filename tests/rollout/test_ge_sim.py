@@ -22,7 +22,7 @@ import pytest
 from PIL import ExifTags, Image
 from pydantic import ValidationError
 
-from tests.rollout.conftest import SIZE, recorded, track, write_recordings
+from tests.rollout.conftest import SIZE, recorded, track, write_recordings  # pyright: ignore[reportMissingImports]
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.rollout.ge_sim import tool_band
@@ -64,12 +64,12 @@ class Server:
                 self.end_headers()
                 self.wfile.write(answer)
 
-            def log_message(self, *args: object) -> None:
+            def log_message(self, format: str, *args: object) -> None:
                 pass
 
         self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self.http.server_port}"
-        threading.Thread(target=self.http.serve_forever, daemon=True).start()
+        threading.Thread(target=self.http.serve_forever, args=(0.01,), daemon=True).start()
 
     def answer(self, path: str, body: bytes) -> tuple[int, bytes]:
         if path == "/init":
