@@ -6,9 +6,14 @@
 Learned policies are folders of LeRobot checkpoints; they act in closed loop in both worlds, on what they see there. The scripted
 policies that recorded the starts look at nothing: how they ended is recorded, and the simulator is given their commands. In
 MuJoCo success is read from the simulated things, inside the measured judge says it of the predicted video. Pictures are equally rare
-in both. Each finished attempt is
-a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints the table. Needs the extra `sim`, and
-LeRobot for learned policies.
+in both.
+
+Why both differ is measured step by step: the judge says it of the true video (`judged`: what differs is the judge's), of what the
+simulator predicts from the very commands that were given in MuJoCo (`same_commands`: the model's), and of what it predicts while
+the policy acts on its pictures (`simulator`: the closed loop's). `target` is where the thing that is to be moved was in the end.
+
+Each finished attempt is a line of FOLDER/attempts.jsonl; the same command goes on where it was stopped, and prints the tables.
+Needs the extra `sim`, and LeRobot for learned policies.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from itertools import batched
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,11 +31,18 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineVectorEnv
+from worldline_core.environment.episodes import judge_of
 from worldline_core.environment.mujoco_world import MujocoEnv
+from worldline_core.evaluation.paired import paired_tests
 from worldline_core.evaluation.policy.agreement import STATISTICS, policy_agreement
+from worldline_core.evaluation.recordings import Trajectory
+from worldline_core.model.video_tokenizer import resize_frame
 
 FRAMES = 32
 RESAMPLES = 2000
+WORLDS = ("mujoco", "judged", "same_commands", "simulator")
+"""From what happens to what is predicted: each adds one cause to the one before it."""
+CAUSES = ("the judge", "the model", "the closed loop")
 
 Act = Callable[[dict[str, Any]], np.ndarray]
 """Commands ``(b, j)`` for an observation of a batch of episodes."""
@@ -63,14 +75,34 @@ class LearnedPolicy:
         return self._after(self._policy.select_action(batch)).numpy()
 
 
-def attempt(env: VectorEnv, numbers: Sequence[int], act: Act) -> list[bool]:
-    """Whether each episode, from the start of that number, ends in success."""
+class Attempts(NamedTuple):
+    """A batch that has ended: success of each, its commands ``(b, n, j)``, and by view the pictures that the environment gave,
+    ``(b, n + 1, H, W, 3)``."""
+
+    success: list[bool]
+    commands: np.ndarray
+    pictures: dict[str, np.ndarray]
+
+
+def attempt(env: VectorEnv, numbers: Sequence[int], act: Act, *, hold: int = 1) -> Attempts:
+    """Episodes from the starts of these numbers; the policy is shown new pictures every ``hold`` steps."""
     seeds: Any = [int(number) for number in numbers]  # a seed for each; the base class's annotation knows of one
     observed, _ = env.reset(seed=seeds)
     ended = np.zeros(len(numbers), dtype=bool)
-    for _ in range(FRAMES):
-        observed, _, ended, _, _ = env.step(act(observed))
-    return [bool(success) for success in ended]
+    seen, commands = [observed["pixels"]], []
+    for step in range(FRAMES):
+        shown = seen[step - step % hold]
+        commands.append(np.array(act({**observed, "pixels": shown})))
+        observed, _, ended, _, _ = env.step(commands[-1])
+        seen.append(observed["pixels"])
+    pictures = {view: np.stack([one[view] for one in seen], axis=1) for view in seen[0]}
+    return Attempts([bool(success) for success in ended], np.stack(commands, axis=1), pictures)
+
+
+def replay(commands: np.ndarray) -> Act:
+    """The given commands ``(b, n, j)``, whatever is seen."""
+    rows = iter(np.moveaxis(commands, 1, 0))
+    return lambda _: next(rows)
 
 
 class Starts:
@@ -86,36 +118,65 @@ class Starts:
             if row.bank in self.names:
                 self.recorded.setdefault(row.source, {})[row.bank] = position
 
-    def commands(self, policy: str, numbers: Sequence[int]) -> Act:
-        """What a recorded policy commanded at these starts, whatever it is shown."""
-        positions = [self.recorded[policy][self.names[number]] for number in numbers]
-        rows = iter(
-            np.stack([self.episodes.episode(position).action[1 : FRAMES + 1] for position in positions], axis=1)
+    def attempts(self, policy: str, number: int, size: tuple[int, int]) -> Attempts:
+        """What a recorded policy did at a start, with pictures of a size (H, W)."""
+        position = self.recorded[policy][self.names[number]]
+        row = self.episodes.rows[position]
+        videos: dict[str, np.ndarray] = {}
+        for view in row.views:
+            frames = self.episodes.frames(position, view, range(FRAMES + 1))
+            videos[view] = np.empty((1, len(frames), *size, 3), np.uint8)
+            for frame, out in zip(frames, videos[view][0], strict=True):
+                resize_frame(frame, size, out=out)
+        commands = self.episodes.episode(position).action[1 : FRAMES + 1]
+        return Attempts([row.outcome == "success"], commands[None], videos)
+
+
+class Worlds:
+    """Both worlds at the same starts, and the judge."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.inside = WorldLineVectorEnv(
+            options.batch, model=options.model, recordings=options.recordings, embodiment=options.embodiment,
+            episode_frames=FRAMES, observe_every=options.observe_every, autoreset_mode=AutoresetMode.DISABLED,
+            steps=options.steps,
+        )  # fmt: skip
+        self.size = self.inside.world.image_size
+        world = MujocoEnv(
+            options.recordings, embodiment=options.embodiment, image_size=self.size, episode_frames=FRAMES
         )
-        return lambda _: next(rows)
+        self.physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
+        self.starts = Starts(options.recordings, world, options.starts)
+        self._target, self._instruction = world.target, lambda number: world.starts[number].instruction
+        self._judge: Any = judge_of("measured", None, None, self.inside.world, self.inside.views, world.robot.name)
 
-    def succeeded(self, policy: str, number: int) -> bool:
-        return self.episodes.rows[self.recorded[policy][self.names[number]]].outcome == "success"
+    def attempts(self, name: str, learned: LearnedPolicy | None, missing: list[int]) -> Iterator[dict[str, Any]]:
+        """One policy at the starts that are missing, as many at a time as the simulator holds."""
+        for numbers in batched(missing, self.inside.num_envs):
+            rows = [self._real(name, learned, number) for number in numbers]
+            # A batch has one size: the last one is filled up with starts that are tried twice.
+            more = self.inside.num_envs - len(numbers)
+            filled = [*numbers, *([numbers[0]] * more)]
+            commands = np.concatenate([attempts.commands for attempts, _ in [*rows, *([rows[0]] * more)]])
+            same = predicted = attempt(self.inside, filled, replay(commands)).success
+            if learned is not None:
+                predicted = attempt(self.inside, filled, learned.begin()).success
+            for (_, row), one, other in zip(rows, same, predicted, strict=False):
+                yield {**row, "same_commands": one, "simulator": other}
 
-
-def attempts_of(
-    name: str, learned: LearnedPolicy | None, starts: Starts, physics: VectorEnv, inside: VectorEnv, missing: list[int]
-) -> Iterator[dict[str, Any]]:
-    """One policy at the starts that are missing, as many at a time as the simulator holds."""
-    for numbers in batched(missing, inside.num_envs):
-        # A batch has one size: the last one is filled up with starts that are tried twice.
-        filled = [*numbers, *([numbers[0]] * (inside.num_envs - len(numbers)))]
-        act = starts.commands(name, filled) if learned is None else learned.begin()
-        predicted = attempt(inside, filled, act)
-        for number, success in zip(numbers, predicted, strict=False):
-            real = starts.succeeded(name, number) if learned is None else attempt(physics, [number], learned.begin())[0]
-            yield {
-                "policy": name,
-                "learned": learned is not None,
-                "start": starts.names[number],
-                "mujoco": real,
-                "simulator": success,
-            }
+    def _real(self, name: str, learned: LearnedPolicy | None, number: int) -> tuple[Attempts, dict[str, Any]]:
+        """An attempt in MuJoCo, recorded or made now, and what the judge says of its video."""
+        if learned is None:
+            found, target = self.starts.attempts(name, number, self.size), None
+        else:
+            found = attempt(self.physics, [number], learned.begin(), hold=self.inside.observe_every)
+            target = self._target().tolist()
+        video = {view: pictures[0] for view, pictures in found.pictures.items() if view in self.inside.views}
+        seen = self._judge(Trajectory(self._instruction(number), video, self.inside.world.contract.fps))
+        return found, {
+            "policy": name, "learned": learned is not None, "start": self.starts.names[number],
+            "mujoco": found.success[0], "judged": bool(seen), "target": target,
+        }  # fmt: skip
 
 
 def table(attempts: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -138,13 +199,37 @@ def table(attempts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def printed(found: dict[str, Any]) -> str:
-    """The table as Markdown."""
-    lines: list[str] = []
-    if "all" in found:
-        lines += ["| policy | starts | MuJoCo | inside |", "|---|---|---|---|"]
-        for name, rates in found["all"]["policies"].items():
-            lines.append(f"| {name} | {rates['attempts']} | {rates['recorded']:.2f} | {rates['predicted']:.2f} |")
+def causes(attempts: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """What each cause adds to the rate of success: its mean, and its interval over starts, by kind of policy."""
+    found: dict[str, dict[str, Any]] = {}
+    for kind, learned in (("learned", True), ("scripted", False)):
+        chosen = [a for a in attempts if a["learned"] == learned]
+        starts = sorted({a["start"] for a in chosen})
+        series = {
+            cause: {
+                start: float(np.mean([a[after] - a[before] for a in chosen if a["start"] == start])) for start in starts
+            }
+            for cause, before, after in zip(CAUSES, WORLDS, WORLDS[1:], strict=False)
+        }
+        tests = paired_tests(series)
+        found[kind] = {cause: [test.mean, test.low, test.high] for cause, test in tests.items()}
+    return {kind: parts for kind, parts in found.items() if parts}
+
+
+def printed(attempts: Sequence[dict[str, Any]], found: dict[str, Any], parts: dict[str, Any]) -> str:
+    """The tables as Markdown."""
+    lines = [
+        "| policy | starts | MuJoCo | its video judged | its commands inside | inside |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in sorted({a["policy"] for a in attempts}):
+        own = [a for a in attempts if a["policy"] == name]
+        rates = " | ".join(f"{np.mean([a[world] for a in own]):.2f}" for world in WORLDS)
+        lines.append(f"| {name} | {len(own)} | {rates} |")
+    lines += ["", f"| policies | {' | '.join(CAUSES)} |", "|---|---|---|---|"]
+    for kind, of_cause in parts.items():
+        cells = ["{:+.2f} ({:+.2f} to {:+.2f})".format(*of_cause[cause]) for cause in CAUSES]
+        lines.append(f"| {kind} | {' | '.join(cells)} |")
     lines += ["", f"| policies | {' | '.join(STATISTICS)} | attempts with the same end |", "|---|---|---|---|---|---|"]
     for kind, facts in found.items():
         cells = [f"{kind} ({len(facts['policies'])})"]
@@ -166,6 +251,7 @@ def main() -> None:
     parser.add_argument("--policies", type=Path, nargs="*", default=[], help="folders of LeRobot checkpoints")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--model", type=Path, help="Stage II or causal checkpoint; by default the shipped causal one")
+    parser.add_argument("--steps", type=int, help="Euler steps of the model; by default its own")
     parser.add_argument("--observe-every", type=int, help="steps between two predicted pictures; by default the block")
     parser.add_argument("--starts", type=int, help="only so many, the first ones")
     parser.add_argument("--batch", type=int, default=8)
@@ -174,32 +260,21 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     path = options.output / "attempts.jsonl"
     attempts = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
-    inside = WorldLineVectorEnv(
-        options.batch, model=options.model, recordings=options.recordings, embodiment=options.embodiment,
-        episode_frames=FRAMES, observe_every=options.observe_every, autoreset_mode=AutoresetMode.DISABLED,
-    )  # fmt: skip
-    world = MujocoEnv(
-        options.recordings,
-        embodiment=options.embodiment,
-        image_size=inside.world.image_size,
-        episode_frames=FRAMES,
-        observe_every=inside.observe_every,
-    )
-    physics = SyncVectorEnv([lambda: world], autoreset_mode=AutoresetMode.DISABLED)
-    starts = Starts(options.recordings, world, options.starts)
+    worlds = Worlds(options)
+    starts = worlds.starts
     policies: dict[str, LearnedPolicy | None] = {one.name: one for one in map(LearnedPolicy, options.policies)}
     policies |= dict.fromkeys(starts.recorded)
     for name, learned in policies.items():
         done = {a["start"] for a in attempts if a["policy"] == name}
         missing = [number for number, start in enumerate(starts.names) if start not in done]
-        for one in attempts_of(name, learned, starts, physics, inside, missing):
+        for one in worlds.attempts(name, learned, missing):
             attempts.append(one)
             with path.open("a") as file:
                 file.write(json.dumps(one) + "\n")
-    physics.close()
-    found = table(attempts)
-    (options.output / "table.json").write_text(json.dumps(found, indent=1))
-    print(printed(found))
+    worlds.physics.close()
+    found, parts = table(attempts), causes(attempts)
+    (options.output / "table.json").write_text(json.dumps(found | {"causes": parts}, indent=1))
+    print(printed(attempts, found, parts))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from gymnasium.utils.env_checker import check_env
 pytest.importorskip("mujoco")
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment import MUJOCO_ENVIRONMENT
+from worldline_core.environment import MUJOCO_ENVIRONMENT, mujoco_world
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.environment.starts import EpisodeStarts
@@ -26,7 +26,7 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.video_tokenizer import resize_frame
 from worldline_core.recorder.banks import BankGrid
 from worldline_core.recorder.controllers import ScriptedPolicy
-from worldline_core.recorder.policies import RecordPoliciesConfig, record_policies
+from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies
 from worldline_core.recorder.record import record_with_manifest
 
 ROBOT = "ur5e_silver"
@@ -125,6 +125,24 @@ def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
     assert len({starts.row(number).bank for number in range(len(starts))}) == len(starts) == 2
 
 
+def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(
+    compared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[list[str]] = []
+
+    def draw(recorder: Any, spec: Any, config: RecordPoliciesConfig) -> Any:
+        drawn.append(list(config.policies))
+        return draw_start(recorder, spec, config)
+
+    monkeypatch.setattr(mujoco_world, "draw_start", draw)
+    again = MujocoEnv(compared, embodiment=ROBOT)
+    again.reset(seed=1)
+    assert drawn == [["expert", "blind", "late"]]
+    # A button that nobody has touched.
+    np.testing.assert_allclose(again.target(), [0.0], atol=1e-3)
+    again.close()
+
+
 def test_recordings_whose_starts_are_not_known_are_refused(
     world: MujocoEnv, shipped: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +178,7 @@ def test_recorded_policies_are_compared_in_both_worlds(
     assert len(attempts) == 6
     ended = {(row.bank, row.source): row.outcome == "success" for row in EpisodeSet.open(compared).rows}
     assert {(one["start"], one["policy"]): one["mujoco"] for one in attempts} == ended
+    assert all(one["same_commands"] == one["simulator"] and one["judged"] == one["mujoco"] for one in attempts)
     found = json.loads((tmp_path / "table.json").read_text())["scripted"]
     rates = {name: [one["simulator"] for one in attempts if one["policy"] == name] for name in POLICIES}
     assert {name: facts["predicted"] for name, facts in found["policies"].items()} == {
@@ -185,7 +204,10 @@ def test_a_learned_policy_meets_the_same_start_in_both_worlds(shipped: Path, com
     world = MujocoEnv(compared, embodiment=ROBOT)
     physics = script.SyncVectorEnv([lambda: world], autoreset_mode="Disabled")
     for env in (inside, physics):
-        assert script.attempt(env, [1], act) == [False]
+        found = script.attempt(env, [1], act)
+        assert found.success == [False]
+        assert found.commands.shape == (1, script.FRAMES, 14)
+        assert found.pictures["head"].shape == (1, script.FRAMES + 1, 64, 96, 3)
     physics.close()
     assert len(seen) == 2 * script.FRAMES
     first = seen[0], seen[script.FRAMES]

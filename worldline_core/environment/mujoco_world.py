@@ -20,6 +20,7 @@ import numpy as np
 from worldline_core.config import validate
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.episodes import checked_commands, robot_spaces
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
@@ -138,6 +139,12 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Latest picture, its views side by side, ``uint8 (H, views * W, 3)``."""
         return np.concatenate([self._pictures[view] for view in self.views], axis=1) if self.render_mode else None
 
+    def target(self) -> np.ndarray:
+        """Where the thing that the task moves is now: ``(3)`` its place [m], or ``(1)`` how far a drawer is open or a button down [m]."""
+        address = self._recorder.scene.model.joint(f"{self._layout.target.kind}_0").qposadr[0]
+        count = 1 if self._layout.family in ("close", "press") else 3
+        return self._qpos[-1][address : address + count].copy()
+
     def _observed(self) -> dict[str, Any]:
         state = read_state(self._recorder.scene, self._data).astype(np.float32)
         if (len(self._qpos) - 1) % self._observe_every == 0:
@@ -172,6 +179,10 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
     step, where = manifest.get("step"), recordings / MANIFEST_NAME
     if step == "record_policies":
         compared = validate(RecordPoliciesConfig, manifest["config"], where=where)
+        # A manifest sorts by name, and what each policy draws depends on its number.
+        numbers = {row.source: row.candidate for row in EpisodeSet.open(recordings).rows}
+        policies = {name: compared.policies[name] for name in sorted(numbers, key=lambda name: numbers[name] or 0)}
+        compared = compared.model_copy(update={"policies": policies})
         specs = {spec.name: spec for spec in compared.starts.specs()}
 
         def of_policies(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
