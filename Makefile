@@ -17,8 +17,8 @@ demo: install
 test: install-scale
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -n auto --dist worksteal
 
-# Deployment against a real server and worker, the rehearsal of the full size, the largest model classes: minutes. Two at a
-# time, a file in one process: several of them start processes of their own, and share what takes a minute to set up.
+# What takes long (CONTRIBUTING.md): servers, processes, trainings, the rehearsal of the full size, wheels. Two at a time, a file
+# in one process: several of them start processes of their own, and share what takes a minute to set up.
 test-slow: install-scale
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(RUN) pytest -m slow -n 2 --dist loadfile --no-loadscope-reorder --timeout=900
 

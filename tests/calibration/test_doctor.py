@@ -159,6 +159,7 @@ def test_quick_search_finds_the_same(benchmark: ModuleType, healthy: list) -> No
         assert diagnosis.best.conventions == conventions
 
 
+@pytest.mark.slow
 def test_evidence_adds_up_over_the_episodes_of_a_source(benchmark: ModuleType) -> None:
     """Two episodes in which the gripper alone is too weak a sign, one in which it is not."""
     items = list(benchmark.healthy(benchmark.RECORDINGS, {"test"}, 7, False))

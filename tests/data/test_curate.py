@@ -341,6 +341,7 @@ def test_states_and_videos_of_different_length(tmp_path: Path) -> None:
     assert curated.rows[0].stage2_reason == "missing_calibration"
 
 
+@pytest.mark.slow
 def test_a_killed_curation_continues_to_the_same_bytes(tmp_path: Path, sample: Make) -> None:
     bad = sample(3)
     bad[0].state[0, 0] = np.inf

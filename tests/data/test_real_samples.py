@@ -120,6 +120,7 @@ def test_unitree(tmp_path: Path, shared_data: Path) -> None:
     assert [row.stage2_reason for row in curated.rows] == ["missing_view", "missing_view"]
 
 
+@pytest.mark.slow
 def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> None:
     """The other nine episodes all come through, and their joints and poses agree."""
     from worldline_core.geometry.embodiment import load_embodiment
@@ -171,6 +172,7 @@ def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
     assert np.abs(first.action - first.state).mean() < np.abs(first.action - first.state[::-1]).mean()
 
 
+@pytest.mark.slow
 def test_videos_of_droid_as_plain_videos_are_for_evaluation_alone(tmp_path: Path, shared_data: Path) -> None:
     folder = shared_data / "droid_ctrl_world" / "droid_new_setup" / "videos"
     counts, curated = run(tmp_path, kind="video_folder", path=str(folder), name="clips", suffixes=[".mp4"])
@@ -218,6 +220,7 @@ def test_droid_with_the_self_calibration(tmp_path: Path, shared_data: Path) -> N
         assert inside.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_wrist_views_that_are_enlarged_are_as_sharp_as_before(tmp_path: Path, shared_data: Path) -> None:
     name = "droid-droid_new_setup-val-0002"
     source = {

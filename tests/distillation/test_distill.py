@@ -12,7 +12,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.distillation.conftest import write_inputs
+from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.distillation import trajectory_store
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
@@ -95,6 +95,7 @@ def test_three_steps_give_a_causal_checkpoint(finished: Finished) -> None:
     assert info.metadata["distillation"] == "distribution_matching"
     assert info.contract == read_checkpoint_info(inputs["stage2"]).contract
     assert info.causal == config().spec
+    assert info.causal is not None
     assert info.causal.sigmas == pytest.approx([1, 15 / 16, 5 / 6, 5 / 8, 0])
     assert counts["lpips"] == info.metadata["lpips"] == "off: no LPIPS weights configured"
     assert counts["episodes"] == 2
@@ -144,6 +145,7 @@ def test_blocks_window_and_nodes_of_the_config_are_those_of_training_and_of_the_
     assert {sigma for _, _, sigma in passes} == {1.0, 0.6, between}
     for folder in (tmp_path / "out" / "teacher_forcing", tmp_path / "out"):
         model, info = load_checkpoint(folder)
+        assert info.causal is not None
         assert info.causal == small.spec
         assert info.causal.recent_blocks == 0
 
@@ -200,7 +202,7 @@ def killing(function: Callable, at_call: int) -> Callable:
     return wrapped
 
 
-@pytest.mark.parametrize("real_score", ["stage2", "causal_teacher"])
+@pytest.mark.parametrize("real_score", ["stage2", pytest.param("causal_teacher", marks=pytest.mark.slow)])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
 ) -> None:

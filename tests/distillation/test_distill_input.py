@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.distillation.conftest import EPISODES, FRAMES, IMAGE, SIGMA, VIEWS, tracks_of
-from tests.distillation.test_distill import config
+from tests.distillation.conftest import EPISODES, FRAMES, IMAGE, SIGMA, VIEWS, tracks_of  # pyright: ignore[reportMissingImports]
+from tests.distillation.test_distill import config  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import CameraTrack, Episode
@@ -67,6 +67,7 @@ def online(**changes: object) -> DistillConfig:
     return DistillConfig.model_validate({**config().model_dump(), "input": {**FRAME_INPUT, **changes}})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_frames_on_the_way_are_as_good_as_cached_latents(
     recorded: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

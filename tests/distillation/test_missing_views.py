@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.rollout.conftest import SIZE, recorded, write_recordings
+from tests.rollout.conftest import SIZE, recorded, write_recordings  # pyright: ignore[reportMissingImports]
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
@@ -104,6 +104,7 @@ def test_every_step_sees_every_set_of_views(
     assert "validation/rollout_error" in " ".join(counts)
 
 
+@pytest.mark.slow
 def test_nothing_changes_where_no_view_is_missing(inputs: dict[str, Path], tmp_path: Path) -> None:
     for name, optional in (("needed", []), ("optional", OPTIONAL)):
         distill(config("latents", ["train"], optional), inputs, tmp_path / name)

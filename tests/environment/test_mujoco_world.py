@@ -71,6 +71,7 @@ def driven(world: MujocoEnv, number: int, commands: np.ndarray) -> tuple[np.ndar
     return np.array(states), ended, info
 
 
+@pytest.mark.slow
 def test_recorded_commands_lead_where_they_led(world: MujocoEnv, shipped: Path) -> None:
     """Of every task: the recorded first picture, the same states, the same end; twice, because a start leaves nothing behind."""
     recordings = EpisodeSet.open(shipped / "recordings")
@@ -166,6 +167,7 @@ def policies_inside(project: Path) -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 def test_recorded_policies_are_compared_in_both_worlds(
     shipped: Path, compared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -106,6 +106,7 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
 
 WITH_THUMBNAILS = ("episode as mcap", "episode as lerobot", "curate")
 """Thumbnails of each view grow, and messages are collected in chunks: together less than the frames of one view."""
+SLOW = ("episode as mcap", "episode as rrd", "inspect", "overlay")
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda recorded, output: write_side_by_side(
         output / "a.mp4", {"true": recorded.videos["head"], "again": recorded.videos["head"]}, FPS, tile_height=96
@@ -139,7 +140,9 @@ def lengths(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Recorded]:
     return {count: Recorded(root / str(count)) for count in (SHORT, LONG)}
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in OUTPUTS]
+)
 def test_memory_does_not_grow_with_the_frames(
     lengths: dict[int, Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

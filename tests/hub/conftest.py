@@ -55,7 +55,7 @@ def handler_of(hub: Hub) -> type[BaseHTTPRequestHandler]:
         protocol_version = "HTTP/1.1"
         disable_nagle_algorithm = True  # the body would wait 40 ms for the client to acknowledge the headers
 
-        def log_message(self, format: str, *args: Any) -> None:
+        def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
             del format, args
 
         def answer(self, content: Any = None, status: int = 200, headers: dict[str, str] | None = None) -> None:

@@ -258,6 +258,7 @@ def test_what_nobody_can_record_is_refused() -> None:
         EpisodeRecorder("so101")
 
 
+@pytest.mark.slow
 def test_a_recording_tells_its_failures_apart_from_its_index(tmp_path: Path) -> None:
     group = RecordGroup(
         embodiment="viperx_pearl", split="ood_test", count=3, families=("lift", "place", "close"), held_out_camera=True

@@ -81,6 +81,7 @@ def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Pat
     assert [path.name for path in inspect(tracks).written] == ["contact_sheet.png"]
 
 
+@pytest.mark.slow
 def test_an_episode_set_is_shown_with_tracks_of_its_commands(project_root: Path, tmp_path: Path) -> None:
     name = "ur5e_silver-test-s1-00000"
     found = inspect(project_root / "artifacts/shipped/recordings", tmp_path, episode_id=name, video=True)

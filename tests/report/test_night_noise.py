@@ -89,6 +89,7 @@ def test_ten_nights_of_pure_noise_stay_green(tmp_path: Path) -> None:
         assert record_night(history, f"{number}", world.write(tmp_path / f"{number}")).regressions == []
 
 
+@pytest.mark.slow
 def test_false_alarms_are_rare_over_two_hundred_nights_of_pure_noise() -> None:
     alarms, nights = 0, 0
     for seed, recordings in ((3, 16), (4, 40)):

@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.report.conftest import EPISODES, write_episode_set
+from tests.report.conftest import EPISODES, write_episode_set  # pyright: ignore[reportMissingImports]
 from worldline_core.errors import ArtifactError
 from worldline_core.report.context import ReportContext
 from worldline_core.report.cost import Timing
@@ -40,7 +40,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
         self.references += [v for k in ("src", "href", "poster") if (v := values.get(k))]
-        self.identities += [values["id"]] if values.get("id") else []
+        self.identities += [v] if (v := values.get("id")) else []
         self.handlers += [name for name in values if name.startswith("on")]
         self.scripts += tag == "script"
         if tag not in VOID:
@@ -140,6 +140,7 @@ def test_videos_play_in_browsers(full_report: Path) -> None:
     assert content.index(b"moov") < content.index(b"mdat")  # the index comes first: playable while loading
 
 
+@pytest.mark.slow
 def test_bytes_are_the_same_again(run_artifacts: dict[str, Path], full_report: Path, tmp_path: Path) -> None:
     report(ReportConfig(tile_height=64, rerun=False, mcap=False), run_artifacts, tmp_path)
     again, before = digest(tmp_path), digest(full_report)

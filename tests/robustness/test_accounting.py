@@ -20,6 +20,7 @@ from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
 
 
+@pytest.mark.slow
 def test_every_damaged_recording_is_accounted_for_by_its_true_reason(tmp_path: Path) -> None:
     written, config = write_corpus(tmp_path, healthy=2, each=1, seed=3)
     labels, again = read_corpus(tmp_path)

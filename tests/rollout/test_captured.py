@@ -22,6 +22,7 @@ from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout
 
 SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)
 RESIDUAL = {"prediction": "first_frame_residual", "view_embedding": True, "fps": 24.0}
+BOTH = [{}, pytest.param(RESIDUAL, marks=pytest.mark.slow)]
 
 
 def record_here(work: Callable[[], Sequence[Tensor]]) -> tuple[Callable[[], None], Sequence[Tensor]]:
@@ -53,7 +54,7 @@ def blocks(model: WorldModel, run: Run, seed: int, fps: float | None = None, dev
     return [*found, *(branch.step(given[1:]) for given in controls[3:])]
 
 
-@pytest.mark.parametrize("changes", [{}, RESIDUAL], ids=["velocity", "residual"])
+@pytest.mark.parametrize("changes", BOTH, ids=["velocity", "residual"])
 def test_replayed_blocks_are_the_same_bytes(make_model: Callable[..., WorldModel], changes: dict[str, Any]) -> None:
     model, other = (make_model(seed, **changes).requires_grad_(False) for seed in (0, 1))
     recordings: list[int] = []
@@ -98,7 +99,7 @@ class OnTheDevice(TorchDispatchMode):
         return found
 
 
-@pytest.mark.parametrize("changes", [{}, RESIDUAL], ids=["velocity", "residual"])
+@pytest.mark.parametrize("changes", BOTH, ids=["velocity", "residual"])
 def test_passes_take_nothing_from_the_processor(make_model: Callable[..., WorldModel], changes: dict[str, Any]) -> None:
     """On tensors of a GPU that have shapes and no values: what would wait for a value, or copy one, is an error."""
 

@@ -128,6 +128,7 @@ def test_other_runners(recordings: Path, undisturbed: tuple[str, str], tmp_path:
     assert both_digests(recordings, tmp_path, shard_mapper(runner(kind, workers=workers))) == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 def test_in_a_flow_the_shards_are_tasks_with_names(
     recordings: Path, undisturbed: tuple[str, str], tmp_path: Path
@@ -158,6 +159,7 @@ def test_in_a_flow_the_shards_are_tasks_with_names(
                 time.sleep(0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 def test_killed_in_the_middle_and_resumed_elsewhere(
     recordings: Path, undisturbed: tuple[str, str], tmp_path: Path

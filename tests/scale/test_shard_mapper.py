@@ -45,13 +45,13 @@ def processes(folder: Path) -> set[str]:
     return {line.split()[1] for line in (folder / "log.txt").read_text().splitlines()}
 
 
-SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("dask", "ray")]
 SEVEN = "Squaring ended with ZeroDivisionError: seven"
 THIRTEEN = "Squaring this episode alone ended its process, twice"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
-@pytest.mark.parametrize("kind", ["processes", *SLOW])
+@pytest.mark.parametrize("kind", ["processes", "dask", "ray"])
 def test_bad_episodes_and_dying_workers_cost_an_episode_each(tmp_path: Path, kind: str) -> None:
     # Asked without importing: what Ray reads at its import is set by the mapper.
     if kind in ("dask", "ray") and find_spec(f"prefect_{kind}") is None:

@@ -183,21 +183,21 @@ def test_failed_step_leaves_no_artifact_and_continues(tmp_path: Path) -> None:
     assert undisturbed.digest == artifact.digest
 
 
-def _slow_count(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    for number in range(config.upto):
-        path = output / f"{number}.txt"
-        if not path.exists():
-            write_bytes_atomic(path, str(number).encode())
-            time.sleep(0.05)
-    return {}
+def _run_slow(root: Path, waits_at: int | None = None) -> None:
+    def count_slowly(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
+        for number in range(config.upto):
+            path = output / f"{number}.txt"
+            if not path.exists():
+                if number == waits_at:
+                    time.sleep(60)  # to be killed
+                write_bytes_atomic(path, str(number).encode())
+        return {}
 
-
-def _run_slow(root: Path) -> None:
-    ArtifactStore(root).run("slow", 1, _slow_count, CountConfig(upto=40), {})
+    ArtifactStore(root).run("slow", 1, count_slowly, CountConfig(upto=5), {})
 
 
 def test_killed_run_continues_to_the_same_digest(tmp_path: Path) -> None:
-    process = multiprocessing.get_context("fork").Process(target=_run_slow, args=(tmp_path / "killed",))
+    process = multiprocessing.get_context("fork").Process(target=_run_slow, args=(tmp_path / "killed", 3))
     process.start()
     deadline = time.time() + 30
     while time.time() < deadline and len(list((tmp_path / "killed").rglob("[0-9]*.txt"))) < 3:

@@ -222,6 +222,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_nodes_side_by_side_write_each_line_once_and_say_whose_it_is(
     prefect_server: None, project_root: Path, tmp_path: Path
 ) -> None:

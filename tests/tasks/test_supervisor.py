@@ -118,6 +118,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_processes_that_record_end_with_the_one_that_started_them(project_root: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "recording.py").write_text(RECORDING)

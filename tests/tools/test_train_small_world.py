@@ -301,6 +301,7 @@ def plan_of(**runs: object) -> Plan:
     return Plan.model_validate({"model": TINY, "measure": {"splits": {"test": 4}}, "runs": runs})
 
 
+@pytest.mark.slow
 def test_runs_share_what_they_have_in_common_and_are_measured(measuring: Measuring, tmp_path: Path) -> None:
     with_base = {"base": BASE, "stage2": STAGE2}
     plan = plan_of(
@@ -369,6 +370,7 @@ CAUSAL = {
 }
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_ends_with_the_same_bits(
     measuring: Measuring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,7 +47,7 @@ class Scripted(LatentStore):
 
 
 def reader(world: Any, behaviour: dict[str, str] | None = None, *, skip: bool = False, **sampling: Any) -> ClipReader:
-    plain = LatentStore.open(world.latents)
+    plain: Any = LatentStore.open(world.latents)
     store = Scripted(plain.root, plain.description, plain.rows)
     store.behaviour = behaviour or {}
     values = {"lengths": (5, 9, 17), "view_weights": {"joint": 1.0, "primary": 1.0}, "single_view_factor": 2}
@@ -73,6 +73,7 @@ def gone(prefetcher_processes: list[int]) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_batches_do_not_depend_on_the_number_of_processes(world: Any) -> None:
     # Two episodes are slow: processes overtake each other.
@@ -141,6 +142,7 @@ def test_skipped_clips_come_with_the_batch(world: Any) -> None:
             assert torch.equal(read.data, single.data)
 
 
+@pytest.mark.slow
 def test_processes_end_with_the_training_process(world: Any, tmp_path: Path) -> None:
     """Killed with SIGKILL, it cannot close anything: its loader processes notice and end by themselves."""
     (tmp_path / "reader.pickle").write_bytes(pickle.dumps(reader(world)))

@@ -37,7 +37,12 @@ def benchmark() -> ModuleType:
 
 @pytest.mark.parametrize(
     ("size", "precision", "accumulation", "checkpointing"),
-    [(0, "fp32", 1, "none"), (2, "fp32", 1, "none"), (0, "bf16", 2, "block"), (1, "bf16", 2, "block")],
+    [
+        (0, "fp32", 1, "none"),
+        pytest.param(2, "fp32", 1, "none", marks=pytest.mark.slow),
+        (0, "bf16", 2, "block"),
+        pytest.param(1, "bf16", 2, "block", marks=pytest.mark.slow),
+    ],
 )
 def test_planned_memory_is_what_the_allocator_hands_out(
     benchmark: ModuleType, size: int, precision: str, accumulation: int, checkpointing: str
@@ -166,7 +171,7 @@ def test_parameters_are_counted_on_the_real_model() -> None:
     assert trained == sum(value.numel() for _, value in model.action_parameters())
 
 
-@pytest.mark.parametrize("sampler", ["causal", "stage2"])
+@pytest.mark.parametrize("sampler", ["causal", pytest.param("stage2", marks=pytest.mark.slow)])
 def test_rollouts_are_timed_with_weights_that_were_never_in_float32(benchmark: ModuleType, sampler: str) -> None:
     rollouts = benchmark.Rollouts.of("tiny", "cpu")
     assert rollouts.model.proj_in.weight.dtype == torch.bfloat16
