@@ -1,6 +1,6 @@
 """Can the page be driven in real time? Blocks of `worldline play` through its own session, against the model's rate.
 
-python benchmarks/play.py [--blocks 8] [--checkpoint FOLDER] [--threads 2]
+python benchmarks/play.py [--blocks 8] [--checkpoint FOLDER] [--decoder FOLDER] [--threads 2]
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--blocks", type=int, default=8)
     parser.add_argument("--checkpoint", type=Path, default=shipped_folder() / "models" / "causal")
+    parser.add_argument("--decoder", type=Path, help="folder of a small decoder")
     parser.add_argument("--episode", default="ur5e_silver-test-s1-00000")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    world = WorldLine.from_pretrained(options.checkpoint)
+    world = WorldLine.from_pretrained(options.checkpoint, decoder=options.decoder)
     server = make_server(world, ServeConfig(port=0, episodes=shipped_folder() / "recordings"), None)
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -18,7 +18,7 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.tokenizers import WanTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.training.frame_source import RecordedView, load_views
-from worldline_core.training.train_tokenizer import clip_of, reconstruction_metrics, select_episodes, video_batch
+from worldline_core.training.train_tokenizer import clip_of, drawn_clips, reconstruction_metrics, select_episodes
 from worldline_core.training.training_config import TokenizerConfig
 
 
@@ -50,7 +50,7 @@ def train_wan(tokenizer: WanTokenizer, views: list[RecordedView], config: Tokeni
     optimizer = torch.optim.AdamW(tokenizer.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
     started, step = time.perf_counter(), 0
     while time.perf_counter() - started < seconds:
-        _, video = video_batch(views, config, step)
+        video = torch.stack([clip.picked for clip in drawn_clips(views, config, step)])
         loss = (tokenizer.decode(tokenizer.encode(video)) - video).abs().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -143,7 +143,7 @@ def train_tokenizer(folder: Path, output: Path, settings: TokenizerSettings, dev
         tokenizer.refinement = Refinement(tokenizer.temporal_compression, settings.width, settings.depth)
         decoder = tokenizer.to(device).refinement.train().requires_grad_(True)
         groups = [ParameterGroup("decoder", dict(decoder.named_parameters()))]
-        return Step(DecoderObjective(tokenizer), groups, load)
+        return Step(DecoderObjective(tokenizer.refine), groups, load)
 
     identity: Facts = {"settings": settings.model_dump(mode="json"), "encoder": tokenizer.encoder_digest}
     result, counts, _ = trained(settings, 0, device, "tokenizer", output, identity, make)

@@ -165,7 +165,7 @@ def test_batches_depend_on_the_step_alone_and_disturbance_spares_the_first_frame
     one, again, other = (decoder_batch(fitted, videos, config, step) for step in (7, 7, 8))
     assert one.names == again.names
     assert torch.equal(one.video, again.video)
-    assert torch.equal(one.coarse, again.coarse)
+    assert torch.equal(one.given, again.given)
     assert not torch.equal(one.video, other.video)
     latents = fitted.encode(scenes())
     disturbed = disturb(latents, 0.3, torch.Generator().manual_seed(0))

@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from worldline_core.errors import ArtifactError
+from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.pipeline.steps import get_step
+from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.train_tokenizer import train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -66,3 +68,34 @@ def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> 
     assert (counts["found"], counts["kept"]) == (8, 2)
     assert counts["left_out"] == {"in other splits": 2, "beyond max_episodes": 4, "shorter than 5 frames": 0}
     assert PatchTokenizer.load(tmp_path).latent_channels == 8
+
+
+def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(
+    world: Any, trained: Path, tmp_path: Path
+) -> None:
+    inputs = {"episodes": world.episodes, "encoder": trained}
+    get_step("train_tokenizer").check_inputs(inputs)
+    before = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
+    found = [
+        train_tokenizer(CONFIG.model_copy(update={"steps": steps}), inputs, tmp_path / str(steps)) for steps in (0, 12)
+    ]
+    assert found[1]["held_out"] != found[0]["held_out"]
+    assert all(metrics["held_out"]["psnr/decoded"] > metrics["own_decoder"]["psnr/linear"] for metrics in found)
+    assert found[0]["own_decoder"] == found[1]["own_decoder"]
+    assert found[0]["own_decoder"]["psnr/decoded"] > 10
+    assert {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()} == before
+    tokenizer = PatchTokenizer.load(trained)
+    assert SmallDecoder.load(tmp_path / "12", tokenizer, tokenizer.encoder_digest[:16]).config.width == 4
+    assert not (tmp_path / "12" / "tokenizer.json").exists()
+    with pytest.raises(ConfigError, match="A start and an encoder"):
+        train_tokenizer(CONFIG, {**inputs, "start": trained}, tmp_path / "both")
+
+
+def test_a_wan_autoencoder_gets_one_too(world: Any, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    small_wan_autoencoder().save_pretrained(tmp_path / "wan" / "vae")
+    inputs = {"episodes": world.episodes, "encoder": tmp_path / "wan"}
+    changes = {"steps": 1, "max_episodes": 1}
+    metrics = train_tokenizer(CONFIG.model_copy(update=changes), inputs, tmp_path / "decoder")
+    assert metrics["held_out"].keys() == metrics["own_decoder"].keys()
+    assert json.loads((tmp_path / "decoder" / "decoder.json").read_text())["config"]["spatial_compression"] == 16

@@ -33,7 +33,9 @@ DESCRIPTION, WEIGHTS = "tokenizer.json", "tokenizer.safetensors"
 FORMAT, VERSION = "worldline.tokenizer", 1
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
+    """Two convolutions beside the identity."""
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(width, width, 3, padding=1)
@@ -56,11 +58,11 @@ class Refinement(nn.Module):
         self.group = group
         inner = 2 * width
         self.enter = nn.Conv2d((group + 2) * 12 + 1, width, 3, padding=1)
-        self.fine_in = _Residual(width)
+        self.fine_in = Residual(width)
         self.down = nn.Conv2d(width, inner, 3, stride=2, padding=1)
-        self.coarse = nn.Sequential(*[_Residual(inner) for _ in range(depth)])
+        self.coarse = nn.Sequential(*[Residual(inner) for _ in range(depth)])
         self.up = nn.Conv2d(inner, 4 * width, 1)
-        self.fine_out = _Residual(width)
+        self.fine_out = Residual(width)
         self.leave = nn.Conv2d(width, group * 4 * 4, 3, padding=1)
         nn.init.zeros_(self.leave.weight)
         bias = torch.zeros(group, 4, 4)

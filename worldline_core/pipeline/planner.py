@@ -188,7 +188,17 @@ class Planner:
         alike: dict[str, list[str]] = {}
         for name, run in self.config.rollouts.items():
             if run.checkpoint is not None and run.config is not None:
-                what = {"sampler", "steps", "num_frames", "clip_frames", "batch_size", "bfloat16", "weights", "text"}
+                what = {
+                    "sampler",
+                    "steps",
+                    "num_frames",
+                    "clip_frames",
+                    "batch_size",
+                    "bfloat16",
+                    "weights",
+                    "decoder",
+                    "text",
+                }
                 alike.setdefault(run.config.model_dump_json(include=what), []).append(name)
         for names in alike.values():
             run = self.config.rollouts[names[0]]

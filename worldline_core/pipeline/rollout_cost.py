@@ -9,6 +9,7 @@ import torch
 
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.layers import TextContext
+from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.step_cost import StepCost, cost_at_depth, cost_of, in_bfloat16, without_values
 from worldline_core.model.tokenizers import WanTokenizer, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
@@ -64,15 +65,19 @@ def rollout_cost(model: WorldModelConfig, shape: ClipShape, config: RolloutConfi
 
 
 def decoding_cost(tokenizer: Path | None, shape: ClipShape, config: RolloutConfig) -> tuple[int, StepCost]:
-    """Bytes of a tokenizer, and what decoding a batch costs: one clip at a time, all of its views at once."""
+    """Bytes of a tokenizer, and what decoding a batch costs: one clip at a time, all of its views at once.
+
+    Of a small decoder whose folder is not here yet, the default size stands for it.
+    """
     with without_values():
         codec = tokenizer_outline(tokenizer)
         if config.weights == "bfloat16" and isinstance(codec, WanTokenizer):
             in_bfloat16(codec)
+        small = None if config.decoder is None else SmallDecoder.outline(config.decoder, codec)
         latents = torch.empty(len(shape.views), codec.latent_channels, latent_frame_count(shape.frames), *shape.grid)
 
         def decode() -> None:
-            with torch.no_grad():
-                codec.decode(latents)
+            with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
+                (small or codec).decode(latents)
 
-        return frozen_bytes(codec), cost_of(decode).times(shape.clips)
+        return frozen_bytes(codec) + (0 if small is None else frozen_bytes(small)), cost_of(decode).times(shape.clips)

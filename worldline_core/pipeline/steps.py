@@ -184,8 +184,8 @@ _STEPS = (
         "train_tokenizer",
         "training.training_config.TokenizerConfig",
         ("episodes",),
-        ("start", "held_out"),
-        summary="fit the small video tokenizer of the embedded default",
+        ("start", "encoder", "held_out"),
+        summary="fit the small video tokenizer of the embedded default, or a small decoder for any tokenizer's latents",
     ),
     Step(
         "train_teacher",

@@ -204,6 +204,7 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
     world = WorldLine.from_pretrained(
         Path(inputs["checkpoint"]),
         tokenizer=Path(inputs["tokenizer"]),
+        decoder=config.decoder,
         expect_kind="stage2" if config.sampler == "full_clip" else "causal",
         device=config.device,
         bfloat16=config.bfloat16,

@@ -80,6 +80,9 @@ class RolloutConfig(StrictModel):
     weights: Literal["float32", "bfloat16"] = Field(default="float32", exclude_if=lambda value: value == "float32")
     """How the model's weights are held, and those of a Wan autoencoder, which then computes in bfloat16 too: half the
     memory, and no copy in float32 is ever made."""
+    decoder: Path | None = Field(default=None, exclude_if=lambda value: value is None)
+    """Folder of a small decoder that train_tokenizer made for the model's tokenizer: it decodes in place of the tokenizer's
+    own, which takes many times its operations."""
     device: str = "cpu"
     captured: bool = Field(default=False, exclude_if=lambda value: not value)
     """On a GPU: record the passes of a block (or of a step of a whole clip) once, and replay them as CUDA graphs."""
@@ -97,6 +100,8 @@ class RolloutConfig(StrictModel):
                 f"captured needs the sampler full_clip or block_causal on the device cuda, not {self.sampler} on {self.device}: "
                 "leave it out there, nothing else changes"
             )
+        if self.decoder is not None and self.sampler in ("copy_first_frame", "ge_sim"):
+            raise ValueError(f"decoder: the sampler {self.sampler} has no latents to decode; leave it out there")
         if self.timed_blocks and self.sampler != "block_causal":
             raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
         if self.shift != 1.0 and self.sampler not in ("full_clip", "text_to_video"):
@@ -120,7 +125,8 @@ class RolloutConfig(StrictModel):
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        return {} if self.text is None else self.text.files_read()
+        read = {} if self.text is None else self.text.files_read()
+        return read if self.decoder is None else {**read, "decoder": self.decoder}
 
 
 NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")

@@ -19,6 +19,7 @@ from worldline_core.config import validate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
+from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.text import ClipFacts, load_text_encoder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import video_to_frames
@@ -55,6 +56,8 @@ class TextToVideo:
             raise CheckpointError(
                 "The model was trained on another tokenizer's latents", where=tokenizer, expected=trained, got=found
             )
+        if config.decoder is not None:
+            self.tokenizer = SmallDecoder.load(config.decoder, self.tokenizer, found, config.device)
         stated = self.info.metadata.get("text")
         if config.text is None and stated is None:
             raise ConfigError(

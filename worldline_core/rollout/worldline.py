@@ -19,6 +19,7 @@ from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
+from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
@@ -92,6 +93,7 @@ class WorldLine:
         folder: Path | str,
         *,
         tokenizer: Path | str | None = None,
+        decoder: Path | str | None = None,
         expect_kind: Literal["stage2", "causal"] | None = None,
         device: str = "cpu",
         bfloat16: bool = True,
@@ -107,6 +109,7 @@ class WorldLine:
         Args:
             folder: of the checkpoint, or ORG/NAME of the hub (safetensors and JSON files are fetched, nothing else).
             tokenizer: its folder; by default ``tokenizer`` in the checkpoint's folder, else beside it.
+            decoder: folder of a small decoder for its latents (train_tokenizer), which decodes in the tokenizer's place.
             expect_kind: refuse checkpoints of another kind.
             bfloat16: mixed precision of the model and the decoder.
             weights: how the model's weights are held, and those of a Wan autoencoder; in bfloat16 they take half the
@@ -118,7 +121,7 @@ class WorldLine:
             sink_blocks, recent_blocks: the causal model's window, by default the one it was trained with.
 
         Raises:
-            CheckpointError: a folder is not what it should be, or the tokenizer is not the model's.
+            CheckpointError: a folder is not what it should be, or tokenizer or decoder are not the model's.
             UnavailableError: the hub does not give it.
             ConfigError: fewer than one step.
         """
@@ -135,7 +138,10 @@ class WorldLine:
                 next_step="give its folder as tokenizer=...",
             )
         codec = load_tokenizer(place, device, getattr(torch, weights))
-        info.contract.require(where=place, tokenizer=tokenizer_fingerprint(codec, place))
+        fingerprint = tokenizer_fingerprint(codec, place)
+        info.contract.require(where=place, tokenizer=fingerprint)
+        if decoder is not None:
+            codec = SmallDecoder.load(Path(decoder), codec, fingerprint, device)
         return cls(
             model, info, codec, device=device, bfloat16=bfloat16, steps=steps, shift=shift, clip_frames=clip_frames,
             sink_blocks=sink_blocks, recent_blocks=recent_blocks,
@@ -322,16 +328,11 @@ class WorldLine:
             drawn = [max(start, frame - stride * back) for frame in frames for back in range(count)]
             index, last = [min(frame, track.num_frames - 1) for frame in drawn], track.num_frames - 1
             cut.append(track.clip(index, wrist_projection=self.contract.wrist_projection, start=min(start, last)))
-        maps = (
-            native_vectors(cut, views, native)
-            if native is not None
-            else render_action_maps(
-                collate_tracks(cut, views=views),
-                cut[0].image_size,
-                grid_size=self.contract.grid_size,
-                sigma_px_ref=self.contract.sigma_px_ref,
-            )
-        )
+        if native is not None:
+            maps = native_vectors(cut, views, native)
+        else:
+            collated, size, sigma = collate_tracks(cut, views=views), cut[0].image_size, self.contract.sigma_px_ref
+            maps = render_action_maps(collated, size, grid_size=self.contract.grid_size, sigma_px_ref=sigma)
         return stack_controls(maps.to(self.device), count)
 
     def simulator(

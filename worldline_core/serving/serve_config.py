@@ -40,6 +40,7 @@ class ServeConfig(StrictModel):
 
     Attributes:
         model: folder of a causal or Stage II checkpoint.
+        decoder: folder of a small decoder for the latents of its tokenizer.
         steps: Euler steps; by default the model's own.
         episodes: EpisodeSet whose recordings sessions may start from.
         output: where sessions of the page are saved.
@@ -54,6 +55,7 @@ class ServeConfig(StrictModel):
     """
 
     model: Path = SHIPPED / "models" / "causal"
+    decoder: Path | None = None
     device: str = "cpu"
     bfloat16: bool = True
     steps: int | None = Field(None, ge=1)

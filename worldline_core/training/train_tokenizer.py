@@ -1,24 +1,29 @@
-"""The train_tokenizer step: fit the bases of the patch tokenizer, then train its convolutional decoder.
+"""The train_tokenizer step: fit the bases of the patch tokenizer, then train its convolutional decoder; or train a small
+decoder for the latents of an existing tokenizer.
 
-The decoder learns on exact and on disturbed codes, because a world model's predicted codes are not exact.
+Decoders learn on exact and on disturbed codes, because a world model's predicted codes are not exact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from einops import rearrange
-from jaxtyping import Float
-from torch import Tensor
+from einops import rearrange, repeat
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import ConfigError
 from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer, Refinement, fit_patch_tokenizer
+from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig, windows
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.frame_source import RecordedView, load_views
@@ -43,22 +48,30 @@ def to_video(frames: Tensor) -> Tensor:
     return frames.float() / 127.5 - 1.0
 
 
-def video_batch(
+@dataclass(frozen=True)
+class DrawnClip:
+    """A clip that a step learns from: its frames, three of its groups of frames, and in [-1, 1] the first frame and theirs."""
+
+    name: str
+    frames: UInt8[Tensor, "3 n h w"]
+    groups: np.ndarray
+    picked: Float[Tensor, "3 t h w"]
+
+
+def drawn_clips(
     views: Sequence[RecordedView], config: TokenizerConfig, step: int, temporal: int = 4
-) -> tuple[tuple[str, ...], Float[Tensor, "b 3 t h w"]]:
-    """Names and clips of one step, a function of the step: a first frame and three later groups of each clip."""
+) -> Iterator[DrawnClip]:
+    """Clips of one step, a function of the step."""
     generator = np.random.default_rng((config.seed, 1, step))
-    names, batch = [], []
     for _ in range(config.batch_size):
         view = views[int(generator.integers(len(views)))]
         count = view.frames.shape[1]
         groups = min((count - 1) // temporal, (config.clip_frames - 1) // temporal)
         start = int(generator.integers(count - groups * temporal))
         picked = np.sort(generator.integers(groups, size=3))
-        index = [start, *(start + 1 + group * temporal + k for group in picked for k in range(temporal))]
-        names.append(view.name)
-        batch.append(to_video(view.frames[:, index]))
-    return tuple(names), torch.stack(batch)
+        frames = view.frames[:, start : start + 1 + groups * temporal]
+        index = [0, *(1 + group * temporal + k for group in picked for k in range(temporal))]
+        yield DrawnClip(view.name, frames, picked, to_video(frames[:, index]))
 
 
 def disturb(latents: Tensor, amount: float, generator: torch.Generator) -> Tensor:
@@ -83,40 +96,65 @@ def disturb(latents: Tensor, amount: float, generator: torch.Generator) -> Tenso
 class DecoderBatch:
     """Clips of single views in [-1, 1], and what the decoder is given to reconstruct them.
 
-    ``coarse``: what the disturbed codes alone decode to. ``observed``: the first frames, or None to do without.
+    ``given``: what the disturbed codes alone decode to, or the windows of these codes that a small decoder sees.
+    ``observed``: the first frames, or None to do without.
     """
 
     names: tuple[str, ...]
     video: Float[Tensor, "b 3 t h w"]
-    coarse: Float[Tensor, "b 3 t h w"]
+    given: Tensor
     observed: Float[Tensor, "b 3 h w"] | None
 
 
 @torch.no_grad()
 def decoder_batch(
-    tokenizer: PatchTokenizer, views: Sequence[RecordedView], config: TokenizerConfig, step: int
+    tokenizer: VideoTokenizer, views: Sequence[RecordedView], config: TokenizerConfig, step: int, *, small: bool = False
 ) -> DecoderBatch:
-    """Clips of one step, coded, disturbed and decoded without the convolutional decoder; a function of the step."""
-    names, video = video_batch(views, config, step, tokenizer.temporal_compression)
-    generator = step_generator(config.seed, step, "cpu")
-    coarse = tokenizer.decode_linear(disturb(tokenizer.encode(video), config.disturbance, generator))
-    dropped = bool(torch.rand((), generator=generator) < config.reference_dropout)
-    return DecoderBatch(names, video, coarse, None if dropped else video[:, :, 0])
+    """Clips of one step, coded and disturbed, for a patch tokenizer's own decoder or a small one; a function of the step."""
+    clips = list(drawn_clips(views, config, step, tokenizer.temporal_compression))
+    video = torch.stack([clip.picked for clip in clips]).to(config.device)
+    generator = step_generator(config.seed, step, config.device)
+    if small or not isinstance(tokenizer, PatchTokenizer):
+        pieces = []
+        for clip in clips:  # each whole: an encoder may look further back than a group
+            codes = tokenizer.encode(to_video(clip.frames[None].to(config.device)))
+            pieces.append(windows(disturb(codes, config.disturbance, generator))[0, [0, *(1 + clip.groups)]])
+        given = torch.stack(pieces)
+    else:
+        given = tokenizer.decode_linear(disturb(tokenizer.encode(video), config.disturbance, generator))
+    dropped = bool(torch.rand((), generator=generator, device=config.device) < config.reference_dropout)
+    return DecoderBatch(tuple(clip.name for clip in clips), video, given, None if dropped else video[:, :, 0])
+
+
+def decode_windows(
+    decoder: SmallDecoder, given: Float[Tensor, "b n window h_l w_l"], observed: Float[Tensor, "b 3 h w"] | None
+) -> Float[Tensor, "b 3 t h w"]:
+    """Frames of windows, the first of which is that of a clip's first frame."""
+    count = given.shape[1]
+    reference = None if observed is None else repeat(observed, "b c h w -> (b n) c h w", n=count)
+    groups = decoder(rearrange(given, "b n window h w -> (b n) window h w"), reference)
+    groups = rearrange(groups, "(b n) g c h w -> b n g c h w", n=count)
+    frames = torch.cat((groups[:, 0, :1], rearrange(groups[:, 1:], "b n g c h w -> b (n g) c h w")), dim=1)
+    return rearrange(frames, "b t c h w -> b c t h w")
 
 
 class DecoderObjective(Objective[DecoderBatch]):
-    """L1 and L2 on pixels, L1 on their differences between neighbours, heavier where the scene has changed."""
+    """L1 and L2 on pixels, L1 on their differences between neighbours, heavier where the scene has changed.
 
-    def __init__(self, tokenizer: PatchTokenizer) -> None:
-        self.tokenizer = tokenizer
+    Args:
+        decode: of what a batch gives and the observed frames, or None, the frames.
+    """
+
+    def __init__(self, decode: Callable[[Tensor, Tensor | None], Tensor]) -> None:
+        self.decode = decode
 
     def loss(self, batch: DecoderBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Loss of one batch."""
         del generator, step
         video = batch.video
-        refined = self.tokenizer.refine(batch.coarse, batch.observed)
+        decoded = self.decode(batch.given, batch.observed)
         weight = 1.0 + 3.0 * ((video - video[:, :, :1]).abs().amax(dim=1, keepdim=True) > 0.1).float()
-        error = (refined.float() - video) * weight
+        error = (decoded.float() - video) * weight
         edges_h = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
         edges_w = (error[..., 1:] - error[..., :-1]).abs().mean()
         return error.abs().mean() + error.square().mean() + 0.5 * (edges_h + edges_w), {}
@@ -133,20 +171,43 @@ def train_decoder(
     Raises:
         TrainingError: the loss or the gradient is not finite.
     """
-    decoder = tokenizer.refinement.train().requires_grad_(True)
+    objective = DecoderObjective(tokenizer.refine)
+    load = partial(decoder_batch, tokenizer, views, config)
+    begun = {"encoder": tokenizer.encoder_digest, "start": start, "episodes": [view.name for view in views]}
+    _train(tokenizer.refinement, objective, load, config, output, begun)
+
+
+def train_small_decoder(
+    decoder: SmallDecoder,
+    tokenizer: VideoTokenizer,
+    views: Sequence[RecordedView],
+    config: TokenizerConfig,
+    output: Path,
+) -> None:
+    """As :func:`train_decoder`, for a decoder of this tokenizer's latents; the tokenizer stays as it is."""
+    objective = DecoderObjective(partial(decode_windows, decoder))
+    load = partial(decoder_batch, tokenizer, views, config, small=True)
+    begun = {"decoder": decoder.config.model_dump(mode="json"), "episodes": [view.name for view in views]}
+    _train(decoder, objective, load, config, output, begun)
+
+
+def _train(
+    decoder: nn.Module,
+    objective: DecoderObjective,
+    load: Callable[[int], DecoderBatch],
+    config: TokenizerConfig,
+    output: Path,
+    begun: Mapping[str, Any],
+) -> None:
+    decoder.train().requires_grad_(True)
     if config.steps:
         result = train(
             config.trainer,
             groups=[ParameterGroup("decoder", dict(decoder.named_parameters()))],
-            objective=DecoderObjective(tokenizer),
-            load=lambda index: decoder_batch(tokenizer, views, config, index),
+            objective=objective,
+            load=load,
             output=output,
-            identity={
-                "config": config.model_dump(mode="json"),
-                "encoder": tokenizer.encoder_digest,
-                "start": start,
-                "episodes": [view.name for view in views],
-            },
+            identity={"config": config.model_dump(mode="json"), **begun},
             title="tokenizer",
             schedule=config.schedule,
         )
@@ -154,20 +215,21 @@ def train_decoder(
     decoder.eval().requires_grad_(False)
 
 
+def fitted_clips(config: TokenizerConfig, views: Sequence[RecordedView]) -> Iterator[Float[Tensor, "1 3 t h w"]]:
+    """Clips that linear parts are fitted to."""
+    generator = np.random.default_rng(config.seed)
+    for _ in range(config.fit_clips):
+        frames = views[int(generator.integers(len(views)))].frames
+        length = min(config.clip_frames, 1 + (frames.shape[1] - 1) // 4 * 4)
+        start = int(generator.integers(frames.shape[1] - length + 1))
+        yield to_video(frames[None, :, start : start + length])
+
+
 def _fitted(config: TokenizerConfig, views: Sequence[RecordedView], folder: Path) -> PatchTokenizer:
     """Bases fitted now, or by the call that was interrupted (eigenvectors are not the same bits on another machine)."""
-
-    def clips() -> Iterator[Tensor]:
-        generator = np.random.default_rng(config.seed)
-        for _ in range(config.fit_clips):
-            frames = views[int(generator.integers(len(views)))].frames
-            length = min(config.clip_frames, 1 + (frames.shape[1] - 1) // 4 * 4)
-            start = int(generator.integers(frames.shape[1] - length + 1))
-            yield to_video(frames[None, :, start : start + length])
-
     if not (folder / DESCRIPTION).is_file():
         fit_patch_tokenizer(
-            clips(),
+            fitted_clips(config, views),
             channels=config.channels,
             motion_weight=config.motion_weight,
             whitening=config.whitening,
@@ -184,11 +246,13 @@ def clip_of(video: Tensor, frames: int, temporal: int) -> Tensor:
 
 
 @torch.no_grad()
-def reconstruction_metrics(tokenizer: VideoTokenizer, videos: list[Tensor], frames: int) -> dict[str, float]:
+def reconstruction_metrics(
+    tokenizer: VideoTokenizer, videos: list[Tensor], frames: int, device: str = "cpu"
+) -> dict[str, float]:
     """PSNR of the decoders and of copying the first frame, over all pixels and over pixels that changed."""
     sums: dict[str, float] = {}
     for video in videos:
-        clip = clip_of(video, frames, tokenizer.temporal_compression)
+        clip = clip_of(video, frames, tokenizer.temporal_compression).to(device)
         latents = tokenizer.encode(clip)
         candidates = {
             "decoded": tokenizer.decode(latents),
@@ -212,35 +276,58 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     """Fit, train and measure a patch tokenizer on ``inputs["episodes"]`` (an EpisodeSet).
 
     It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. With
-    ``inputs["start"]``, a tokenizer, its bases are kept (latents stay valid) and its decoder is trained further.
+    ``inputs["start"]``, a patch tokenizer, its bases are kept (latents stay valid) and its decoder is trained further.
+    With ``inputs["encoder"]``, any tokenizer, only a small decoder of its latents is trained and written
+    (``decoder.safetensors``, ``decoder.json``), and what the tokenizer's own decoder reaches is measured beside it.
 
     Writes ``tokenizer.safetensors``, ``tokenizer.json``, ``metrics.jsonl`` (the losses) and ``metrics.json`` into
     ``output``; an interrupted call continues where it stopped and ends with the same bytes.
 
     Returns:
         reconstruction metrics on held-out scenes; {"found", "kept", "left_out"} count the episodes.
+
+    Raises:
+        ConfigError: both a start and an encoder are given.
     """
+    if {"start", "encoder"} <= inputs.keys():
+        raise ConfigError(
+            "A start and an encoder", expected="start: a patch tokenizer whose decoder is trained further; or encoder: "
+            "any tokenizer, for whose latents a small decoder is trained", got=sorted(inputs),
+        )  # fmt: skip
+    encoder = load_tokenizer(Path(inputs["encoder"]), config.device) if "encoder" in inputs else None
     episodes = EpisodeSet.open(inputs["episodes"])
     rows = episodes.rows
     chosen = select_episodes(episodes, config.splits, config.max_episodes, config.seed)
     views = load_views(episodes, chosen, config.image_size, _SHORTEST)
-    if "start" in inputs:
-        tokenizer = PatchTokenizer.load(Path(inputs["start"]))
-        start = tokenizer.weights_sha256
-    else:
-        start = ""
-        tokenizer = _fitted(config, views, output / BASES)
-        torch.manual_seed(config.seed)
-        tokenizer.refinement = Refinement(
-            tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
-        )
-    train_decoder(tokenizer, views, config, output, start)
     metadata = {
         "config": config.model_dump(mode="json"),
         "training_episodes": len(chosen),
         "training_views": len(views),
     }
-    tokenizer.save(output, metadata)
+    measured: dict[str, VideoTokenizer]
+    if encoder is not None:
+        name = tokenizer_fingerprint(encoder, Path(inputs["encoder"]))
+        size = {"width": config.refinement_width, "depth": config.refinement_depth}
+        torch.manual_seed(config.seed)
+        decoder = SmallDecoder(SmallDecoderConfig.of(encoder, name, **size), encoder).to(config.device)
+        decoder.fit(fitted_clips(config, views))
+        train_small_decoder(decoder, encoder, views, config, output)
+        decoder.save(output, metadata)
+        measured = {"held_out": SmallDecoder.load(output, encoder, name, config.device), "own_decoder": encoder}
+    else:
+        if "start" in inputs:
+            tokenizer = PatchTokenizer.load(Path(inputs["start"]))
+            start = tokenizer.weights_sha256
+        else:
+            start = ""
+            tokenizer = _fitted(config, views, output / BASES)
+            torch.manual_seed(config.seed)
+            tokenizer.refinement = Refinement(
+                tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
+            )
+        train_decoder(tokenizer.to(config.device), views, config, output, start)
+        tokenizer.save(output, metadata)
+        measured = {"held_out": PatchTokenizer.load(output).to(config.device)}
     if "held_out" in inputs:
         episodes = EpisodeSet.open(inputs["held_out"])
     held_out = select_episodes(episodes, config.held_out_splits, config.held_out_episodes, config.seed)
@@ -248,7 +335,8 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     if held_out:
         videos = [view.frames for view in load_views(episodes, held_out, config.image_size, _SHORTEST)]
         metrics["held_out_episodes"] = len(held_out)
-        metrics["held_out"] = reconstruction_metrics(PatchTokenizer.load(output), videos, config.clip_frames)
+        for name, codec in measured.items():
+            metrics[name] = reconstruction_metrics(codec, videos, config.clip_frames, config.device)
     write_json_atomic(output / "metrics.json", metrics)
     fitting = sum(row.split in config.splits for row in rows)
     used = len({view.name.rpartition("/")[0] for view in views})

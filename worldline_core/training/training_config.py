@@ -235,7 +235,11 @@ class TeacherConfig(StrictModel):
 
 
 class TokenizerConfig(StrictModel):
-    """Everything the shipped tokenizer depends on."""
+    """Everything the shipped tokenizer depends on.
+
+    ``refinement_width`` and ``refinement_depth`` are also the size of a small decoder for the latents of an ``encoder``;
+    ``channels``, ``motion_weight``, ``whitening`` and ``fit_clips`` have no meaning then.
+    """
 
     image_size: ImageSize = (64, 96)
     channels: int = Field(default=32, ge=1)
@@ -261,6 +265,8 @@ class TokenizerConfig(StrictModel):
     seed: int = Field(default=0, ge=0)
     checkpoint_every: int = Field(default=500, ge=1)
     bfloat16: bool = True
+    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
+    device: str = Field(default="cpu", exclude_if=lambda value: value == "cpu")
 
     @property
     def trainer(self) -> TrainerConfig:
@@ -272,6 +278,7 @@ class TokenizerConfig(StrictModel):
             optimizer=OptimizerConfig(learning_rate=self.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4),
             ema_decay=self.average_decay,
             precision="bf16" if self.bfloat16 else "fp32",
+            device=self.device,
             save_every_steps=self.checkpoint_every,
         )
 
