@@ -1,6 +1,7 @@
 """Operations, bytes and the least time of every stage and rollout at full size, and, where a GPU is, the time they take.
 
     python benchmarks/full_size.py                                   # the floors: nothing is loaded, any machine will do
+    python benchmarks/full_size.py --set rollouts.causal.config.decoder=FOLDER  # with a small decoder (of the default size, if not there)
     python benchmarks/full_size.py --card H200 --time cuda           # rollouts with random weights, timed on this card
     python benchmarks/full_size.py --time cuda --captured            # the model's passes replayed as CUDA graphs
     python benchmarks/full_size.py --memory                          # planned against measured memory at three small sizes
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,9 +48,9 @@ TARGETS = {"causal": 7.0, "stage2": 50.0}
 """Seconds of a prediction of 129 frames and three views on one H200, decoding included."""
 
 
-def floors(preset: str, card: str) -> list[dict[str, Any]]:
+def floors(preset: str, card: str, overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Operations and least seconds of every stage of a preset."""
-    config = load_config(PipelineConfig, preset=preset)
+    config = load_config(PipelineConfig, preset=preset, overrides=overrides)
     planner = Planner(config, Path.cwd(), Machine(1, CARDS[card].memory, CARDS[card], 1.0))
     return [
         {"stage": row.title, "pflop": row.facts["PFLOP"], "gigabytes": row.facts["GB moved"],
@@ -195,6 +197,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="cosmos3-nano")
     parser.add_argument("--card", choices=tuple(CARDS), default="H200")
+    parser.add_argument("--set", action="append", default=[], metavar="a.b=value", help="of the floors' preset")
     parser.add_argument("--time", metavar="DEVICE", help="time the rollouts there (cuda)")
     parser.add_argument(
         "--captured", action="store_true", help="record the model's passes and replay them as CUDA graphs"
@@ -218,7 +221,7 @@ def main() -> None:
             figures = {"device": device_name(options.time), "captured": options.captured, "seconds": seconds}
             print(json.dumps({"sampler": sampler, "frames": rollouts.frames, "target": target, **figures}))
     else:
-        for row in floors(options.preset, options.card):
+        for row in floors(options.preset, options.card, options.set):
             print(json.dumps({"card": options.card, **row}))
 
 

@@ -31,7 +31,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     world = WorldLine.from_pretrained(options.checkpoint, decoder=options.decoder)
-    server = make_server(world, ServeConfig(port=0, episodes=shipped_folder() / "recordings"), None)
+    config = ServeConfig.model_validate({"port": 0, "episodes": shipped_folder() / "recordings"})
+    server = make_server(world, config, None)
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:

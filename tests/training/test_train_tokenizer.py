@@ -53,7 +53,7 @@ def test_a_decoder_is_trained_further_on_the_bases_of_its_start(world: Any, trai
     metrics = train_tokenizer(CONFIG, inputs, tmp_path)
     before, after = PatchTokenizer.load(trained), PatchTokenizer.load(tmp_path)
     assert after.encoder_digest == before.encoder_digest
-    assert not torch.equal(after.refinement.leave.bias, before.refinement.leave.bias)
+    assert not torch.equal(after.refinement.leave.weight, before.refinement.leave.weight)
     assert metrics["held_out_episodes"] == 1
     # A state of this training is no state of another start.
     with pytest.raises(ArtifactError, match=r"belongs to another run[\s\S]*give it the start"):
