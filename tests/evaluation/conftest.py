@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,8 @@ import pytest
 
 from worldline_core.actions.episode_tracks import write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, Episode
+from worldline_core.data.episodes.episode_index import read_index
+from worldline_core.data.episodes.episode_index import write_index as write_episode_index
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 from worldline_core.store.artifact_files import write_manifest
@@ -82,7 +85,6 @@ def _write(
     sources: dict[str, str] | None = None,
     training: int = 0,
     late: tuple[str, ...] = (),
-    known: bool = True,
 ) -> SmallWorld:
     """With ``training`` further recordings that nobody predicted; the robot of those that are ``late`` stands still at first."""
     episodes, tracks = root / "episodes", root / "tracks"
@@ -97,7 +99,7 @@ def _write(
             episode = Episode(
                 episode_id=episode_id, source=(sources or {}).get(episode_id, "test"), embodiment="box_arm", scene=f"scene_{number % 2}",
                 task_family="lift", instruction="lift the red cube",
-                outcome="unknown" if bank or not (known or episode_id in learned) else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
+                outcome="unknown" if bank else ("success" if success else "failure"), split="train" if episode_id in learned else split, fps=FPS,
                 state=state, action=state, timestamps=np.arange(NUM_FRAMES) / FPS, bank=bank,
                 candidate=number if bank else None,
             )  # fmt: skip
@@ -148,15 +150,15 @@ def attempts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, Smal
     """Thirty attempts beside the recordings that the model knows; and the same without their outcomes."""
     cases = {f"try-{number:02d}": number % 2 == 0 for number in range(30)}
     root = tmp_path_factory.mktemp("attempts")
-    made = [
-        _write(root / str(known), cases, split="test", bank=None, training=20, late=("try-29",), known=known)
-        for known in (True, False)
-    ]
-    for world in made:
-        for method in ("good", "copy"):
-            told = {"config": {"sampler": "block_causal", "steps": None}, "inputs": {"checkpoint": {"digest": method}}}
-            write_manifest(world.inputs[f"rollouts.{method}"], {"step": "rollout", **told})
-    return made[0], made[1]
+    made = _write(root, cases, split="test", bank=None, training=20, late=("try-29",))
+    for method in ("good", "copy"):
+        told = {"config": {"sampler": "block_causal", "steps": None}, "inputs": {"checkpoint": {"digest": method}}}
+        write_manifest(made.inputs[f"rollouts.{method}"], {"step": "rollout", **told})
+    untold = root / "untold"
+    shutil.copytree(made.inputs["episodes"], untold)
+    rows = read_index(untold)
+    write_episode_index(untold, [replace(row, outcome="unknown") if row.split == "test" else row for row in rows])
+    return made, SmallWorld({**made.inputs, "episodes": untold}, made.outcomes)
 
 
 @pytest.fixture(scope="session")

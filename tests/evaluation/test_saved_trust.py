@@ -15,7 +15,7 @@ from worldline_core.pages.page import render
 from worldline_core.report.decisions import policy_evaluation
 
 CONFIG = PolicyEvaluationConfig(
-    segmenter="colour", splits=("test",), balanced=False, resamples=100, trust=TrustConfig()
+    segmenter="colour", splits=("test",), views=("head",), balanced=False, resamples=100, trust=TrustConfig()
 )
 
 
@@ -72,7 +72,7 @@ def test_a_calibration_is_held_against_new_outcomes(calibrated, attempts, tmp_pa
 def test_a_calibration_of_something_else_is_refused(calibrated, attempts, tmp_path):
     inputs = attempts[1].inputs
     with pytest.raises(ConfigError, match=r"(?s)of another judge.*left_wrist.*next step: judge as it was made"):
-        evaluate_policy(later(calibrated).model_copy(update={"views": ("head",)}), inputs, tmp_path)
+        evaluate_policy(later(calibrated).model_copy(update={"views": ("head", "left_wrist")}), inputs, tmp_path)
     saved = SavedTrust.read(calibrated)
     with pytest.raises(ConfigError, match=r"(?s)not made with these robots.*box_arm.*other_arm"):
         saved.require(saved.judged_by, ["box_arm", "other_arm"])
