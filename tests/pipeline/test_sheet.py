@@ -91,6 +91,15 @@ def test_small_presets_train_on_8_gb_without_a_closer_look(preset: str, monkeypa
     DistillEstimates(planner.config.distill, planner.generation, grid).require_fit()
 
 
+def test_distillation_from_frames_of_another_size_than_stage2s_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"frames of \[64, 96\][\s\S]*of \[480, 640\][\s\S]*set distill\.input\.image_size"
+    ):
+        load_config(PipelineConfig, preset="cosmos3-nano", overrides=["distill.input.kind=frames"])
+    same = "distill.input={kind: frames, image_size: [480, 640]}"
+    load_config(PipelineConfig, preset="cosmos3-nano", overrides=[same])
+
+
 @pytest.mark.slow
 def test_distillation_from_frames_holds_what_encodes_them() -> None:
     frames = "distill.input={kind: frames, image_size: [64, 96]}"

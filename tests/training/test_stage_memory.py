@@ -11,8 +11,11 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
+from torch.nn import functional
 
 from worldline_core.errors import ConfigError
+from worldline_core.model import step_cost
 from worldline_core.model.step_cost import StepCost, cost_of, without_values
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
@@ -91,6 +94,24 @@ def test_operations_are_those_of_the_matrix_products() -> None:
     assert cost.flops == 2 * 2 * 32 * 64 * 128  # forward, and the weights' gradient
     assert cost.bytes == 2 * 4 * (32 * 64 + 64 * 128 + 32 * 128)
     assert cost.gradients == 4 * 64 * 128
+
+
+def test_operations_that_came_before_cost_the_same_again() -> None:
+    def work() -> Tensor:
+        queries, keys, values = layer(torch.empty(2, 3, 16, 64)).chunk(3, dim=-1)
+        attended = functional.scaled_dot_product_attention(queries, keys, values)
+        attended = (attended + torch.tensor(2.0) * keys.amax(-1, keepdim=True)).relu_()
+        return torch.stack((attended.to(torch.bfloat16).float(), values)).sort(-1)[0].sum()
+
+    costs: list[StepCost] = []
+    step_cost._OUTCOMES.clear()
+    for _ in range(3):
+        with without_values():
+            layer = torch.nn.Linear(64, 192)
+            costs.append(cost_of(work, list(layer.parameters())))
+    assert step_cost._OUTCOMES
+    assert costs[0] == costs[1] == costs[2]
+    assert costs[0].activations > costs[0].kept > 0
 
 
 def test_shards_checkpointing_and_shorter_clips_are_proposed_in_this_order() -> None:

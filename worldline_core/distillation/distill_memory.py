@@ -119,7 +119,7 @@ class DistillEstimates:
                 return cost_of(make)
 
         encoder, encoding = self._encoding(shape)
-        made = cost_at_depth(trace, self.model.num_layers)
+        made = cost_at_depth(trace, self.model.num_layers, forward_only=True)
         return 4 * parameter_counts(self.model)[0] + encoder, made if encoding is None else encoding.then(made)
 
     def _encoding(self, shape: ClipShape) -> tuple[int, StepCost | None]:

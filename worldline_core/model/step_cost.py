@@ -11,11 +11,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, in_kernel_invocation_manager
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
@@ -24,8 +25,11 @@ from worldline_core.model.checkpoint import SINGLE_PRECISION
 
 _ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
 _ATTENTION_BACKWARD = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward
+_CPU = torch.device("cpu")
 _TRACED_LAYERS = (4, 8)
-"""Deeper models are traced at these depths: their layers are equal, so that everything is a straight line in between."""
+"""Deeper models are traced at these depths: their layers are equal, so that everything is a straight line from there on."""
+_TRACED_LAYERS_FORWARD = (2, 3)
+"""The same without a way back: nothing but caches is held of a layer while the next one is computed."""
 
 
 @dataclass(frozen=True)
@@ -112,17 +116,58 @@ class _Meter(TorchDispatchMode):
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
+        if func is torch.ops.prim.device.default:
+            return args[0].device
         if func is torch.ops.aten._local_scalar_dense.default:
             return True if args[0].dtype == torch.bool else 0.5 if args[0].is_floating_point() else 1
+        kind, mode = _kind(func), _mode_of(args)
+        if mode is None or kind == "other":
+            return self._done(func, args, kwargs)[0]
+        if kind == "views":
+            with in_kernel_invocation_manager(mode):
+                found = func(*args, **kwargs)
+            one = isinstance(found, Tensor)
+            return FakeTensor(mode, found, _CPU) if one else [FakeTensor(mode, part, _CPU) for part in found]
+        try:
+            key = func, _looks(args), _looks(tuple(kwargs.items()))
+            outcome = _OUTCOMES.get(key)
+        except (_HasValueError, TypeError):  # TypeError: an argument that cannot be looked up
+            return self._done(func, args, kwargs)[0]
+        if outcome is not None:
+            return self._repeated(outcome, mode)
+        result, product = self._done(func, args, kwargs)
+        parts = result if isinstance(result, (list, tuple)) else [result]
+        own = {id(part.untyped_storage()) for part in parts if _has_its_own_storage(part)}
+        if len(own - {id(tensor.untyped_storage()) for tensor in _tensors((args, kwargs))}) == len(parts):
+            looks = [(part.shape, part.stride(), part.dtype) for part in parts]
+            _OUTCOMES[key] = _Outcome(product, looks, None if parts is not result else type(result))
+        return result
+
+    def _done(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, tuple[float, float] | None]:
+        """The result of an operation, followed, and the product that it is, if it is one."""
         result = func(*args, **kwargs)
-        flops = _operations(func._overloadpacket, args, kwargs, result)
+        flops, product = _operations(func._overloadpacket, args, kwargs, result), None
         if flops:
-            self.products[float(flops), float(sum(map(_nbytes, _tensors((args, kwargs, result)))))] += 1
+            product = float(flops), float(sum(map(_nbytes, _tensors((args, kwargs, result)))))
+            self.products[product] += 1
         given = {id(tensor.untyped_storage()) for tensor in _tensors((args, kwargs))}
         for tensor in _tensors(result):
             if id(tensor.untyped_storage()) not in given:  # else it is a view, or was changed in place
                 self._follow(tensor)
-        return result
+        return result, product
+
+    def _repeated(self, outcome: _Outcome, mode: FakeTensorMode) -> Any:
+        """As `_done`, of an operation whose outcome is known."""
+        if outcome.product is not None:
+            self.products[outcome.product] += 1
+        with torch._C._DisableTorchDispatch():
+            made = [
+                torch.empty_strided(shape, stride, dtype=dtype, device="meta") for shape, stride, dtype in outcome.looks
+            ]
+        tensors = [FakeTensor(mode, tensor, _CPU) for tensor in made]
+        for tensor in tensors:
+            self._follow(tensor)
+        return tensors[0] if outcome.container is None else outcome.container(tensors)
 
     def _follow(self, tensor: Tensor) -> None:
         storage = tensor.untyped_storage()
@@ -147,6 +192,58 @@ class _Meter(TorchDispatchMode):
         if self._storages.pop(id(storage), None) is not None:
             self.live -= storage.nbytes()
             self.gradients += storage.nbytes()
+
+
+class _HasValueError(Exception):
+    """A tensor is known by more than its shape."""
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What an operation makes of arguments that look so: shape, strides and dtype of each new tensor."""
+
+    product: tuple[float, float] | None
+    looks: list[tuple[torch.Size, tuple[int, ...], torch.dtype]]
+    container: type | None
+
+
+_OUTCOMES: dict[Any, _Outcome] = {}
+"""Layers and steps repeat the same operations thousands of times: torch works out what they make once."""
+
+
+@cache
+def _kind(func: Any) -> Literal["makes", "views", "other"]:
+    """Whether an operation's results are new tensors, share their argument's storage, or it does anything else."""
+    schema = getattr(func, "_schema", None)
+    if schema is None or schema.is_mutable:
+        return "other"
+    shared = func is torch.ops.aten._unsafe_view.default or any(one.alias_info is not None for one in schema.returns)
+    return "views" if shared else "makes"
+
+
+def _mode_of(args: tuple[Any, ...]) -> FakeTensorMode | None:
+    """The mode of the first argument, where that is a tensor, or several, without values."""
+    first = args[0] if args else None
+    first = first[0] if isinstance(first, (list, tuple)) and first else first
+    return first.fake_mode if type(first) is FakeTensor and first.constant is None else None
+
+
+def _looks(value: Any) -> Any:
+    """All that the outcome of an operation depends on.
+
+    Raises: _HasValueError for a tensor that torch remembers a value of, or that may stand for a number.
+    """
+    if type(value) is FakeTensor:
+        if value.ndim == 0 or value.constant is not None:
+            raise _HasValueError
+        return value.shape, value.stride(), value.dtype
+    if isinstance(value, Tensor):
+        raise _HasValueError
+    return tuple(map(_looks, value)) if isinstance(value, (list, tuple)) else (type(value), value)
+
+
+def _has_its_own_storage(value: Any) -> bool:
+    return type(value) is FakeTensor and value.constant is None and value.untyped_storage().nbytes() == _nbytes(value)
 
 
 def _operations(packet: Any, args: Any, kwargs: Any, result: Any) -> float:
@@ -189,12 +286,12 @@ def cost_of(work: Callable[[], Tensor | None], parameters: Iterable[nn.Parameter
     return StepCost(meter.activations, kept, meter.gradients, meter.peak, meter.products)
 
 
-def cost_at_depth(trace: Callable[[int], StepCost], layers: int) -> StepCost:
+def cost_at_depth(trace: Callable[[int], StepCost], layers: int, *, forward_only: bool = False) -> StepCost:
     """What ``trace(layers)`` would give; deep models are traced at two small depths, and the line is continued.
 
     Their ``peak`` is the sum of both parts, which is at most too high: where it lies between them depends on the depth.
     """
-    shallow, deep = _TRACED_LAYERS
+    shallow, deep = _TRACED_LAYERS_FORWARD if forward_only else _TRACED_LAYERS
     if layers <= deep:
         return trace(layers)
     first, second = trace(shallow), trace(deep)

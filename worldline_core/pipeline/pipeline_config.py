@@ -23,7 +23,7 @@ from worldline_core.rollout.rollout_config import ImportRolloutsConfig, RolloutC
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
-from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.clip_config import EncodeLatentsConfig, FrameInput
 from worldline_core.training.training_config import Stage1Config, Stage2Config
 
 
@@ -99,6 +99,19 @@ class PipelineConfig(StrictModel):
                 raise ValueError(f"rollouts.{name} needs train_stage1")
         if self.train_stage1 is None and self.models.base is None:
             raise ValueError("train_stage1: without it Stage II starts from models.base, and there is none")
+        return self
+
+    @model_validator(mode="after")
+    def _distillation_sees_the_size_of_stage2(self) -> PipelineConfig:
+        trained, seen = (
+            stage.input.image_size if isinstance(stage.input, FrameInput) else self.encode_latents.image_size
+            for stage in (self.train_stage2, self.distill)
+        )
+        if trained != seen:
+            raise ValueError(
+                f"distill reads frames of {list(seen)}, and train_stage2, whose model it distills, of {list(trained)}: "
+                f"set distill.input.image_size (for cached latents encode_latents.image_size) to {list(trained)}"
+            )
         return self
 
 

@@ -61,7 +61,7 @@ def rollout_cost(model: WorldModelConfig, shape: ClipShape, config: RolloutConfi
             with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
                 return replace(cost_of(understand).then(cost_of(euler_step).times(steps)), kept=0.0)
 
-    return cost_at_depth(trace, model.num_layers)
+    return cost_at_depth(trace, model.num_layers, forward_only=True)
 
 
 def decoding_cost(tokenizer: Path | None, shape: ClipShape, config: RolloutConfig) -> tuple[int, StepCost]:

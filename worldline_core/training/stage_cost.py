@@ -91,20 +91,23 @@ def frozen_bytes(model: nn.Module) -> int:
     return sum(value.numel() * value.element_size() for value in model.state_dict().values())
 
 
-@cache
 def encoding_cost(tokenizer: Path | None, shape: ClipShape) -> tuple[int, StepCost]:
     """Bytes of a tokenizer, and what encoding a micro-batch costs: clips and views one by one, as `FrameSource` does."""
+    size, cost = _encoding_cost(tokenizer, shape.frames, shape.grid)
+    return size, cost.times(shape.clips * len(shape.views))
+
+
+@cache
+def _encoding_cost(tokenizer: Path | None, frames: int, grid: tuple[int, int]) -> tuple[int, StepCost]:
     with without_values():
         codec = tokenizer_outline(tokenizer)
-        size = [side * codec.spatial_compression for side in shape.grid]
-        video = torch.empty(1, 3, shape.frames, *size)
+        video = torch.empty(1, 3, frames, *(side * codec.spatial_compression for side in grid))
 
         def encode() -> None:
             with torch.no_grad():
                 codec.encode(video)
 
-        cost = cost_of(encode).times(shape.clips * len(shape.views))
-        return frozen_bytes(codec), cost
+        return frozen_bytes(codec), cost_of(encode)
 
 
 @cache
