@@ -6,6 +6,8 @@ import argparse
 import errno
 import json
 import logging
+import os
+import select
 import signal
 import sys
 import traceback
@@ -125,17 +127,32 @@ def exit_with_clear_errors(action: Callable[[], object]) -> None:
     sys.excepthook = _print_traceback
     try:
         action()
+        sys.stdout.flush()
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         raise SystemExit(128 + signal.SIGTERM) from stopped
     except WorldLineError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error
+    except BrokenPipeError as error:
+        if not _nobody_reads():
+            raise
+        raise SystemExit(128 + signal.SIGPIPE) from error
     except (OSError, SafetensorError) as error:
         if getattr(error, "errno", None) not in _FULL and not any(f"(os error {n})" in str(error) for n in _FULL):
             raise
         print(f"error: No space left\n  where: {shown(error)}\n  next step: {_CONTINUE}", file=sys.stderr)
         raise SystemExit(1) from error
+
+
+def _nobody_reads() -> bool:
+    """Whether what stdout went to has ended (`worldline ... | head`); then nothing is written there at the exit either."""
+    watched = select.poll()
+    watched.register(sys.stdout.fileno(), 0)
+    if not any(event & select.POLLERR for _, event in watched.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -41,7 +41,9 @@ def sound_episode(recordings, embodiment: str) -> int:
 def test_kinematics_of_the_state_give_the_recorded_wrist_cameras(recordings, embodiment):
     episode = recordings[0].episode(sound_episode(recordings, embodiment))
     kinematics = ArmKinematics(load_embodiment(embodiment))
-    for view, poses in kinematics.wrist_camera_poses(episode.state.astype(np.float64)).items():
+    found = kinematics.wrist_camera_poses(episode.state.astype(np.float64))
+    assert set(found) == set(episode.cameras) - {"head"}
+    for view, poses in found.items():
         np.testing.assert_allclose(poses.numpy(), episode.cameras[view].T_base_camera, atol=1e-5)
 
 

@@ -147,7 +147,7 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(
 def test_recordings_whose_starts_are_not_known_are_refused(
     world: MujocoEnv, shipped: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(DataError, match=r"(?s)Nobody knows where things stand.*record_banks"):
+    with pytest.raises(DataError, match=r"(?s)The manifest does not say where things stood.*record_banks"):
         MujocoEnv(shipped / "banks", embodiment=ROBOT, splits=("bank", "test"))
     with pytest.raises(ConfigError, match="observe_every 0"):
         MujocoEnv(embodiment=ROBOT, observe_every=0)

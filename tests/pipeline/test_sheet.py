@@ -82,10 +82,11 @@ def test_small_presets_train_on_8_gb_without_a_closer_look(preset: str, monkeypa
 
     for module in (stage_memory, distill_memory):
         monkeypatch.setattr(module, "device_memory", lambda _device: 8e9)
-    for name, (_, trainer, clips) in planner.trainings().items():
-        if name.startswith("train_"):
-            shape = largest_clips(clips, trainer.batch_size, planner.model.views, grid)
-            require_fit(looked_closer, trainer, clips.lengths, rough_bytes(planner.model, shape))
+    trainings = [found for name, found in planner.trainings().items() if name.startswith("train_")]
+    assert trainings
+    for _, trainer, clips in trainings:
+        shape = largest_clips(clips, trainer.batch_size, planner.model.views, grid)
+        require_fit(looked_closer, trainer, clips.lengths, rough_bytes(planner.model, shape))
     monkeypatch.setattr(distill_memory, "trained_cost", looked_closer)
     monkeypatch.setattr(distill_memory, "teacher_trajectories", looked_closer)
     DistillEstimates(planner.config.distill, planner.generation, grid).require_fit()

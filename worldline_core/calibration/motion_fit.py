@@ -24,19 +24,20 @@ PARAMETERS = 10
 """Rotation and translation of the camera in its own frame [rad, m] (3 + 3), relative focal length (1), principal point in
 shares of the image's sides (2), frames by which the pictures trail (1)."""
 NUISANCE_PRIOR = np.array([0.3, 0.5, 0.5])
-"""Left open beside them: thickness of the links, strength of the flow and of the change that motion makes."""
+"""Standard deviations of what is fitted besides: thickness of the links, and factors on the predicted flow and change."""
 EDGE_CELLS = 0.35
 NEAR_M, MIN_STEP_PX, STILL_STEP_PX, LONGEST_STEP_PX = 0.03, 0.3, 0.05, 20.0
 NOISE_CHANGE = 2.0
 MIN_CELLS = 60
 SAMPLE_CELLS_STILL, SAMPLE_CELLS_WRIST = 90.0, 2.5
-"""Cells that say together what one says: neighbours and successive steps are alike. Measured on healthy recordings."""
+"""So many cells count as one independent measurement, because neighbours and successive steps are correlated. Measured on
+healthy recordings."""
 DEPTH_START_PER_M, MOST_PER_M, DEPTH_PRIOR = 4.0, 15.0, np.array([4.0, 20.0, 20.0])
 """Inverse depth of the scene before a wrist camera: a plane, its value in the middle and its slopes (priors)."""
 FLOW_ERROR_PX, FLOW_ERROR_SHARE, FAINT_EDGE = 0.5, 0.1, 20.0
 HAND_MARGIN_CELLS = 2.0
 LEAST_INFORMATION = 1e-20
-"""Of what a view could show and does not, since its camera rests: it is bounded by the priors alone, and named."""
+"""Information on a parameter that a view cannot show because its camera rests: only the prior bounds it."""
 _STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.02, 0.02, 0.25])
 
 
@@ -50,7 +51,7 @@ class Equations:
 
 
 def moved_camera(camera: CameraTrack, theta: np.ndarray) -> CameraTrack:
-    """A camera changed by the parameters (k,); the lag is not the camera's."""
+    """A camera changed by the parameters (k,), all but the lag."""
     change = np.eye(4)
     change[:3, :3] = cv2.Rodrigues(np.asarray(theta[:3], dtype=np.float64))[0]
     change[:3, 3] = theta[3:6]
@@ -61,7 +62,7 @@ def moved_camera(camera: CameraTrack, theta: np.ndarray) -> CameraTrack:
 
 
 class StillView:
-    """A view that stands still: the motion of the arms as measured, to lay the predicted one over."""
+    """A view that stands still: the measured motion of the arms, which the predicted one is compared with."""
 
     def __init__(self, camera: CameraTrack, points: np.ndarray, radii: np.ndarray, motion: Motion) -> None:
         """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps."""
@@ -134,8 +135,8 @@ class StillView:
         slope = slope[:, kept]
         moves = np.concatenate([(slope[:-1] + slope[1:]) / 2, -step[..., None]], axis=-1)[..., wanted]
         grows = np.concatenate([np.diff(slope, axis=0), -faster[..., None]], axis=-1)[..., wanted]
-        # What a cell takes over from the points: their step, and how the parameters change where it begins and itself; the
-        # fastest point is what is seen.
+        # A cell takes from the points near it their step, and how the parameters move the step's start and change the step.
+        # Where several points meet, the fastest one counts most.
         weight = (length + 0.1) ** 2
         taken = np.concatenate([step[..., None], moves / CELL_PX, grows], axis=-1).reshape(*step.shape[:2], -1)
         taken = np.concatenate([taken * weight[..., None], weight[..., None]], axis=-1).astype(np.float32)
@@ -206,7 +207,7 @@ def _blurred(maps: np.ndarray, cells: float) -> np.ndarray:
 
 
 def _without_nuisance(equations: Equations) -> Equations:
-    """What is left when the parameters after the first ones are fitted as well."""
+    """Equations of the PARAMETERS alone, with the nuisance parameters fitted (Schur complement)."""
     a, b = slice(0, PARAMETERS), slice(PARAMETERS, None)
     information, gradient = equations.information, equations.gradient
     known = information[b, b] + np.diag(NUISANCE_PRIOR**-2)
@@ -328,7 +329,8 @@ class WristView:
 
 
 def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.ndarray]:
-    """Turns (n, 3, 3) and moves (n, 3) [m] of a camera from each of its poses (n + 1, 4, 4) to the next, so late."""
+    """Rotations (n, 3, 3) and translations (n, 3) [m] of a camera from each of its poses (n + 1, 4, 4) to the next, delayed
+    by so many frames."""
     relative = rigid_inverse(poses[1:]) @ poses[:-1]
     if frames == 0.0:
         return relative[:, :3, :3], relative[:, :3, 3]
@@ -338,7 +340,7 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
 
 
 def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Bool (n, r, c): cells near what these points (n + 1, p, 3) hide at either end of a step."""
+    """Bool (n, r, c): cells that these points (n + 1, p, 3) hide at either end of a step, with a margin."""
     rows, columns = (np.arange(count) * CELL_PX + (CELL_PX - 1) / 2 for count in shape[1:])
     hidden = np.zeros((shape[0] + 1, *shape[1:]), dtype=bool)
     for i, pose in enumerate(camera.T_base_camera):

@@ -18,7 +18,7 @@ from worldline_core.geometry.transforms import hand_eye_residual
 GRAY_WIDTH = 96
 CELL_PX = 4
 STILL_CHANGE = 4.0
-"""Grey levels: compression and sensor noise stay below."""
+"""Changes below so many grey levels are compression or sensor noise."""
 _STEPS_AT_ONCE = 64
 
 

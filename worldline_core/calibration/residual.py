@@ -31,12 +31,13 @@ class Kind:
 
     Attributes:
         parameters: its place among the PARAMETERS.
-        scale: from radians, metres or shares to the unit that is reported.
-        prior: nobody is off by more (standard deviation of each parameter), in that unit.
-        usual: as far as a camera is off that was bumped or badly calibrated.
-        linear, near: estimates up to here are good without a second look; without a first look at coarse maps.
-        shared_still, shared_wrist: error that all episodes of a source have in common (standard deviation): a robot's
-            shape is simplified, flow is too short. It does not shrink with their number.
+        unit, scale: what is reported, and the factor to it from radians, metres or shares. All that follows is in this unit.
+        prior: standard deviation of each parameter before anything was measured.
+        usual: typical error of a camera that was bumped or badly calibrated.
+        linear: an estimate from the fine maps is final up to this size; beyond it the equations are solved again there.
+        near: beyond this size the coarse maps are solved first.
+        shared_still, shared_wrist: standard deviation of the error that all episodes of a source have in common, because
+            the robot's shape is simplified and flow is measured too short. More episodes do not reduce it.
     """
 
     parameters: slice
@@ -50,7 +51,7 @@ class Kind:
     shared_wrist: float
 
     def solved(self, equations: Equations, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Information (k, k) on these parameters alone, and how they should change (k,)."""
+        """Information (k, k) on these parameters alone, and the step (k,) to their best values."""
         prior = (self.scale / self.prior) ** 2
         information = equations.information[self.parameters, self.parameters]
         gradient = equations.gradient[self.parameters] - prior * theta[self.parameters]
@@ -66,15 +67,15 @@ KINDS = {
 }
 HAND_REACH_M = 0.2
 COARSE_CELLS, FINE_CELLS = 1.5, 0.7
-"""Blur of the maps for the first look and for the last."""
+"""Blur of the coarse and of the fine maps, in cells."""
 SHAPE_UNKNOWN = 12.0
-"""Where only tool poses are recorded the arm behind the hand is not predicted, and tells as much less."""
+"""Factor on the uncertainty of the robot's shape where only tool poses are recorded: the arm behind the hand is unknown."""
 FEWEST_TOGETHER = 5
-"""Episodes whose scatter says how much they can be believed together."""
+"""From so many episodes on, their scatter says how certain they are together."""
 ALIKE_SHARE = 0.5
-"""Of the best gain: kinds above it cannot be told apart."""
+"""Kinds of error that gain at least this share of the best gain cannot be told apart."""
 OUTLIER_DEVIATIONS = 3.0
-"""Of an episode from the others: such a one has half its weight."""
+"""An episode so many standard deviations from the others has half its weight."""
 
 
 def with_residuals(
@@ -101,7 +102,7 @@ def with_residuals_together(
 def estimate_residuals(
     observation: Observation, reading: Reading, config: CalibrationDoctorConfig
 ) -> tuple[Residual, ...]:
-    """By how much each camera is off in each way, for every view whose pictures show it; under one reading."""
+    """The estimated error of each kind for every view whose pictures show it, under one reading of the conventions."""
     states, images = reading.steps(observation.num_images)
     frames, pictures = slice(states.start, states.stop + 1), slice(images.start, images.stop + 1)
     wrists = {arm.wrist_view: i for i, arm in enumerate(observation.arms)}
@@ -123,10 +124,10 @@ def estimate_residuals(
 
 
 def _of_view(view: str, evidence: StillView | WristView, shape: float = 1.0) -> list[Residual]:
-    """Of each kind: from the first look where it is small, else from looks at where the last one says that the camera is.
+    """The residuals of one view. Where an error is large, the equations are solved again at the corrected camera.
 
     Args:
-        shape: by how much more than usual the shape of what moves in a still view is unknown.
+        shape: factor on the uncertainty of the robot's shape in a view that stands still.
     """
     start = np.zeros(PARAMETERS)
     fine, coarse, found = evidence.equations(start, FINE_CELLS), None, []
@@ -156,7 +157,7 @@ def _of_view(view: str, evidence: StillView | WristView, shape: float = 1.0) -> 
 
 
 def combined(episodes: Sequence[Sequence[Residual]]) -> tuple[Residual, ...]:
-    """Of the episodes of one source; those that disagree with the others count less, and widen the interval."""
+    """Residuals of one source from those of its episodes; outliers count less, and scatter widens the interval."""
     groups: dict[tuple[str, str], list[Residual]] = {}
     for residual in (residual for residuals in episodes for residual in residuals):
         groups.setdefault((residual.view, residual.kind), []).append(residual)
@@ -178,8 +179,8 @@ def combined(episodes: Sequence[Sequence[Residual]]) -> tuple[Residual, ...]:
 
 
 def standing_out(residuals: Sequence[Residual], limits: ResidualLimits) -> tuple[Residual, ...]:
-    """Of each view one kind that is certain and large enough: of those that explain its pictures about best, the one that
-    happens most easily."""
+    """At most one error for each view, of those that are certain and large enough: among the kinds that explain the
+    pictures about equally well, the one that is smallest against its usual size."""
     found: dict[str, list[Residual]] = {}
     for residual in residuals:
         enough = residual.size > getattr(limits, residual.kind.replace(" ", "_")) and residual.gain > 0
@@ -194,14 +195,14 @@ def standing_out(residuals: Sequence[Residual], limits: ResidualLimits) -> tuple
 
 
 def corrected_camera(camera: CameraTrack, residual: Residual) -> CameraTrack:
-    """The camera where a residual says that it is."""
+    """The camera with the estimated error removed."""
     kind, theta = KINDS[residual.kind], np.zeros(PARAMETERS)
     theta[kind.parameters] = np.asarray(residual.estimate) / kind.scale
     return moved_camera(camera, theta)
 
 
 def consistent_text(residuals: Sequence[Residual]) -> str:
-    """By how much a camera could be turned unseen; the largest over the views."""
+    """The largest rotation of a camera that could have gone unseen, over the views."""
     turns = [residual.within for residual in residuals if residual.kind == "rotation"]
     return f"consistent within {max(turns):.1f} deg" if turns else "consistent, but no picture says within what"
 

@@ -123,7 +123,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
         self.observe_every = observe_every or self.frames_per_step
         if self.observe_every < 1 or self.frames_per_step % self.observe_every:
             raise ConfigError(
-                "An environment cannot be stepped so",
+                "observe_every does not divide a block of the model",
                 expected=f"observe_every a divisor of {self.frames_per_step}", got=f"observe_every {self.observe_every}",
             )  # fmt: skip
         self.single_action_space, self.single_observation_space = robot_spaces(
@@ -268,7 +268,7 @@ class WorldLineVectorEnv(VectorEnv[dict[str, Any], np.ndarray, np.ndarray]):
                     raise DataError("Not a judgement", where="success", expected="True, False or None", got=found)
                 episode.success = bool(found)
                 if isinstance(self._succeeds, TrustedJudge):
-                    episode.trust = self._succeeds.told(episode.tracks)
+                    episode.trust = self._succeeds.assess(episode.tracks)
 
     def _observed(self, slot: int) -> dict[str, Any]:
         episode = self._episodes[slot]

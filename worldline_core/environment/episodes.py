@@ -42,7 +42,7 @@ class TrustedJudge:
 
     Raises:
         ArtifactError: there is no such calibration.
-        ConfigError: it was made with another judge, robot or checkpoint, or reads what one simulation does not tell.
+        ConfigError: it was made with another judge, robot or checkpoint, or compares the predictions of two models.
     """
 
     def __init__(
@@ -77,11 +77,12 @@ class TrustedJudge:
         self._confidence = confidence_of(asdict(judgement))
         return judgement.success
 
-    def told(self, tracks: Sequence[EpisodeTracks]) -> dict[str, Any]:
-        """Of the last verdict ``trust`` (NaN where the judge had nothing to go by), and in ``do_not_trust`` why not to rely on it.
+    def assess(self, tracks: Sequence[EpisodeTracks]) -> dict[str, Any]:
+        """``trust``, the probability that the last verdict is right (NaN where the judge had nothing to judge by), and
+        ``do_not_trust``, the reasons not to rely on it ("" where there are none).
 
         Args:
-            tracks: of the episode so far.
+            tracks: action tracks of the episode so far.
         """
         poses, openings = (
             np.concatenate(rows) for rows in zip(*((t.T_base_tool, t.gripper[:, 0]) for t in tracks), strict=True)
@@ -106,7 +107,7 @@ def judge_of(
     views: Sequence[str],
     embodiment: str,
 ) -> Success | None:
-    """The judge that an environment asks for; the embedded one follows what the instruction names by colour.
+    """The judge that an environment asks for; the measured one tracks what the instruction names by its colour.
 
     Raises: ConfigError where trust is asked for in another judge, or in a model without a folder; as of :class:`TrustedJudge`.
     """
@@ -177,7 +178,7 @@ class Together:
         return simulation, [{view: video[:count] for view, video in clip.items()} for clip in clips]
 
     def without(self, slots: Sequence[int]) -> Together | None:
-        """The others."""
+        """The same without the episodes of some slots; None where none is left."""
         kept = [index for index, slot in enumerate(self.slots) if slot not in slots]
         if len(kept) in (0, len(self.slots)):
             return self if kept else None
@@ -186,9 +187,9 @@ class Together:
 
 
 def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """Seeds of so many episodes: those given, or counted up from one, or none.
+    """A seed for each of ``count`` episodes: those given, or counted up from the one given, or None for each.
 
-    Raises: DataError for another number of them, or what is no seed.
+    Raises: DataError when ``given`` has another number of seeds, or something that is no seed.
     """
     if isinstance(given, int | np.integer):
         given = [int(given) + number for number in range(count)]
@@ -197,7 +198,7 @@ def each_seed(given: int | Sequence[int | None] | None, count: int) -> list[int 
         seeds = [*given]
     known = [seed for seed in seeds if seed is not None]
     if len(seeds) != count or not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in known):
-        raise DataError("Not the seeds of the episodes", expected=f"{count}, from 0 to 2^63 - 1, or one", got=given)
+        raise DataError("Not the seeds of the episodes", expected=f"one, or {count}, from 0 to 2^63 - 1", got=given)
     return seeds
 
 

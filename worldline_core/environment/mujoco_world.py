@@ -206,7 +206,7 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
 
         return of_episodes
     raise DataError(
-        "Nobody knows where things stand in these recordings", where=where,
+        "The manifest does not say where things stood in these recordings", where=where,
         expected="a manifest of `worldline record` (record_episodes or record_policies)", got=step,
         next_step="record the starts with `worldline record`",
     )  # fmt: skip

@@ -300,7 +300,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        12,
+        13,
         "worldline_core.report.report",
         "report",
         "report.context.ReportConfig",

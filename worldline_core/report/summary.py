@@ -99,9 +99,16 @@ class HeadView:
             return None
         difference = self.difference(method, copy)
         bounds = (difference["low"], difference["high"]) if difference else None
-        text = f"copying the first frame: {number(float(reference['mean']))}"
+        value, beside = told_apart(float(mean["mean"]), float(reference["mean"]))
+        text = f"copying the first frame: {beside}"
         how = f"{how}{mean['count']} recordings{interval_words(bounds)}"
-        return Figure(number(float(mean["mean"])), what, mean["mean"], reference["mean"], text, bounds, how)
+        return Figure(value, what, mean["mean"], reference["mean"], text, bounds, how)
+
+
+def told_apart(mean: float, reference: float) -> tuple[str, str]:
+    """Two numbers for readers, with a third digit where two show no difference."""
+    digits = 2 if number(mean) != number(reference) else 3
+    return number(mean, digits), number(reference, digits)
 
 
 def interval_words(bounds: tuple[float, float] | None, *, points: bool = False) -> str:
@@ -223,13 +230,13 @@ def sentence(context: ReportContext, view: HeadView | None, figures: dict[str, F
         return text + "."
     beats = "already beats" if own.verdict == "better" else "does not yet beat"
     return Markup("{}; the model that this run trained itself{} {} copying the first frame ({} against {}).").format(
-        text, training_time(context), beats, own.value, number(own.reference)
+        text, training_time(context), beats, *told_apart(own.mean, own.reference)
     )
 
 
 def controls_clause(view: HeadView, found: Figure) -> tuple[bool, str]:
     """Whether the main method follows the controls: better than a copy, and than with the controls of another episode."""
-    beside = f"(robot IoU {found.value} against {number(found.reference)} for copying the first frame)"
+    beside = "(robot IoU {} against {} for copying the first frame)".format(*told_apart(found.mean, found.reference))
     if found.verdict != "better":
         return False, f"does not yet predict better than a copy of the first frame {beside}"
     shuffled = view.difference(view.primary, view.method(f"{view.primary.kind}_shuffled", view.primary.group))

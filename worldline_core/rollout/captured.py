@@ -23,7 +23,7 @@ Run = Callable[..., Sequence[Tensor]]
 
 
 def run_now(passes: Passes, cache: KVCache | None, *tensors: Tensor | None, **settings: object) -> Sequence[Tensor]:
-    """Run them as they are."""
+    """Run the passes without recording them."""
     return passes(cache, *tensors, **settings)
 
 
@@ -31,8 +31,8 @@ class Captured:
     """Runs passes from their recordings, one for every form of their inputs (shapes, window of the cache, settings).
 
     Args:
-        record: runs work that takes and returns buffers, and gives what runs it again, and its results; tests on a CPU give
-            their own.
+        record: called with a function that computes results from buffers; runs it, and returns a function that runs it
+            again and the buffers of its results. CUDA graphs unless given.
 
     Raises:
         ConfigError: the device is no GPU.
@@ -95,7 +95,7 @@ class CudaGraphs:
                     work()
             torch.cuda.current_stream().wait_stream(beside)
             graph = torch.cuda.CUDAGraph()
-            # Another thread may be decoding the block before: what it asks of the GPU is none of this recording's business.
+            # Another thread may be decoding the block before: its calls must not end this recording.
             with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
                 results = work()
         return graph.replay, results

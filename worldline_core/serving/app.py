@@ -32,7 +32,7 @@ from worldline_core.serving.session_host import SessionHost, error_message
 
 MEDIA_TYPE = "application/msgpack"
 TAKE_S = 30.0
-"""A client takes a reply, and sends a body, within this time."""
+"""Seconds within which a client must take a reply, and send a body."""
 _STATUS = {"BusyError": 503}
 
 
@@ -102,7 +102,7 @@ def make_app(host: SessionHost, token: str | None, held: HeldBytes) -> ASGIApp:
             try:
                 message = unpack(found.get("bytes") or b"", "request")
             except DataError as error:
-                # What follows a message that is not understood cannot be trusted either.
+                # After a message that is not understood, the ones behind it may be misread.
                 await send_in_time(websocket, pack({"error": error_message(error)}))
                 await websocket.close(1007, "a message was not understood")
                 return
@@ -110,7 +110,8 @@ def make_app(host: SessionHost, token: str | None, held: HeldBytes) -> ASGIApp:
 
     async def page(_: Request) -> Response:
         html = render("serving/play.html", title="Play", subtitle="", script="serving/play.js")
-        return HTMLResponse(html, headers={"X-Frame-Options": "DENY"})  # a page around it could have clicks made in it
+        # Inside a frame of another site, visitors could be led to click here without knowing.
+        return HTMLResponse(html, headers={"X-Frame-Options": "DENY"})
 
     async def played(websocket: WebSocket) -> None:
         async def send(content: str | bytes) -> None:

@@ -148,7 +148,7 @@ class SkipLog:
 
     @staticmethod
     def count(folder: Path) -> int:
-        """Clips that all processes skipped."""
+        """How many clips all processes have skipped."""
         return sum(len(read_json_lines(path)) for path in folder.glob("skipped_clips-*.jsonl"))
 
 
@@ -250,7 +250,7 @@ class ClipLoader:
         return Batch(clips, views, latents, maps, ids, mask, frames, fps)
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
-        """What a prompt may say of a clip: a stride shows its frames at a lower rate."""
+        """What a prompt may say about a clip; a stride lowers its rate."""
         return ClipFacts(clip.num_frames, self._rate(clip), self.store.image_size)
 
     def _rate(self, clip: Clip) -> float:

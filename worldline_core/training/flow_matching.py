@@ -94,7 +94,7 @@ def flow_matching_loss(
 ) -> Float[Tensor, ""]:
     """Mean squared velocity error over the noisy frames, in float32 (clean frames carry no loss).
 
-    ``weights``: further ones, as `Batch` carries them.
+    ``weights``: multiply the squared error, as in `Batch`.
     """
     error = (velocity.float() - velocity_target(latents, noise).float()) ** 2
     if weighting.kind == "sample":
@@ -168,7 +168,7 @@ class FlowMatchingObjective:
         return None if batch.text_ids is None else self.model.encode_text(batch.text_ids, batch.text_mask)
 
     def end_step(self, values: Mapping[str, float]) -> None:
-        """Let the loss scales follow."""
+        """Update the scales of the relational terms with this step's losses."""
         if self.relational is not None:
             means = (values[name] for name in ("flow_matching", "relational_intra", "relational_cross"))
             self.relational.scales.update(*means)

@@ -48,7 +48,7 @@ def relation(first: Float[Tensor, "*batch n d"], second: Float[Tensor, "*batch m
 
 @dataclass(frozen=True)
 class Relations:
-    """All that the terms need of a clip's teacher: half a megabyte at full size, where its features are a gigabyte.
+    """What the terms need from the teacher for a clip: half a megabyte at full size, against a gigabyte of features.
 
     Attributes:
         shape: (bins, rows, columns) that features are pooled to.
@@ -123,7 +123,7 @@ class RelationalScales:
 
 
 class ClipRelations(Protocol):
-    """Where the teacher's relations of clips come from; see `TeacherRelations`."""
+    """Gives the teacher's relations of clips; see `TeacherRelations`."""
 
     def relations(
         self,
@@ -200,7 +200,7 @@ class RelationalTerm:
         self.scales = RelationalScales(config)
 
     def taught(self, batch: Batch, grid: tuple[int, int, int]) -> Relations:
-        """What the teacher says of a batch, on its device: asked before the student runs, whose activations fill memory.
+        """The teacher's relations of a batch, on its device; computed before the student's activations fill the memory.
 
         Args:
             grid: the student's (t, h, w).
@@ -215,7 +215,8 @@ class RelationalTerm:
         """The flow-matching loss plus the weighted relational terms.
 
         Args:
-            features: the student's; taught: of the same clips.
+            features: of the student's middle block.
+            taught: the teacher's relations of the same clips.
         """
         intra, cross = relational_losses(pool_features(features, taught.shape), taught, step)
         scale_intra, scale_cross = self.scales.at(step)

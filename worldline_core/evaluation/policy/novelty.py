@@ -1,12 +1,12 @@
-"""How far what a simulator is asked is from all that its model was trained on: the controls, and the setup.
+"""How far the controls and the setup of a simulation are from everything that its model was trained on.
 
-Both are compared with the training recordings. Controls step by step: where the tools are from where they began, how fast they
+Both are compared with the training recordings. Controls are compared step by step: where the tools are from where they began, how fast they
 move and how far the grippers are open, in windows of two latent frames, each with the same moment of every training recording
 of as many arms. The setup is which body it is, and where its head camera stands and how wide it sees, compared with the
 training recordings of the same body. The novelty is the distance to the nearest training recording, of the window that is
-farthest, in units of the distance that a share ``1 - level`` of the training recordings stay within among themselves. Above 1
-lies what so many training recordings are not: nearest-neighbour novelty detection with the threshold of conformal prediction
-(Laxhammar and Falkman 2010). First pictures themselves tell little here: scenes are varied so much that statistics of
+farthest, in units of the distance that a share ``1 - level`` of the training recordings stay within among themselves. So only a
+share ``level`` of the training recordings would be above 1: nearest-neighbour novelty detection with the threshold of conformal
+prediction (Laxhammar and Falkman 2010). First pictures themselves tell little here: scenes are varied so much that statistics of
 their latents hardly tell an unseen body or camera from an unseen scene.
 
 Axis legend: r recordings, w windows, f features, n frames, a arms.
@@ -43,9 +43,9 @@ class KnownRecordings:
     """Training recordings as vectors, and how far others are from them.
 
     Args:
-        recordings: of each its kind and its vectors ``(w, f)``; of more than 2,000 of one kind some are drawn.
-        what: they are, for the message.
-        level: share of the training recordings that are farther from the others than 1.
+        recordings: kind and vectors ``(w, f)`` of each; of more than 2,000 of one kind, 2,000 are drawn.
+        what: what the recordings are, for the error message.
+        level: share of the training recordings whose own novelty is above 1.
 
     Raises:
         DataError: no kind has five recordings.
@@ -78,12 +78,12 @@ class KnownRecordings:
             )  # fmt: skip
 
     def novelty(self, kind: Kind, vectors: Float[np.ndarray, "w f"]) -> float:
-        """Of a recording; infinite where fewer than five training recordings are of its kind: hardly anything is like it."""
+        """Novelty of a recording; infinite where fewer than five training recordings are of its kind."""
         known = self._known.get(str(kind))
         return float("inf") if known is None else known.novelty(vectors)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that is known, by name, to be saved."""
+        """The arrays to save, by name, for :meth:`of_arrays`."""
         return {f"{kind}/{name}": array for kind, found in self._known.items() for name, array in found.arrays.items()}
 
     @classmethod
@@ -117,7 +117,7 @@ class _Neighbours:
             apart = cdist(vectors, vectors)
             np.fill_diagonal(apart, np.inf)
             own[w, lengths > w] = apart.min(axis=1)
-        # The windows of a recording are as hard to match as each other: in units of their median.
+        # Some windows are harder to match than others: each is measured in units of its median distance.
         scale = np.array([max(float(np.median(own[w, lengths > w])), 1e-6) for w in range(windows)])
         limit = np.quantile((own / scale[:, None]).max(axis=0), 1.0 - level)
         return cls({f"window_{w}": vectors for w, vectors in enumerate(known)} | {"scale": scale, "limit": limit[None]})

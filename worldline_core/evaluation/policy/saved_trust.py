@@ -1,8 +1,8 @@
-"""Trust that was calibrated where outcomes are known, saved for where they are not: ``trust.safetensors``.
+"""``trust.safetensors``: a calibration of trust, made where outcomes are known and used where they are not.
 
 The header says what it was made with: the judge, the embodiments, and of every method the checkpoint and how it was sampled.
 Verdicts on other videos, of another judge or on other robots were never compared with outcomes, so they get no probability. The
-tensors are the training recordings that tell what is new (:mod:`worldline_core.evaluation.policy.novelty`).
+tensors are the training recordings that novelty is measured against (:mod:`worldline_core.evaluation.policy.novelty`).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class _Header(StrictModel):
 
 @dataclass(frozen=True)
 class SavedTrust:
-    """A saved calibration, and the training recordings that it calls known."""
+    """A saved calibration, and the training recordings that it measures novelty against."""
 
     judged_by: JudgedBy
     embodiments: tuple[str, ...]
@@ -132,7 +132,7 @@ class SavedTrust:
             )  # fmt: skip
 
     def calibration_of(self, predicted_by: PredictedBy | None) -> Calibration | str:
-        """Of verdicts on such videos; or why there is none."""
+        """The calibration of verdicts on such videos, or the reason why there is none."""
         for method in self.methods.values():
             if method.predicted_by == predicted_by:
                 return Calibration(method.signals, np.array(method.weights))

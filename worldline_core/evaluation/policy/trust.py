@@ -42,7 +42,7 @@ class Calibration:
     weights: Float[np.ndarray, " s+1"]
 
     def trust(self, rows: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, " n"] | str:
-        """Of each verdict, or why there is none."""
+        """The trust in each verdict, or the reason why there is none."""
         values, known = _signals(rows)
         if missing := [name for name in self.signals if name not in known]:
             return f"the calibration reads {', '.join(missing)}, which not all of these verdicts have"
@@ -50,7 +50,7 @@ class Calibration:
 
 
 def calibrated(rows: Sequence[Mapping[str, Any]]) -> Calibration:
-    """Of all verdicts of one method, with signals and recorded outcomes, for verdicts whose outcome is not known."""
+    """The calibration from all verdicts of one method, for verdicts whose outcome is not known."""
     values, known = _signals(rows)
     return Calibration(tuple(known), fit_right(values, _right(rows)))
 
@@ -112,7 +112,7 @@ def trust_verdicts(
 
 
 def _add_doubt(name: str, rows: Sequence[dict[str, Any]], others: Sequence[Mapping[str, Any]]) -> None:
-    """Of each verdict: one minus the mean confidence in the same verdict of ``others`` on its episode; None without any."""
+    """One minus the mean confidence of the ``others`` on an episode in its verdict; None where there are none."""
     stated: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for row in others:
         if row["confidence"] is not None:
@@ -191,12 +191,12 @@ def fit_right(signals: Float[np.ndarray, "n s"], right: Bool[np.ndarray, " n"]) 
 
 
 def probability(weights: np.ndarray, signals: Float[np.ndarray, "n s"]) -> Float[np.ndarray, " n"]:
-    """That a verdict with these signals is right."""
+    """The probability that a verdict with these signals is right."""
     return 1.0 / (1.0 + np.exp(-np.clip(weights[0] + signals @ weights[1:], -60, 60)))
 
 
 def reasons(row: Mapping[str, Any], least_trust: float) -> list[str]:
-    """Why a verdict carries the mark; none where it does not."""
+    """The reasons why a verdict is marked as not to be trusted; empty where it is not."""
     found = [
         name.replace("_", " ") for name in ("new_controls", "new_setup") if row[name] is not None and row[name] > 1.0
     ]
