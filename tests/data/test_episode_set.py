@@ -7,11 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, EpisodeDescription
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.episodes.sidecar import Sidecar
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.video.frames import packed_images, unpacked_images
 from worldline_core.errors import DataError
@@ -160,6 +163,27 @@ def test_different_robots_get_datasets_of_their_own(tmp_path: Path, sample: Make
         stored.frames(2, "left_wrist")
     with pytest.raises(DataError, match="No such episode"):
         stored.position("absent")
+
+
+def test_labels_of_more_than_a_gigabyte_are_read_image_by_image(tmp_path: Path, sample: Make) -> None:
+    """Eight images are written of the 4000 that the table declares: going on beyond them is what is refused."""
+    episode, frames, masks = sample(0)
+    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(32, 48)) as writer:
+        writer.add(episode, frames, masks, thing_labels={"head": masks["head"].astype(np.uint8)})
+    (path,) = tmp_path.rglob("thing_labels.parquet")
+    labels = np.full((8, 480, 640), 3, np.uint8)
+    row = pq.read_table(path).to_pylist()[0] | {
+        "shape": [4000, 480, 640],
+        "bits": packed_images(labels, np.uint8, 1).tobytes(),
+    }
+    pq.write_table(pa.Table.from_pylist([row], schema=pq.read_schema(path)), path)
+    read = Sidecar(path.parents[2]).things(row["episode_index"], "head")
+    assert read is not None
+    assert read.shape == (4000, 480, 640)
+    images = iter(read)
+    assert all(np.array_equal(next(images), image) for image in labels)
+    with pytest.raises(RejectedInputError, match="from image 8 on"):
+        next(images)
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path: Path, sample: Make) -> None:
