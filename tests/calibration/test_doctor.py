@@ -23,6 +23,7 @@ from worldline_core.geometry.kinematics import ArmKinematics
 CONFIG = CalibrationDoctorConfig()
 
 
+@pytest.mark.slow
 def test_every_mistake_is_named(benchmark: ModuleType, healthy: list) -> None:
     item = healthy[0]
     names = []

@@ -148,6 +148,7 @@ def test_every_step_is_a_subcommand_choice() -> None:
     assert (arguments.step, arguments.overrides) == ("train_stage2", ["train_stage2.steps=3"])
 
 
+@pytest.mark.slow
 def test_task_and_inspect_answer_scripts_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["task", "curate", "--preset", "smoke", "--artifacts", str(tmp_path), "--json"])
     artifact = json.loads(capsys.readouterr().out)

@@ -87,6 +87,7 @@ def test_agibot_v2(tmp_path: Path, shared_data: Path) -> None:
     assert 0 < v < 48
 
 
+@pytest.mark.slow
 def test_droid(tmp_path: Path, shared_data: Path) -> None:
     folder = shared_data / "droid_ctrl_world" / "droid_new_setup"
     counts, curated = run(tmp_path, kind="droid_annotation", path=str(folder), name="droid")

@@ -74,6 +74,7 @@ def config(kind: str, splits: list[str], optional: list[str]) -> DistillConfig:
 
 
 @pytest.mark.parametrize("kind", ["latents", "frames"])
+@pytest.mark.slow
 def test_every_step_sees_every_set_of_views(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:

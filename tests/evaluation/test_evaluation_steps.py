@@ -75,6 +75,7 @@ def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, 
     assert contents(evaluated) == contents(tmp_path / "again")
 
 
+@pytest.mark.slow
 def test_names_of_episodes_and_banks_never_become_names_of_files(oddly_named, tmp_path):
     recordings, bank = oddly_named
     _seal(bank.inputs["banks"], bank.outcomes)

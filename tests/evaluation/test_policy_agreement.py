@@ -106,6 +106,7 @@ def test_every_attempt_is_needed():
         PolicyEvaluationConfig(compare_policies=True)
 
 
+@pytest.mark.slow
 def test_the_step_compares_the_sources_of_its_episodes(policies, tmp_path):
     evaluate_policy(COMPARED, policies.inputs, tmp_path)
     found = json.loads((tmp_path / "summary.json").read_text())["policies"]

@@ -36,6 +36,7 @@ def later(calibration):
     return CONFIG.model_copy(update={"trust": TrustConfig(calibration=calibration)})
 
 
+@pytest.mark.slow
 def test_verdicts_without_outcomes_are_trusted_as_verdicts_with_outcomes_taught(calibrated, attempts, tmp_path):
     """A first frame repeated is judged a failure, rightly of every second attempt."""
     before = told(calibrated)
@@ -62,6 +63,7 @@ def test_verdicts_without_outcomes_are_trusted_as_verdicts_with_outcomes_taught(
     assert "Recordings whose outcome is not known" in page
 
 
+@pytest.mark.slow
 def test_a_calibration_is_held_against_new_outcomes(calibrated, attempts, tmp_path):
     evaluate_policy(later(calibrated / TRUST_FILE), attempts[0].inputs, tmp_path)
     found = json.loads((tmp_path / "summary.json").read_text())["trust"]["methods"]["copy"]
@@ -69,6 +71,7 @@ def test_a_calibration_is_held_against_new_outcomes(calibrated, attempts, tmp_pa
     assert not (tmp_path / TRUST_FILE).exists()
 
 
+@pytest.mark.slow
 def test_a_calibration_of_something_else_is_refused(calibrated, attempts, tmp_path):
     inputs = attempts[1].inputs
     with pytest.raises(ConfigError, match=r"(?s)of another judge.*left_wrist.*next step: judge as it was made"):

@@ -117,6 +117,7 @@ def test_a_recording_that_starts_late_says_how_it_ended(recorder):
     assert (on_time[1].outcome, motion.outcome) == ("success", "failure")
 
 
+@pytest.mark.slow
 def test_a_recorded_comparison_of_policies(tmp_path):
     counts = record_policies(CONFIG, tmp_path)
     assert counts["policies"]["expert"] == {"press": {"attempts": 1, "successes": 1}}

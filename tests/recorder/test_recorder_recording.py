@@ -132,6 +132,7 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
     assert rows[0].scene in {f"scene_{n:02d}" for n in range(12)}
 
 
+@pytest.mark.slow
 def test_bank_outcomes_are_sealed(recorder: EpisodeRecorder, tmp_path: Path) -> None:
     spec = BankSpec(name="bank", embodiment="viperx_graphite", family="close", scene="scene_12", layout=1)
     config = RecordBanksConfig(banks=(spec,), candidates=4, num_frames=29, success_range=(0.25, 0.75), masks=False)

@@ -22,6 +22,7 @@ from worldline_core.exports.worldarena import export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet
 
 
+@pytest.mark.slow
 def test_a_prediction_is_exported_in_every_format(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     rollouts = RolloutSet.open(run_artifacts["rollout.shipped_causal"])
     episodes = EpisodeSet.open(run_artifacts["curate"])

@@ -97,7 +97,7 @@ def droid(shared_data: Path, tmp_path_factory: pytest.TempPathFactory, make_mode
     return inputs_of(root, [(labelled, frames)], 4.0, make_model, make_contract)
 
 
-@pytest.mark.parametrize("kind", ["causal", "stage2"])
+@pytest.mark.parametrize("kind", [pytest.param("causal", marks=pytest.mark.slow), "stage2"])
 def test_droid_goes_through_in_its_two_views(droid: dict[str, str], tmp_path: Path, kind: str) -> None:
     done = run_chain(tmp_path, chain(droid, kind, None))
     rollouts = RolloutSet.open(tmp_path / "rollout")

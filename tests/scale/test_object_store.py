@@ -71,7 +71,9 @@ def test_a_missing_and_a_damaged_object_cost_their_episodes_only(
     assert all("worldline-remote" not in row.detail and "127.0.0.1" not in row.detail for row in rows)
 
 
-@pytest.mark.parametrize("fault", ["busy", "broken", "hang up"])
+@pytest.mark.parametrize(
+    "fault", ["busy", *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("broken", "hang up"))]
+)
 def test_a_store_that_flickers_changes_nothing(
     tmp_path: Path, recordings: Path, store: ObjectStore, fault: str
 ) -> None:
@@ -89,6 +91,7 @@ def test_a_store_that_flickers_changes_nothing(
     assert remote == curated_digest(config(recordings), tmp_path / "local")
 
 
+@pytest.mark.slow
 def test_a_store_that_stays_away_is_no_reason_to_quarantine(
     tmp_path: Path, recordings: Path, store: ObjectStore
 ) -> None:

@@ -85,6 +85,7 @@ def runner(kind: str, **settings: Any) -> RunnerConfig:
 
 
 @pytest.mark.parametrize("size", [1, 5])
+@pytest.mark.slow
 def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], tmp_path: Path, size: int) -> None:
     assert both_digests(recordings, tmp_path, SerialMapper(RunnerConfig(episodes_per_shard=size))) == undisturbed
 

@@ -179,6 +179,7 @@ def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) 
         assert found == {number: digest for number, digest in enumerate(expected) if number % 4 != 3}
 
 
+@pytest.mark.slow
 def test_limits_refuse_and_free_again(serving: Callable) -> None:
     with serving(max_sessions=2, max_clips=3, max_connections=2, max_message_bytes=1 << 20, idle_s=0.6) as url:
         with SimulatorClient(url) as client:

@@ -120,7 +120,14 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
 
 
 @pytest.mark.parametrize(
-    "kind", ["pickle", "a decoder", "another place", "a class", "no record", "half a character", "a folder"]
+    "kind",
+    [
+        "pickle",
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in ("a decoder", "another place", "a class", "no record", "half a character", "a folder")
+        ),
+    ],
 )
 def test_prefects_records_are_not_believed(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
@@ -140,6 +147,7 @@ def test_prefects_records_are_not_believed(
     assert not (tmp_path / "trap").exists()
 
 
+@pytest.mark.slow
 def test_a_store_that_was_moved_is_found_where_it_is(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -255,6 +255,7 @@ def test_an_error_that_says_what_to_do_is_logged_without_a_traceback(error: Exce
     assert not is_worth_saying(record)
 
 
+@pytest.mark.slow
 def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:
     code = """
         import multiprocessing, os, time

@@ -54,6 +54,7 @@ def test_a_signal_from_the_terminal_stops_everything(project_root: Path, number:
     wait_until_gone(helper)
 
 
+@pytest.mark.slow
 def test_work_that_does_not_listen_is_killed(project_root: Path) -> None:
     process, helper = start(project_root, "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)")
     process.send_signal(signal.SIGINT)

@@ -411,6 +411,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(
     assert last.metadata["run"]["steps"] == 6
 
 
+@pytest.mark.slow
 def test_seconds_become_the_same_number_of_steps_for_every_seed(measuring: Measuring, tmp_path: Path) -> None:
     plan = plan_of(one={"stage2": {"seconds": 0.2, "batch": 1}}).model_copy(update={"seeds": (0, 1)})
     Training(measuring.memory, plan, tmp_path, measuring).all()

@@ -103,6 +103,7 @@ def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     monkeypatch.setattr(trainer_module, "_step", step)
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bytes(
     world: Any, stage1_folder: Path, teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
