@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -85,6 +86,15 @@ def test_deep_models_cost_what_two_shallow_ones_foretell(monkeypatch: pytest.Mon
     assert drawn.flops == pytest.approx(traced.flops, rel=1e-9)
     assert drawn.activations == pytest.approx(traced.activations, rel=1e-3)
     assert drawn.gradients == traced.gradients == 4 * parameter_counts(config)[0]
+
+
+def test_deep_models_hold_most_on_the_way_back_where_shallow_ones_do_before() -> None:
+    def trace(layers: int) -> StepCost:
+        ahead, back = 10.0 + layers, 2.0 * layers
+        return StepCost(max(ahead, back), ahead=ahead, back=back)
+
+    assert trace(8).activations == 18
+    assert step_cost.cost_at_depth(trace, 36) == replace(trace(36), peak=72.0)
 
 
 def test_operations_are_those_of_the_matrix_products() -> None:

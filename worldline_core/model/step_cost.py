@@ -59,6 +59,7 @@ class StepCost:
         kept: bytes held when the loss is there and the way back begins.
         gradients: bytes of the parameters' gradients at its end.
         peak: most bytes of both together.
+        ahead, back: the part of ``activations`` until the loss is there, and from there on.
         products: how many matrix products, convolutions and attentions of (operations, bytes read and written) it does.
     """
 
@@ -66,6 +67,8 @@ class StepCost:
     kept: float = 0.0
     gradients: float = 0.0
     peak: float = 0.0
+    ahead: float = 0.0
+    back: float = 0.0
     products: Counter[tuple[float, float]] = field(default_factory=Counter[tuple[float, float]])
 
     @property
@@ -91,6 +94,8 @@ class StepCost:
             max(self.kept, other.kept),
             max(self.gradients, other.gradients),
             max(self.peak, other.peak),
+            max(self.ahead, other.ahead),
+            max(self.back, other.back),
             self.products + other.products,
         )
 
@@ -278,12 +283,13 @@ def cost_of(work: Callable[[], Tensor | None], parameters: Iterable[nn.Parameter
     hooks = [one.register_post_accumulate_grad_hook(meter.is_gradient) for one in parameters if one.requires_grad]
     with meter:
         loss = work()
-        kept = meter.live
+        kept, ahead, meter.activations = meter.live, meter.activations, meter.live
         if hooks and loss is not None:
             loss.backward()
     for hook in hooks:
         hook.remove()
-    return StepCost(meter.activations, kept, meter.gradients, meter.peak, meter.products)
+    back = meter.activations
+    return StepCost(max(ahead, back), kept, meter.gradients, meter.peak, ahead, back, meter.products)
 
 
 def cost_at_depth(trace: Callable[[int], StepCost], layers: int, *, forward_only: bool = False) -> StepCost:
@@ -302,9 +308,11 @@ def cost_at_depth(trace: Callable[[int], StepCost], layers: int, *, forward_only
 
     keys = first.products.keys() | second.products.keys()
     products = Counter({key: line(first.products[key], second.products[key]) for key in keys})
-    activations, kept = line(first.activations, second.activations), line(first.kept, second.kept)
-    gradients = line(first.gradients, second.gradients)
-    return StepCost(activations, kept, gradients, activations + gradients, products)
+    # Shallow models may hold most before the loss is there, deep ones after: each of the two is a line.
+    ahead, back = line(first.ahead, second.ahead), line(first.back, second.back)
+    activations, gradients = max(ahead, back), line(first.gradients, second.gradients)
+    kept = line(first.kept, second.kept)
+    return StepCost(activations, kept, gradients, activations + gradients, ahead, back, products)
 
 
 def in_bfloat16(model: nn.Module) -> None:
