@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,6 +19,7 @@ from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.planner import Planner, typical_lengths
 from worldline_core.pipeline.sheet import Machine, Row
+from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.training import stage_memory
 from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.stage_memory import Spread, StageMemory, largest_clips, require_fit, rough_bytes
@@ -99,6 +101,22 @@ def test_distillation_from_frames_of_another_size_than_stage2s_is_refused() -> N
         load_config(PipelineConfig, preset="cosmos3-nano", overrides=["distill.input.kind=frames"])
     same = "distill.input={kind: frames, image_size: [480, 640]}"
     load_config(PipelineConfig, preset="cosmos3-nano", overrides=[same])
+
+
+@pytest.mark.parametrize(
+    ("changes", "instead"),
+    [
+        ({"batch_size": 2}, "a smaller batch_size, or weights: bfloat16"),
+        ({"batch_size": 1}, "a smaller num_frames, or weights: bfloat16"),
+        ({"batch_size": 1, "weights": "bfloat16"}, "a smaller num_frames"),
+    ],
+)
+def test_a_rollout_that_does_not_fit_is_told_what_can_still_be_smaller(changes: dict[str, Any], instead: str) -> None:
+    planner = Planner(load_config(PipelineConfig, preset="smoke"), PROJECT, Machine.of(1, "0.001GB", "H100", 0.4))
+    config = RolloutConfig.model_validate({"sampler": "full_clip", "num_frames": 5, **changes})
+    row = planner._rollout("stage2", config, planner.generation, (64, 96))
+    assert not row.fits
+    assert row.instead == instead
 
 
 @pytest.mark.slow

@@ -23,10 +23,11 @@ from torch import Tensor, nn
 from worldline_core.errors import ArtifactError, ConfigError, StoppedError, TrainingError
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training import processes
+from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.processes import BatchPlan
 from worldline_core.training.trainer import Objective, ParameterGroup, TrainingResult, train
-from worldline_core.training.training_config import TrainerConfig
-from worldline_core.training.training_state import identity_digests, newest_state
+from worldline_core.training.training_config import SavingConfig, TrainerConfig
+from worldline_core.training.training_state import TrainingStates, identity_digests, newest_state
 
 STATES = Path("run") / "training_state"
 
@@ -129,9 +130,22 @@ def test_a_full_disk_ends_the_run_and_keeps_the_state_before(tmp_path: Path) -> 
     with files_of_at_most(20_000), pytest.raises(TrainingError, match="state could not be written") as ended:
         run(tmp_path)
     assert "File too large" in str(ended.value)
+    assert "free some space, then give the same command again" in str(ended.value)
     assert f"last good state is {tmp_path / STATES / 'step-000000004'}" in str(ended.value)
     assert [path.name for path in (tmp_path / STATES).iterdir()] == ["step-000000004"]
     assert torch.equal(run(tmp_path).average["weight"], run(tmp_path / "whole").average["weight"])
+
+
+def test_a_state_that_another_process_left_unfinished_is_not_blamed_on_the_disk(tmp_path: Path) -> None:
+    weight = {"weight": nn.Parameter(torch.zeros(3))}
+    states = TrainingStates(
+        tmp_path, SavingConfig(), weight, ExponentialAverage(weight, 0.5), torch.optim.SGD(weight.values())
+    )
+    gone = RuntimeError("[gloo/transport/tcp/pair.cc:544] Connection closed by peer [127.0.0.1]:2345")
+    for error in (gone, None):
+        message = str(states.failed(error))
+        assert "every process to write its part" in message
+        assert "space" not in message
 
 
 def test_a_stopped_run_saves_its_state_and_goes_on_with_the_same_bytes(tmp_path: Path) -> None:

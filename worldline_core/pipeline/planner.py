@@ -219,7 +219,10 @@ class Planner:
             "activations": max(cost.activations - cost.kept, decoding.activations),
         }
         facts = {"tokens of a clip": shape.tokens(model)}
-        return self._row(f"rollout {name} (a prediction)", count, parts, cost.then(decoding), facts)
+        instead = "a smaller batch_size" if config.batch_size > 1 else "a smaller num_frames"
+        if config.weights == "float32":
+            instead += ", or weights: bfloat16"
+        return self._row(f"rollout {name} (a prediction)", count, parts, cost.then(decoding), facts, instead)
 
     def _row(
         self, title: str, parameters: int, parts: Mapping[str, float], work: StepCost, facts: Mapping[str, Any],

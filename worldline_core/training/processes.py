@@ -58,6 +58,11 @@ def any_process(flag: bool) -> bool:
     return average_values({"flag": float(flag)})["flag"] > 0
 
 
+def another_process_ended(error: BaseException | None) -> bool:
+    """Whether this is what the network says of a process that cannot be reached any more."""
+    return isinstance(error, torch.distributed.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error))
+
+
 @contextmanager
 def reporting_lost_processes(where: str) -> Iterator[None]:
     """Say in plain words that another process has ended, where its silence shows as an error of the network.
@@ -68,8 +73,7 @@ def reporting_lost_processes(where: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        network = isinstance(error, torch.distributed.DistError) or "gloo" in str(error)
-        if processes()[1] == 1 or not network:
+        if processes()[1] == 1 or not another_process_ended(error):
             raise
         raise TrainingError(
             "Another process of this training has ended or cannot be reached.",

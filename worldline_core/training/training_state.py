@@ -29,7 +29,7 @@ from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.processes import processes, wait_for_all
+from worldline_core.training.processes import another_process_ended, processes, wait_for_all
 from worldline_core.training.sharding import own_part
 from worldline_core.training.training_config import SavingConfig
 
@@ -253,12 +253,13 @@ class TrainingStates:
 
         if isinstance(error, CheckpointException):
             error = next(iter(error.failures.values()))[0]
+        ended = error is None or another_process_ended(error)
         return TrainingError(
             "The training state could not be written.",
             where=self.folder,
-            expected="room for a state beside the one before it",
+            expected="every process to write its part" if ended else "room for a state beside the one before it",
             got=repr(error) if error else "another process could not write its part",
-            next_step=f"free some space, then give the same command again; {self.last_good()}",
+            next_step=f"{'' if ended else 'free some space, then '}give the same command again; {self.last_good()}",
         )
 
     def last_good(self) -> str:
