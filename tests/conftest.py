@@ -57,6 +57,21 @@ def unchecked_shapes() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
+def rendering() -> None:
+    """For tests that render: what fails after this is a failure, not a machine without OpenGL."""
+    mujoco = pytest.importorskip("mujoco")
+    from worldline_core.recorder.rendering import prepare_rendering
+
+    prepare_rendering()
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>")).close()
+    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
+        pytest.skip(
+            f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri"
+        )
+
+
+@pytest.fixture(scope="session")
 def project_root() -> Path:
     return PROJECT_ROOT
 

@@ -18,22 +18,13 @@ from worldline_core.errors import DataError
 from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
 from worldline_core.recorder.defects import DEFECTS
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
-from worldline_core.recorder.rendering import SceneRenderer, prepare_rendering
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion, Recording
 from worldline_core.recorder.things import sample_layout
 
 
 @pytest.fixture(scope="module")
-def recorder() -> EpisodeRecorder:
-    prepare_rendering()
-    recorder = EpisodeRecorder("viperx_graphite")
-    try:
-        SceneRenderer(recorder.scene).close()
-    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
-        pytest.skip(
-            f"off-screen OpenGL is not available here ({error}); on Debian: libegl1 libegl-mesa0 libgl1-mesa-dri"
-        )
-    return recorder
+def recorder(rendering: None) -> EpisodeRecorder:
+    return EpisodeRecorder("viperx_graphite")
 
 
 @pytest.fixture(scope="module")

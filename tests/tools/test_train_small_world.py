@@ -30,7 +30,6 @@ from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.recorder.bodies import BODIES
-from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.relational import TeacherRelations
 from worldline_core.training.training_config import RelationalConfig
@@ -109,14 +108,10 @@ def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     assert len({job.episode_id for task in everything for job in task.jobs}) == sum(len(t.jobs) for t in everything)
 
 
+@pytest.mark.usefixtures("rendering")
 def test_the_shipped_model_predicts_what_the_tool_records(tmp_path: Path) -> None:
-    prepare_rendering()
-    mujoco = pytest.importorskip("mujoco")
     task = plan_files(tmp_path, 3000, ["small_world_test"])[0]
-    try:
-        record_file(replace(task, jobs=task.jobs[:2]))
-    except (RuntimeError, AttributeError, ImportError, OSError, mujoco.FatalError) as error:
-        pytest.skip(f"off-screen OpenGL is not available here: {error}")
+    record_file(replace(task, jobs=task.jobs[:2]))
     memory = Memory(tmp_path, [task.path.name], PatchTokenizer.load(MODELS / "tokenizer"), None)
     file = Recorded.read(task.path)
     latents, model = memory.encode(videos(file.frames, "cpu")), Predictor.open(MODELS / "stage2", "cpu")
