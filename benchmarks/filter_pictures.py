@@ -1,6 +1,6 @@
 """The pictures of docs/filters.md: for each filter a clip that it cuts, made from a shipped recording.
 
-Run: `python benchmarks/filter_pictures.py [--output docs/pictures/filters]`. The faults are injected (filters/labelled_clips.py).
+Run: `python benchmarks/filter_pictures.py [--output docs/pictures/filters]`. The faults are injected (tools/labelled_clips.py).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How well the filters find what they are for, on labelled clips: precision, recall and F1 of every reason.
 
 Run: `python benchmarks/filters.py [--part report|tuning] [--recordings FOLDER] [--clips 100] [--processes 2] [--output out.json]`.
-Each clip is a healthy shipped recording with one fault injected at a random severity (filters/labelled_clips.py), or with
+Each clip is a healthy shipped recording with one fault injected at a random severity (tools/labelled_clips.py), or with
 a change that is none; the clean recordings are negatives as well. Spoiled views are compressed again (H.264) as
 curation does. `--part tuning` are the recordings of scenes 0 to 11, `--part report` those of scenes 12 to 15, `--recordings`
 another set with exact robot masks than the shipped one (of which 120 are taken). Thresholds are chosen on tuning parts.

@@ -1,6 +1,6 @@
 """Which tokenizer for the embedded size: linear, linear with a decoder, or a small convolutional autoencoder.
 
-``python -m benchmarks.tokenizers --episodes SET --tokenizer FOLDER --minutes 5`` trains a small
+``python -m benchmarks.video_tokenizers --episodes SET --tokenizer FOLDER --minutes 5`` trains a small
 ``AutoencoderKLWan`` for that long on the training episodes and prints reconstruction quality and time of each.
 """
 
