@@ -262,7 +262,7 @@ def test_views_and_calibration_can_be_demanded(tmp_path: Path, sample: Make) -> 
 
 
 def test_unsteady_frame_times_are_a_wrong_rate(tmp_path: Path, sample: Make) -> None:
-    from worldline_core.data.mcap.writer import write_episode_mcap
+    from worldline_core.data.mcap.exported import write_episode_mcap
 
     folder = tmp_path / "raw"
     for number in range(2):

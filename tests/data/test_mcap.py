@@ -19,9 +19,8 @@ from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.mcap.encodings import Encoding
-from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap.exported import read_exported_episode, write_episode_mcap, write_rollout_mcap
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.writer import write_episode_mcap, write_rollout_mcap
 from worldline_core.errors import DataError
 
 Make = Callable[..., tuple]

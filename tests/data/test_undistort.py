@@ -20,10 +20,9 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.mcap import writer as mcap_writer
-from worldline_core.data.mcap.exported import read_exported_episode
+from worldline_core.data.mcap import exported
+from worldline_core.data.mcap.exported import read_exported_episode, write_episode_mcap
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.writer import write_episode_mcap
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
 from worldline_core.data.sources.open import undistorted
 from worldline_core.geometry.distortion import Distortion
@@ -86,10 +85,10 @@ def write_mcap_of_lens(
         names = {"radtan": "plumb_bob", "fisheye": "kannala_brandt"}
         model = "rational_polynomial" if len(lens.coefficients) > 5 else names[lens.model]
         stated = {"distortion_model": model, "D": list(lens.coefficients)}
-    of_pinhole = mcap_writer._calibration
+    of_pinhole = exported._calibration
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mcap_writer, "_calibration", lambda c: of_pinhole(c) | (stated if c.view == "head" else {}))
-        mcap_writer.write_episode_mcap(path, episode, frames, masks)
+        patch.setattr(exported, "_calibration", lambda c: of_pinhole(c) | (stated if c.view == "head" else {}))
+        exported.write_episode_mcap(path, episode, frames, masks)
 
 
 def curated_mcap(tmp_path: Path, **changes: Any) -> EpisodeSet:

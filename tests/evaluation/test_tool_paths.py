@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import wasserstein_distance
 
-from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.action_tracks import DELAY_FRAMES, changed_tracks, compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.actions.changed_controls import DELAY_FRAMES, changed_tracks
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.render_actions import KinematicsByName
 from worldline_core.data.episodes.episode_set import EpisodeSet

@@ -18,7 +18,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.encodings import Encoding
-from worldline_core.data.mcap.writer import write_episode_mcap
+from worldline_core.data.mcap.exported import write_episode_mcap
 from worldline_core.data.sources.open import open_source
 
 Field = descriptor_pb2.FieldDescriptorProto

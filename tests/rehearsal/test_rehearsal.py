@@ -19,8 +19,14 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
 from worldline_core.rehearsal.outside_models import OUTSIDE_MODELS, OutsideModel, write_outside_models
-from worldline_core.rehearsal.recordings import TWO_VIEWS, write_recordings
-from worldline_core.rehearsal.rehearsal import ABLATION_SIZES, changes_of, other_input, table
+from worldline_core.rehearsal.rehearsal import (
+    ABLATION_SIZES,
+    TWO_VIEWS,
+    changes_of,
+    other_input,
+    table,
+    write_recordings,
+)
 from worldline_core.report.ablation_table import load_variants
 from worldline_core.training.clip_config import FrameInput
 

@@ -14,7 +14,7 @@ from upath import UPath
 
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.mcap.writer import write_episode_mcap
+from worldline_core.data.mcap.exported import write_episode_mcap
 from worldline_core.store.artifact_files import digest_folder
 
 DATA_TESTS = Path(__file__).parents[1] / "data"

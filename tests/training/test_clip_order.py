@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldline_core.training.epoch_order import EpochOrder, mixed_key, permuted
+from worldline_core.training.clip_sampler import EpochOrder, mixed_key, permuted
 
 
 @given(count=st.integers(1, 700), key=st.integers(0, 2**64 - 1))

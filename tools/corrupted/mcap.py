@@ -26,7 +26,7 @@ from tools.corrupted.content import (
 )
 from tools.corrupted.labels import Kind, Label
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.data.mcap.writer import write_episode_mcap
+from worldline_core.data.mcap.exported import write_episode_mcap
 
 _BASES = 4
 _CHUNK = 0x06

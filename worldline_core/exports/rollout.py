@@ -16,7 +16,7 @@ from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.encodings import Encoding
-from worldline_core.data.mcap.writer import write_rollout_mcap
+from worldline_core.data.mcap.exported import write_rollout_mcap
 from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment

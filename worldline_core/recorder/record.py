@@ -245,7 +245,7 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     if job.defect is not None:
         recording = DEFECTS[job.defect](recording, np.random.default_rng((*job.entropy, 1)))
     if config.mcap:
-        from worldline_core.data.mcap.writer import write_episode_mcap
+        from worldline_core.data.mcap.exported import write_episode_mcap
 
         path = output / "mcap" / f"{job.episode_id}.mcap"
         write_episode_mcap(path, recording.episode, recording.frames, robot_masks=recording.robot_masks)

@@ -1,6 +1,7 @@
-"""The dataset card of an EpisodeSet: README.md (as the Hugging Face hub reads it), index.html, one picture per source.
+"""The dataset card of an EpisodeSet: README.md (as the Hugging Face hub reads it), index.html, one picture per source;
+and the page "Data" of a report: what was recorded, as the card says it, with a contact sheet.
 
-The page is the Markdown file's text made into HTML: what is said is written once, in `card.md`.
+The card's page is the Markdown file's text made into HTML: what is said is written once, in `card.md`.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from markupsafe import Markup
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.pages.charts import funnel_chart
-from worldline_core.pages.page import markdown, render, words
+from worldline_core.pages.page import Table, markdown, render, words
 from worldline_core.pictures.contact_sheet import contact_sheet
 from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.dataset_facts import (
     UNKNOWN,
     DatasetFacts,
@@ -27,7 +29,7 @@ from worldline_core.report.dataset_facts import (
     most_frequent,
     recorded_time,
 )
-from worldline_core.report.episode_sheet import episode_rows, some_of_each
+from worldline_core.report.episode_sheet import episode_rows, one_of_each, some_of_each
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.untrusted_text import cut, visible
 
@@ -239,3 +241,38 @@ def _write_pictures(facts: DatasetFacts, output: Path) -> list[tuple[str, str, i
             write_bytes_atomic(output / PICTURES / file, jpeg_bytes(sheet))
             written.append((name, file, len(rows)))
     return written
+
+
+def data_section(context: ReportContext) -> Section:
+    """Counts of the curated episodes (before filters) and pictures of some."""
+    folder = context.inputs.get("curate") or context.inputs.get("filter") or context.inputs.get("episodes")
+    if folder is None:
+        return Section("data", "Data", missing="no EpisodeSet was given (inputs curate or filter).")
+    facts = DatasetFacts.read(folder)
+    if not facts.rows:
+        return Section("data", "Data", missing="the EpisodeSet holds no episode.")
+    shown, unreadable = episode_rows(
+        EpisodeSet.open(folder), one_of_each(facts.rows, context.config.contact_sheet_rows)
+    )
+    alt = "Contact sheet of recorded episodes"
+    return context.section(
+        "data",
+        "Data",
+        facts.summary,
+        contents=card_parts(facts, ("contents",)),
+        scenes=scene_table(facts),
+        sources=card_parts(facts, ("sources", "duplicates") if facts.sources else ("duplicates",)),
+        sheet=context.picture("contact_sheet", contact_sheet(shown), alt=alt, photo=True) if shown else None,
+        unreadable=unreadable,
+    )
+
+
+def scene_table(facts: DatasetFacts) -> Table:
+    """Every scene with its robots and splits."""
+    body = []
+    for scene, _, episodes, recorded, *outcomes in facts.by_property(lambda row: row.scene):
+        own = [row for row in facts.rows if row.scene == scene]
+        robots, splits = sorted({row.embodiment for row in own}), sorted({words(row.split) for row in own})
+        body.append([scene, ", ".join(robots), ", ".join(splits), episodes, recorded, *outcomes])
+    headings = ("Scene", "Embodiments", "Split", "Episodes", "Recorded", "Success", "Failure", "Unknown")
+    return Table(headings, body, range(3, 8))

@@ -18,8 +18,14 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import REASONS, Curve, Finding
 from worldline_core.pages.page import render
-from worldline_core.pictures.clip_strip import KEPT_COLOUR, ClipStrip, clip_strip, reason_colour, stacked
-from worldline_core.pictures.contact_sheet import evenly_spaced
+from worldline_core.pictures.contact_sheet import (
+    KEPT_COLOUR,
+    ClipStrip,
+    clip_strip,
+    evenly_spaced,
+    reason_colour,
+    stacked,
+)
 from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
 from worldline_core.report.filters import KEPT, FilteredEpisode, numbers_text, read_outcomes
 from worldline_core.store.artifact_files import read_json

@@ -16,7 +16,7 @@ from worldline_core.progress import with_progress
 from worldline_core.report.actions import actions_section
 from worldline_core.report.context import ReportConfig, ReportContext
 from worldline_core.report.cost import cost_section
-from worldline_core.report.data import data_section
+from worldline_core.report.dataset_card import data_section
 from worldline_core.report.decisions import planning_section, policy_section
 from worldline_core.report.filters import filters_section
 from worldline_core.report.nightly import nights_section

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from worldline_core.actions.action_tracks import changed_tracks
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.actions.changed_controls import changed_tracks
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine

@@ -27,8 +27,7 @@ from worldline_core.errors import DataError, WorldLineError
 from worldline_core.pictures.labels import jpeg_bytes
 from worldline_core.policies.openpi import OpenpiPolicy
 from worldline_core.rollout.simulation import Simulation
-from worldline_core.serving.played_episode import save_played
-from worldline_core.serving.recorded_starts import RecordedStart
+from worldline_core.serving.recorded_starts import RecordedStart, save_played
 from worldline_core.serving.session_host import LARGEST_SEED, SessionHost, error_message
 from worldline_core.serving.teleoperation import ArmInput, Teleoperation, frame_marks
 
