@@ -10,8 +10,7 @@ from pathlib import Path
 
 from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
-from flows.plan_command import add_plan_command
-from flows.rehearsal import add_rehearse_command
+from flows.full_size_commands import add_plan_command, add_rehearse_command
 from flows.serve_commands import add_serve_commands
 from tasks.temporary_server import prepare_prefect
 from worldline_core.pipeline.steps import STEPS

@@ -19,7 +19,7 @@ from prefect.serializers import JSONSerializer
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
 from prefect.task_runners import ProcessPoolTaskRunner
 
-from tasks.command_line import log_to_stderr
+from tasks.command_line import log_to_stderr, run_task_command
 from tasks.shard_mapper import shard_mapper
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.source_paths import SourceFolder, parse_location
@@ -101,6 +101,10 @@ class ArtifactTask:
         ids = [state.state_details.task_run_id for state in after]
         runs: set[RunInput] = {TaskRunResult(id=run) for run in ids if run}  # pyright: ignore[reportUnhashable] - frozen
         return pool().submit(task, parameters, dependencies={"inputs": runs}), False, find
+
+    def main(self) -> None:
+        """Run the step alone, without a Prefect server: ``python -m tasks.<step>``."""
+        run_task_command(self.step.name)
 
     def _prepared(
         self,
