@@ -157,11 +157,7 @@ def _is_recorded(key: str, reference: ArtifactReference) -> bool:
 
 
 def _run_step(
-    step_name: str,
-    config: dict[str, Any],
-    inputs: dict[str, dict[str, Any]],
-    store_root: str,
-    runner: dict[str, Any],
+    step_name: str, config: dict[str, Any], inputs: dict[str, dict[str, Any]], store_root: str, runner: dict[str, Any]
 ) -> dict[str, Any]:
     """The body of every task: plain JSON in and out, so that any task runner can carry it."""
     if multiprocessing.parent_process() is not None:

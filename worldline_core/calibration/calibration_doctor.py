@@ -13,12 +13,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, Explanation
-from worldline_core.calibration.image_evidence import (
-    gripper_terms,
-    image_terms,
-    inversion_gain,
-    observable_views,
-)
+from worldline_core.calibration.image_evidence import gripper_terms, image_terms, inversion_gain, observable_views
 from worldline_core.calibration.measures import (
     camera_lags,
     conventions_to_try,

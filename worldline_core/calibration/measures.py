@@ -233,10 +233,7 @@ def image_lag(observation: Observation, recorded: Reading, view: str, config: Ca
 
 
 def notes_on(
-    observation: Observation,
-    recorded: Reading,
-    measures: tuple[ViewMeasures, ...],
-    config: CalibrationDoctorConfig,
+    observation: Observation, recorded: Reading, measures: tuple[ViewMeasures, ...], config: CalibrationDoctorConfig
 ) -> tuple[str, ...]:
     """What a person should know besides the verdict."""
     notes = []

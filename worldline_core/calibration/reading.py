@@ -10,12 +10,7 @@ import numpy as np
 
 from worldline_core.actions.robot_masks import robot_capsules
 from worldline_core.calibration.observation import CELL_PX, Observation
-from worldline_core.data.episodes.conventions import (
-    RecordedConventions,
-    apply_conventions,
-    arm_blocks,
-    image_frames,
-)
+from worldline_core.data.episodes.conventions import RecordedConventions, apply_conventions, arm_blocks, image_frames
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rotations import rotation_angle_deg

@@ -105,9 +105,7 @@ class DistributionMatchingConfig(StrictModel):
     """
 
     trainer: TrainerConfig = TrainerConfig(
-        steps=600,
-        log_every=30,
-        optimizer=OptimizerConfig(learning_rate=2e-5, betas=(0.0, 0.999), warmup_steps=12),
+        steps=600, log_every=30, optimizer=OptimizerConfig(learning_rate=2e-5, betas=(0.0, 0.999), warmup_steps=12)
     )
     fake_score_rate: float = Field(default=4.0, gt=0)
     real_score: Literal["stage2", "causal_teacher"] = "stage2"

@@ -128,11 +128,7 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
 
 
 def trajectory_shard(
-    number: int,
-    config: DistillConfig,
-    teacher: WorldModel,
-    loader: ClipLoader,
-    load: Callable[[int], Batch],
+    number: int, config: DistillConfig, teacher: WorldModel, loader: ClipLoader, load: Callable[[int], Batch]
 ) -> tuple[Sequence[Clip], dict[str, Tensor]]:
     """Clips and tensors of one shard of the store: a function of the seed and the shard's number.
 

@@ -103,9 +103,7 @@ def _blueprint(views: Sequence[str], curves: Sequence[str], fps: float) -> rrb.B
     )
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(*pictures, rrb.TextDocumentView(origin="verdict", name="verdict")),
-            series,
-            row_shares=[2, 3],
+            rrb.Horizontal(*pictures, rrb.TextDocumentView(origin="verdict", name="verdict")), series, row_shares=[2, 3]
         ),
         rrb.TimePanel(timeline="frame", fps=fps, state="collapsed"),
         collapse_panels=True,

@@ -32,11 +32,7 @@ class SideBySide:
 
 
 def side_by_side(
-    columns: Mapping[str, Frames],
-    *,
-    tile_height: int = 256,
-    upscale: Upscale = "lanczos",
-    labels: bool = True,
+    columns: Mapping[str, Frames], *, tile_height: int = 256, upscale: Upscale = "lanczos", labels: bool = True
 ) -> Iterator[NDArray[np.uint8]]:
     """Pictures (H, W, 3) of labelled columns of frames `n h w 3`, one after the other.
 
@@ -73,12 +69,7 @@ def side_by_side(
 
 
 def write_side_by_side(
-    path: Path,
-    columns: Mapping[str, Frames],
-    fps: float,
-    *,
-    tile_height: int = 256,
-    upscale: Upscale = "lanczos",
+    path: Path, columns: Mapping[str, Frames], fps: float, *, tile_height: int = 256, upscale: Upscale = "lanczos"
 ) -> SideBySide:
     """Write labelled columns as `path` (mp4) with a poster beside it."""
     count = min(map(len, columns.values()), default=0)

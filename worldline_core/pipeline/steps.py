@@ -320,11 +320,7 @@ def get_step(name: str) -> Step:
 
 
 def run_step(
-    store: ArtifactStore,
-    name: str,
-    config: StrictModel,
-    inputs: Mapping[str, Path],
-    mapper: ShardMapper | None = None,
+    store: ArtifactStore, name: str, config: StrictModel, inputs: Mapping[str, Path], mapper: ShardMapper | None = None
 ) -> Artifact:
     """Run one step on the store (or find its finished artifact).
 
@@ -341,11 +337,4 @@ def run_step(
         with same_threads(output):
             return function(config, inputs, output, **options)
 
-    return store.run(
-        step.name,
-        step.version,
-        work,
-        config,
-        inputs,
-        distributed=step.distributed,
-    )
+    return store.run(step.name, step.version, work, config, inputs, distributed=step.distributed)

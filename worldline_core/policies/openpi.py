@@ -38,12 +38,7 @@ class OpenpiPolicy(MessageSocket):
     """
 
     def __init__(
-        self,
-        url: str,
-        *,
-        api_key: str | None = None,
-        deadline_s: float = 30.0,
-        max_bytes: int = MAX_MESSAGE_BYTES,
+        self, url: str, *, api_key: str | None = None, deadline_s: float = 30.0, max_bytes: int = MAX_MESSAGE_BYTES
     ) -> None:
         headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
         super().__init__(url, headers=headers, deadline_s=deadline_s, max_bytes=max_bytes)

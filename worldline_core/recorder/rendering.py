@@ -188,10 +188,7 @@ class SceneRenderer:
         self.scene.model.cam_quat[number] = quat
 
     def render(
-        self,
-        qpos: np.ndarray,
-        paint: Callable[[np.ndarray], None],
-        labels: np.ndarray,
+        self, qpos: np.ndarray, paint: Callable[[np.ndarray], None], labels: np.ndarray
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], dict[str, CameraTrack]]:
         """What the cameras see of positions (N, nq), per view.
 

@@ -24,14 +24,7 @@ from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoi
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
 from worldline_core.recorder.scene_model import FRAME_RATE, SUBSTEPS, SceneModel
-from worldline_core.recorder.things import (
-    Layout,
-    apply_layout,
-    build_scene,
-    light_buttons,
-    sample_layout,
-    thing_labels,
-)
+from worldline_core.recorder.things import Layout, apply_layout, build_scene, light_buttons, sample_layout, thing_labels
 
 # Largest accepted distance between a planned tool position and what the arm can reach.
 REACH_TOLERANCE_M = 0.012
@@ -289,12 +282,7 @@ class EpisodeRecorder:
         Raises: DataError when no reachable plan is found in 50 draws.
         """
         layout, motion, scene_id, random = self.draw(
-            episode_id=episode_id,
-            split=split,
-            family=family,
-            entropy=entropy,
-            num_frames=num_frames,
-            policy=policy,
+            episode_id=episode_id, split=split, family=family, entropy=entropy, num_frames=num_frames, policy=policy
         )
         return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
 

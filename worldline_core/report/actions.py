@@ -53,13 +53,7 @@ def actions_section(context: ReportContext) -> Section:
     )
     channels = channels_picture(context, episodes, tracks, chosen[0]) if chosen else None
     return context.section(
-        "actions",
-        TITLE,
-        lead,
-        overlays=overlays,
-        unreadable=unreadable,
-        channels=channels,
-        counts=sample_table(folder),
+        "actions", TITLE, lead, overlays=overlays, unreadable=unreadable, channels=channels, counts=sample_table(folder)
     )
 
 

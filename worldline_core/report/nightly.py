@@ -52,10 +52,7 @@ class Night:
 
 
 def compare_with_history(
-    scores: Mapping[str, Path],
-    history: Path,
-    night: str | None = None,
-    artifacts: Mapping[str, Path] | None = None,
+    scores: Mapping[str, Path], history: Path, night: str | None = None, artifacts: Mapping[str, Path] | None = None
 ) -> NightlyComparison:
     """Record a night, and write `comparison.json`, pictures and pages with trends into the history's folder.
 

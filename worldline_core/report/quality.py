@@ -85,12 +85,7 @@ def group_parts(context: ReportContext, scores: VideoScores, group: str) -> dict
 
 
 def metric_table(
-    scores: VideoScores,
-    group: str,
-    view: str,
-    metrics: Sequence[str] = ALWAYS,
-    suffix: str = "",
-    title: str = "",
+    scores: VideoScores, group: str, view: str, metrics: Sequence[str] = ALWAYS, suffix: str = "", title: str = ""
 ) -> Table | None:
     """Methods in rows, metrics of one view in columns (``name`` or ``name[variant]``); the best of each column stands out."""
     methods = scores.methods(group)

@@ -232,11 +232,7 @@ def _observed(world: World, episodes: EpisodeSet, batch: Sequence[Prediction]) -
 
 
 def _predicted(
-    config: RolloutConfig,
-    world: World,
-    episodes: EpisodeSet,
-    tracks: ActionTracks,
-    batch: Sequence[Prediction],
+    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks, batch: Sequence[Prediction]
 ) -> Iterator[Frames]:
     """Frames of a batch, piece by piece."""
     controls = [tracks.tracks(item.controls_of) for item in batch]
@@ -254,11 +250,7 @@ def _predicted(
 
 
 def _write(
-    batch: Sequence[Prediction],
-    pieces: Iterator[Frames],
-    writer: RolloutSetWriter,
-    size: tuple[int, int],
-    device: str,
+    batch: Sequence[Prediction], pieces: Iterator[Frames], writer: RolloutSetWriter, size: tuple[int, int], device: str
 ) -> float:
     """Write a batch as it is predicted; wall seconds of predicting (writing is left out)."""
     seconds, done = 0.0, 0

@@ -21,13 +21,7 @@ class NoAnswer(Exception):  # noqa: N818
 
 
 def exchange(
-    url: str,
-    body: bytes | None,
-    *,
-    headers: Mapping[str, str],
-    timeout_s: float,
-    max_bytes: int,
-    proxies: bool = True,
+    url: str, body: bytes | None, *, headers: Mapping[str, str], timeout_s: float, max_bytes: int, proxies: bool = True
 ) -> tuple[int, bytes]:
     """Status and body of the answer to a POST (without ``body``: a GET), of which little more than ``max_bytes`` is read.
 

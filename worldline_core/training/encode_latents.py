@@ -31,15 +31,7 @@ from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.latent_store import (
-    DESCRIPTION,
-    INDEX,
-    LatentRow,
-    Layout,
-    clip_key,
-    group_key,
-    single_key,
-)
+from worldline_core.training.latent_store import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
 
 _SPAN = 2 * TEMPORAL_FACTOR + 1
 

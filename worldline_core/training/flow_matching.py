@@ -199,12 +199,7 @@ class FlowMatchingObjective:
         losses: dict[str, float] = {}
         for suffix, maps in conditions.items():
             velocity = self.model(
-                noisy,
-                sigma,
-                action_maps=maps,
-                text=self._text(batch),
-                views=batch.views,
-                fps=batch.fps,
+                noisy, sigma, action_maps=maps, text=self._text(batch), views=batch.views, fps=batch.fps
             ).velocity
             for name, kind in (("loss", "velocity"), ("sample_error", "sample")):
                 weighting = LossWeighting.model_validate({"kind": kind})

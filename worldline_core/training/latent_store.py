@@ -113,12 +113,7 @@ class LatentStore(ClipSource):
         return read.to(device, copy=True)
 
     def clip(
-        self,
-        episode_id: str,
-        start_frame: int,
-        num_frames: int,
-        stride: int = 1,
-        views: tuple[str, ...] | None = None,
+        self, episode_id: str, start_frame: int, num_frames: int, stride: int = 1, views: tuple[str, ...] | None = None
     ) -> Float[Tensor, "v c t h w"]:
         """Latents (float32) of the clip of ``num_frames`` frames at ``start_frame``, ``start_frame + stride``, ...
 

@@ -73,15 +73,7 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
             model.action_encoder = new_action_branch(model.config)
         return model, info
 
-    stage = Stage.open(
-        config,
-        inputs,
-        output,
-        number=2,
-        title="stage II",
-        load_model=load_model,
-        tracks=tracks,
-    )
+    stage = Stage.open(config, inputs, output, number=2, title="stage II", load_model=load_model, tracks=tracks)
     model = stage.model
     contract = ActionContract.of_these_maps(
         controls=tracks.tracks(stage.training_rows[0].episode_id).controls,

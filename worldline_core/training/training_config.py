@@ -222,10 +222,7 @@ class TeacherConfig(StrictModel):
 
     shape: SmallTeacherShape = SmallTeacherShape()
     trainer: TrainerConfig = TrainerConfig(
-        steps=600,
-        batch_size=12,
-        ema_decay=0.99,
-        optimizer=OptimizerConfig(learning_rate=1e-3, decay_steps=200),
+        steps=600, batch_size=12, ema_decay=0.99, optimizer=OptimizerConfig(learning_rate=1e-3, decay_steps=200)
     )
     splits: tuple[str, ...] = ("train",)
     max_episodes: int = Field(default=120, ge=2)

@@ -66,13 +66,7 @@ class SmallVideoTeacher(nn.Module):
         self.mask_token = nn.Parameter(torch.zeros(width))
         self.blocks = nn.ModuleList(
             nn.TransformerEncoderLayer(
-                width,
-                shape.num_heads,
-                4 * width,
-                dropout=0.0,
-                activation="gelu",
-                batch_first=True,
-                norm_first=True,
+                width, shape.num_heads, 4 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
             )
             for _ in range(shape.num_layers)
         )

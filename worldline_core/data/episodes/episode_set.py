@@ -67,11 +67,7 @@ class EpisodeSet:
         return read_quarantine(self.root)
 
     def select(
-        self,
-        *,
-        split: str | Sequence[str] | None = None,
-        embodiment: str | None = None,
-        stage2_ok: bool | None = None,
+        self, *, split: str | Sequence[str] | None = None, embodiment: str | None = None, stage2_ok: bool | None = None
     ) -> list[int]:
         """Positions of the rows that match every given value."""
         splits = None if split is None else {split} if isinstance(split, str) else set(split)

@@ -13,14 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
-from worldline_core.data.episodes.episode import (
-    TRAINING_SPLITS,
-    UNDESCRIBED,
-    Episode,
-    Outcome,
-    Split,
-    TaskFamily,
-)
+from worldline_core.data.episodes.episode import TRAINING_SPLITS, UNDESCRIBED, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.rejection import RejectedInputError, noted
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip

@@ -7,13 +7,7 @@ import struct
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.rejection import (
-    MAX_PIXELS,
-    RejectedInputError,
-    check_image_size,
-    too_large,
-    unreadable,
-)
+from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -93,8 +93,7 @@ class Timing:
             )
         clocks = {
             stream.topic: Clock.of(
-                np.array(stream.stamps_ns, np.int64) + config.offset_ns(stream.topic),
-                np.array(stream.log_ns, np.int64),
+                np.array(stream.stamps_ns, np.int64) + config.offset_ns(stream.topic), np.array(stream.log_ns, np.int64)
             )
             for stream in headed
             if stream.stamped

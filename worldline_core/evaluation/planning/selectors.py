@@ -19,16 +19,7 @@ from worldline_core.evaluation.policy.evidence import route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure, score
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
-from worldline_core.evaluation.vlm import (
-    PROMPTS,
-    Answer,
-    AnswerText,
-    Part,
-    Text,
-    Video,
-    VisionLanguageModel,
-    ask,
-)
+from worldline_core.evaluation.vlm import PROMPTS, Answer, AnswerText, Part, Text, Video, VisionLanguageModel, ask
 
 _WHOLE, _LATE = 10, 6
 _LATE_FROM = 0.6

@@ -26,13 +26,7 @@ from worldline_core.evaluation.policy.agreement import policy_agreement, require
 from worldline_core.evaluation.policy.judge import Judge, VLMJudge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.novelty import KnownSetting
-from worldline_core.evaluation.policy.saved_trust import (
-    JudgedBy,
-    SavedMethod,
-    SavedTrust,
-    content_digest,
-    predicted_by,
-)
+from worldline_core.evaluation.policy.saved_trust import JudgedBy, SavedMethod, SavedTrust, content_digest, predicted_by
 from worldline_core.evaluation.policy.trust import TRUST_COLUMNS, calibrated, trust_verdicts
 from worldline_core.evaluation.recordings import (
     TRUE_METHOD,

@@ -25,13 +25,7 @@ class Sam3Segmenter:
     follows = True
     description = "SAM 3 video tracker, started from the projected tool centres of the first frame"
 
-    def __init__(
-        self,
-        model: Any,
-        processor: Any,
-        *,
-        device: torch.device | str = "cpu",
-    ) -> None:
+    def __init__(self, model: Any, processor: Any, *, device: torch.device | str = "cpu") -> None:
         self.device = torch.device(device)
         self.dtype = torch.bfloat16 if self.device.type == "cuda" else torch.float32
         self.model = model.to(self.device, self.dtype).eval()
