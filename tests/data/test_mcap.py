@@ -49,7 +49,7 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make, encoding:
     read = read_exported_episode(McapFile(tmp_path / "a.mcap"))
     for view, images in frames.items():
         assert np.array_equal(read.frames(view), images)  # png is exact
-        assert np.array_equal(read.robot_masks(view), masks[view])
+        assert np.array_equal(read.robot_masks(view), masks[view])  # pyright: ignore[reportArgumentType]
         assert np.abs(read.episode.cameras[view].K - episode.cameras[view].K).max() < 1e-9
         assert read.episode.cameras[view].moving == episode.cameras[view].moving
         assert np.abs(read.episode.cameras[view].T_base_camera - episode.cameras[view].T_base_camera).max() < 1e-9
@@ -58,7 +58,7 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, sample: Make, encoding:
     assert np.array_equal(read.episode.action, episode.action)
     assert read.episode.T_base_ee is not None
     assert np.abs(read.episode.T_base_ee - episode.T_base_ee).max() < 1e-9
-    assert np.array_equal(read.episode.gripper, gripper)
+    assert np.array_equal(read.episode.gripper, gripper)  # pyright: ignore[reportArgumentType]
     for name in ("episode_id", "scene", "instruction", "outcome", "split", "fps", "state_names", "conventions", "bank"):
         assert getattr(read.episode, name) == getattr(episode, name)
 
@@ -69,7 +69,7 @@ def test_jpeg_of_rollouts_stays_within_its_stated_tolerance(tmp_path: Path, samp
     with (tmp_path / "a.mcap").open("rb") as stream:
         messages = [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages(["/head/image"])]
     encoded = [np.frombuffer(base64.b64decode(message["data"]), np.uint8) for message in messages]
-    read = np.stack([cv2.cvtColor(cv2.imdecode(image, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for image in encoded])
+    read = np.stack([cv2.cvtColor(cv2.imdecode(image, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for image in encoded])  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert read.shape == frames.shape
     assert 0 < np.abs(read.astype(int) - frames).mean() < 4
 
@@ -117,7 +117,7 @@ def test_ros_2_decoders_read_the_export(tmp_path: Path, sample: Make) -> None:
         assert (image.format, image.header.frame_id) == ("png", "head_camera")
         assert image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec == pytest.approx(episode.timestamps[number])
         decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
-        assert np.array_equal(decoded[..., ::-1], frames["head"][number])
+        assert np.array_equal(decoded[..., ::-1], frames["head"][number])  # pyright: ignore[reportOptionalSubscript]
     (info,), (static,) = found["/head/calibration"], found["/tf_static"]
     assert (info.height, info.width) == frames["head"].shape[1:3]
     assert np.array_equal(np.reshape(info.k, (3, 3)), fixed.K)
@@ -143,11 +143,11 @@ def test_protobuf_decoders_read_the_export(tmp_path: Path, sample: Make) -> None
             assert published.FromString(message.data).SerializeToString() == message.data
             found.setdefault(channel.topic, []).append(decoded)
     assert [joint.name for joint in found["/joint_states"][3].joints] == list(episode.state_names)
-    assert np.array_equal(np.float32([j.position for j in found["/joint_states"][3].joints]), episode.state[3])
+    assert np.array_equal(np.float32([j.position for j in found["/joint_states"][3].joints]), episode.state[3])  # pyright: ignore[reportArgumentType]
     assert np.array_equal(np.reshape(found["/head/calibration"][0].K, (3, 3)), episode.cameras["head"].K)
     assert found["/head/image"][2].timestamp.ToNanoseconds() == round(episode.timestamps[2] * 1e9)
     decoded = cv2.imdecode(np.frombuffer(found["/head/image"][2].data, np.uint8), cv2.IMREAD_COLOR)
-    assert np.array_equal(decoded[..., ::-1], frames["head"][2])
+    assert np.array_equal(decoded[..., ::-1], frames["head"][2])  # pyright: ignore[reportOptionalSubscript]
     (tool,) = [each for each in found["/tf"] if each.child_frame_id == "tool_1" and each.timestamp.ToNanoseconds() == 0]
     assert np.allclose([tool.translation.x, tool.translation.y, tool.translation.z], tools()[0, 1, :3, 3])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.evaluation.conftest import make_film
+from tests.evaluation.conftest import make_film  # pyright: ignore[reportMissingImports]
 from worldline_core.evaluation.policy.evidence import establishes_success, route
 from worldline_core.evaluation.policy.measured_judge import facts, measure, score
 from worldline_core.evaluation.policy.measurements import (

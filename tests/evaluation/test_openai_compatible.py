@@ -32,7 +32,7 @@ class Server:
                 self.end_headers()
                 self.wfile.write(reply if isinstance(reply, bytes) else json.dumps(reply).encode())
 
-            def log_message(self, *args):
+            def log_message(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
                 pass
 
         self.server = HTTPServer(("127.0.0.1", 0), Handler)
@@ -68,7 +68,7 @@ def test_sends_text_and_frames_and_reads_the_answer(server, monkeypatch):
     text, image = body["messages"][0]["content"]
     assert text == {"type": "text", "text": "what?"}
     png = base64.b64decode(image["image_url"]["url"].removeprefix("data:image/png;base64,"))
-    assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)
+    assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)  # pyright: ignore[reportOptionalSubscript]
     assert server.headers[0]["Authorization"] == "Bearer secret"
 
 
@@ -100,7 +100,7 @@ def test_no_answer_is_null_evidence_and_counted_until_the_server_is_given_up(ser
     server.replies = [(400, {"error": "content"}), (500, {}), good]
     found = [judge.extract(_trajectory(), "grasp", (0, 19), 360) for _ in range(3)]
     assert [answer.well_formed for answer in found] == [False, False, True]
-    assert found[0].evidence.target_held_for_two_late_steps is None
+    assert found[0].evidence.target_held_for_two_late_steps is None  # pyright: ignore[reportAttributeAccessIssue]
     server.replies = [(500, {})] * 3
     judge.reconcile(_trajectory(), "", "", "")
     judge.inspect_motion(_trajectory(), (0, 19), "")
@@ -127,14 +127,14 @@ def test_configuration_names_what_is_missing(tmp_path):
 
 def _trajectory():
     frames = {view: np.zeros((20, 8, 12, 3), np.uint8) for view in ("head", "left_wrist", "right_wrist")}
-    return Trajectory("lift the red cube", frames, 8.0)
+    return Trajectory("lift the red cube", frames, 8.0)  # pyright: ignore[reportArgumentType]
 
 
 def test_judge_asks_the_papers_questions(server):
     server.replies = [_reply('{"target_held_for_two_late_steps": true, "wrong_object_or_drop": false}')] * 2
     judge = VLMJudge(_model(server))
     grasp = judge.extract(_trajectory(), "grasp", (0, 10, 19), 360)
-    assert grasp.evidence.target_held_for_two_late_steps is True
+    assert grasp.evidence.target_held_for_two_late_steps is True  # pyright: ignore[reportAttributeAccessIssue]
     lift = judge.extract(_trajectory(), "lift", (0, 10, 19), 360)
     assert not lift.well_formed  # a grasp's schema is no lift's evidence
     images = [

@@ -77,7 +77,7 @@ def trajectory() -> Trajectory:
     frames = {
         view: random.integers(0, 256, (20, 48, 64, 3), dtype=np.uint8) for view in ("head", "left_wrist", "right_wrist")
     }
-    return Trajectory("lift the red cube", frames, 8.0)
+    return Trajectory("lift the red cube", frames, 8.0)  # pyright: ignore[reportArgumentType]
 
 
 def test_generation_is_greedy_bounded_and_sees_every_picture(opened: tuple[Qwen3VLModel, Calls]) -> None:

@@ -79,7 +79,7 @@ def annex_b(
     count: int, *, codec: str = "libx264", keys_every: int = 15, options: dict[str, str] | None = None
 ) -> list[bytes]:
     """One message a frame, without B-frames, as Foxglove wants it."""
-    encoder = av.CodecContext.create(codec, "w")
+    encoder: Any = av.CodecContext.create(codec, "w")
     encoder.width, encoder.height, encoder.pix_fmt = 64, 48, "yuv420p"
     encoder.framerate, encoder.time_base = 30, Fraction(1, 30)
     encoder.options = {"bf": "0", "g": str(keys_every), "crf": "10", "tune": "zerolatency", **(options or {})}
@@ -111,7 +111,7 @@ def write(
         message.timestamp.ParseFromString(at(seconds)[1])
         return message
 
-    def pose_of(seconds: float) -> dict[str, Any]:
+    def pose_of(seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
         place, quaternion = toy.wrist(seconds)
         return dict(zip("xyz", place, strict=True)), dict(zip("xyzw", quaternion, strict=True))
 
