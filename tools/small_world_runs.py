@@ -7,12 +7,13 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.distill_config import CYCLE
+from worldline_core.model.contracts import CAUSAL_SIGMAS
 from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
 from worldline_core.training.training_config import OptimizerConfig, SavingConfig, SigmaSampling, TrainerConfig
 
@@ -120,6 +121,8 @@ class ForcingSettings(Timed):
 
     ``long_every``: every so many batches are a third as many cuts of 65 frames of long recordings, so that the model meets
     a window that moves; 0 does without them.
+    ``sigmas``: nodes of the sampler, saved with the model; (1, 0) is one step a block.
+    ``history``: what a block sees before it, the recorded blocks or the model's own, as in a rollout.
     """
 
     batch: int = Field(default=192, ge=3)
@@ -128,7 +131,17 @@ class ForcingSettings(Timed):
     things: tuple[float, float] = (0.0, 0.0)
     history_noise: float = Field(default=0.0, ge=0)
     long_every: int = Field(default=4, ge=0)
+    sigmas: tuple[float, ...] = CAUSAL_SIGMAS
+    history: Literal["recorded", "generated"] = "recorded"
     compile: bool = False
+
+    @model_validator(mode="after")
+    def _noise_on_recorded_blocks(self) -> Self:
+        if self.history == "generated" and self.history_noise:
+            raise ValueError(
+                "history_noise: the model's own blocks are not exact anyway; with history: generated it is 0"
+            )
+        return self
 
 
 class RegressionSettings(Timed):

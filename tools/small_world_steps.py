@@ -35,7 +35,7 @@ from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.errors import ConfigError
 from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
-from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, TrainedClips
+from worldline_core.model.contracts import CAUSAL_SIGMAS, NATIVE_VECTORS, ActionContract, TrainedClips
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
@@ -215,13 +215,14 @@ def controls_of(maps: Tensor, native: Tensor, views: Sequence[str], native_size:
     return repeat(native[:, :native_size], "b c t -> b v c t 1 1", v=len(views)).float()
 
 
-def distillation(seed: int) -> DistillConfig:
-    """Stage III as the shipped model had it: no perceptual term, plain few-step trajectories, recorded targets."""
+def distillation(seed: int, sigmas: tuple[float, ...] = CAUSAL_SIGMAS) -> DistillConfig:
+    """Stage III of the small world: no perceptual term, plain few-step trajectories, recorded targets."""
     without_lpips = {"auxiliary": {"lpips": 0.0}}
     return DistillConfig.model_validate(
         {
             "clips": {"lengths": [SHORT, 1 + 16 * LONG_BLOCKS]},
-            "trajectory_regression": {**without_lpips, "trajectories": {"substeps": [1, 1, 1, 1]}},
+            "sigmas": sigmas,
+            "trajectory_regression": {**without_lpips, "trajectories": {"substeps": [1] * (len(sigmas) - 1)}},
             "distribution_matching": {
                 **without_lpips,
                 "sigma_range": [0.1, 0.98],
@@ -265,7 +266,10 @@ def recorded_batch(
 
 
 class ForcingObjective(CausalObjective[Batch]):
-    """Teacher forcing on blocks disturbed by noise of a level of its own for each clip: a rollout's are not exact."""
+    """Teacher forcing where the blocks before are not exact, as in a rollout.
+
+    They are disturbed by noise of a level of its own for each clip, or what the model itself makes of them.
+    """
 
     def __init__(self, model: WorldModel, config: DistillConfig, settings: ForcingSettings) -> None:
         super().__init__(model, config)
@@ -275,13 +279,20 @@ class ForcingObjective(CausalObjective[Batch]):
         """Teacher-forcing loss of one batch."""
         latents, device = batch.latents, batch.latents.device
         disturbance = torch.randn(latents.shape, generator=generator, device=device)
-        level = torch.rand((len(latents), 1, 1, 1, 1, 1), generator=generator, device=device)
-        disturbance[..., :1, :, :] = 0
+        if self.settings.history == "generated":
+            size = self.spec.block_size  # the last block is nobody's history
+            maps, noise = (value[..., :-size, :, :] for value in (maps_of(batch), disturbance))
+            generated = self.rollout(batch, maps, noise, self.spec.steps - 1, with_gradient=False)
+            history = torch.cat((generated.to(latents), latents[..., -size:, :, :]), dim=3)
+        else:
+            level = torch.rand((len(latents), 1, 1, 1, 1, 1), generator=generator, device=device)
+            disturbance[..., :1, :, :] = 0
+            history = latents + self.settings.history_noise * level * disturbance
         loss = teacher_forcing_loss(
             self.model,
             latents,
             maps_of(batch),
-            history=latents + self.settings.history_noise * level * disturbance,
+            history=history,
             views=batch.views,
             spec=self.spec,
             sampling=self.settings.sigma,
@@ -297,8 +308,12 @@ def causal_step(start: Start, settings: ForcingSettings | RegressionSettings | M
 
     Raises: ConfigError for a model of other views or controls than the three views and action maps.
     """
-    memory, config = start.memory, distillation(start.seed)
+    memory = start.memory
     model, info = start.loaded(start.parent, "stage2", "causal")
+    if isinstance(settings, ForcingSettings):
+        config = distillation(start.seed, settings.sigmas)
+    else:
+        config = distillation(start.seed, CAUSAL_SIGMAS if info.causal is None else info.causal.sigmas)
     if info.views != VIEWS or info.config.native_size is not None:
         raise ConfigError(
             "The causal model takes maps and all views", where=start.parent, expected=VIEWS, got=info.views

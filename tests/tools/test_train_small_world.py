@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,16 +21,19 @@ from tools import small_world_steps
 from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, Recorded, plan_files, record_file
 from tools.small_world_measures import Measuring, Predictor, Shown, gradient_energy, judged
 from tools.small_world_memory import Episodes, KnownRelations, Memory, joined, videos
-from tools.small_world_runs import Plan
-from tools.small_world_steps import controls_of, object_weights
+from tools.small_world_runs import ForcingSettings, Plan
+from tools.small_world_steps import Start, controls_of, object_weights, open_step
 from tools.small_world_table import Spread, compared, markdown
 from tools.train_small_world import MODELS, Training
 from worldline_core.config import CONFIG_ROOT, load_config
+from worldline_core.distillation.causal_objective import CausalObjective, maps_of
 from worldline_core.errors import ConfigError, DataError, StoppedError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
 from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.world_model import WorldModel
 from worldline_core.recorder.bodies import BODIES
+from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.relational import TeacherRelations
 from worldline_core.training.training_config import RelationalConfig
@@ -132,6 +136,10 @@ def test_the_shipped_model_predicts_what_the_tool_records(tmp_path: Path) -> Non
             r"histroy_noise: unknown key; did you mean 'history_noise'",
         ),
         ({"stage2": {"steps": 1, "seconds": 1}}, r"runs\.one\.stage2: .*give seconds or steps"),
+        (
+            {"teacher_forcing": {"steps": 1, "history": "generated", "history_noise": 0.2}},
+            r"runs\.one\.teacher_forcing: .*with history: generated it is 0",
+        ),
         ({"stage2": {"steps": 1, "views": ["left_wrist"]}}, r"runs\.one\.stage2: .*the head view among them"),
     ],
 )
@@ -145,7 +153,14 @@ def test_a_wrong_key_of_the_plan_is_refused_by_its_name(
 
 
 @pytest.mark.parametrize(
-    "name", ["small_world", "small_world_directions", "small_world_distillation", "small_world_continued"]
+    "name",
+    [
+        "small_world",
+        "small_world_directions",
+        "small_world_distillation",
+        "small_world_continued",
+        "small_world_one_step",
+    ],
 )
 def test_the_plans_are_ones_that_the_tool_reads(name: str) -> None:
     plan = load_config(Plan, path=SHIPPED / f"{name}.yaml")
@@ -363,6 +378,36 @@ CAUSAL = {
     "trajectory_regression": {"steps": 2, "batch": 2, "batches": 2, "clips": 3, "long_every": 2},
     "distribution_matching": {"steps": 4, "batch": 2},
 }
+
+
+def test_a_block_sees_what_the_model_itself_makes_of_the_blocks_before(
+    measuring: Measuring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, Any] = {}
+
+    def loss(model: WorldModel, latents: Tensor, maps: Tensor, **given: Any) -> Tensor:
+        seen.update(given)
+        return latents.sum()
+
+    monkeypatch.setattr(small_world_steps, "teacher_forcing_loss", loss)
+    settings = ForcingSettings(steps=1, batch=3, sigmas=(1.0, 0.0), history="generated", long_every=1)
+    start = Start(measuring.memory, 0, plan_of().model, MODELS / "causal", None)
+    step = open_step(start, settings)
+    batch = step.load(0)
+    assert isinstance(batch, Batch)
+    step.objective.loss(batch, torch.Generator().manual_seed(5), 0)
+    assert step.saved["causal"].sigmas == (1.0, 0.0)
+    shown, recorded = seen["history"], batch.latents
+    assert shown.shape == recorded.shape == (1, 3, 32, 17, 8, 12)
+    assert not shown.requires_grad
+    # The first two blocks are those of a rollout of them alone.
+    noise = torch.randn(recorded.shape, generator=torch.Generator().manual_seed(5))
+    alone = Batch(batch.clips, batch.views, recorded[:, :, :, :9])
+    maps = maps_of(batch)[:, :, :, :9]
+    assert isinstance(step.objective, CausalObjective)
+    rolled = step.objective.rollout(alone, maps, noise[:, :, :, :9], 0, with_gradient=False)
+    torch.testing.assert_close(shown[:, :, :, :9], rolled)
+    assert (shown[:, :, :, 9:13] - recorded[:, :, :, 9:13]).abs().mean() > 0.01
 
 
 @pytest.mark.slow
