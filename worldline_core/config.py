@@ -61,7 +61,10 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
 
 
 def _read(text: str | IO[str]) -> Any:
-    """A YAML value. Raises: yaml.YAMLError for whatever is no YAML."""
+    """A YAML value.
+
+    Raises: yaml.YAMLError for whatever is no YAML.
+    """
     try:
         # _StrictLoader derives from SafeLoader: no object construction.
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506
@@ -130,7 +133,11 @@ def preset_names() -> list[str]:
 
 
 def preset_path(name: str) -> Path:
-    """The file of a preset. Raises ConfigError: there is no preset of that name; the message lists those there are."""
+    """The file of a preset.
+
+    Raises:
+        ConfigError: there is no preset of that name; the message lists those there are.
+    """
     if name not in preset_names():
         close = difflib.get_close_matches(name, preset_names(), n=1)
         raise ConfigError(

@@ -149,7 +149,11 @@ def episodes_of_config(path: Path, overrides: Sequence[str]) -> tuple[list[Liste
 
 
 def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
-    """The episodes of an EpisodeSet. Raises DataError: the folder holds no readable index."""
+    """The episodes of an EpisodeSet.
+
+    Raises:
+        DataError: the folder holds no readable index.
+    """
     episodes = EpisodeSet.open(folder)
 
     def load(position: int) -> LoadedEpisode:
@@ -163,7 +167,11 @@ def episodes_of_artifact(folder: Path) -> list[ListedEpisode]:
 
 
 def chosen_episodes(listed: Sequence[ListedEpisode], wanted: Sequence[str]) -> list[ListedEpisode]:
-    """The episodes with these ids; all of them when none is named. Raises DataError: an id is not there."""
+    """The episodes with these ids; all of them when none is named.
+
+    Raises:
+        DataError: an id is not there.
+    """
     known = {item.episode_id for item in listed}
     if unknown := set(wanted) - known:
         raise DataError(

@@ -48,7 +48,11 @@ def with_observed_frame(
 
 
 def maps_of(batch: Batch) -> Float[Tensor, "b v a t h w"]:
-    """Action maps of a batch. Raises ConfigError: there are none."""
+    """Action maps of a batch.
+
+    Raises:
+        ConfigError: there are none.
+    """
     if batch.action_maps is None:
         raise ConfigError("Distillation needs action maps", next_step="give the action tracks to the clip loader")
     return batch.action_maps

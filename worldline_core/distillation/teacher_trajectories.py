@@ -116,7 +116,11 @@ def teacher_trajectories(
 
 
 def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str]) -> Float[Tensor, "b v t h w"]:
-    """Robot masks of some clips from their action tracks. Raises ConfigError: the loader has no action tracks."""
+    """Robot masks of some clips from their action tracks.
+
+    Raises:
+        ConfigError: the loader has no action tracks.
+    """
     if loader.tracks is None:
         raise ConfigError("Robot masks come from action tracks", next_step="give the tracks to the clip loader")
     cut = [loader.tracks.tracks(clip.episode_id).clip(list(clip.frames)) for clip in clips]

@@ -95,7 +95,11 @@ class TrajectoryStore:
 
     @classmethod
     def open(cls, folder: Path) -> TrajectoryStore:
-        """Open a finished folder. Raises ArtifactError: it has no index, or a shard is missing or damaged."""
+        """Open a finished folder.
+
+        Raises:
+            ArtifactError: it has no index, or a shard is missing or damaged.
+        """
         if not (folder / INDEX).is_file():
             raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
         shards = read_json(folder / INDEX).get("shards")

@@ -219,7 +219,10 @@ def robot_spaces(
 
 
 def checked_commands(actions: Any, shape: tuple[int, ...] | None, robot: Embodiment) -> np.ndarray:
-    """Commands of one step as float64. Raises: DataError: they have another shape or are not finite."""
+    """Commands of one step as float64.
+
+    Raises: DataError: they have another shape or are not finite.
+    """
     try:
         given = np.asarray(actions)
     except ValueError:  # rows of different lengths

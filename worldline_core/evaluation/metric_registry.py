@@ -146,7 +146,10 @@ def metric_of(name: str) -> Metric | None:
 
 
 def requested(names: tuple[str, ...]) -> dict[str, Metric]:
-    """The entries of metrics that are asked for. Raises: ConfigError for a name that is no metric on request."""
+    """The entries of metrics that are asked for.
+
+    Raises: ConfigError for a name that is no metric on request.
+    """
     unknown = [name for name in names if name not in ON_REQUEST]
     if unknown or len(set(names)) != len(names):
         raise ConfigError("No metrics on request", expected=f"some of {', '.join(ON_REQUEST)}, each once", got=names)

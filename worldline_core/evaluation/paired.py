@@ -129,7 +129,10 @@ def write_series(path: Path, series: Series) -> None:
 
 
 def read_series(path: Path) -> Series:
-    """Series that `write_series` wrote; none where there is no such file. Raises: ArtifactError where it is damaged."""
+    """Series that `write_series` wrote; none where there is no such file.
+
+    Raises: ArtifactError where it is damaged.
+    """
     found: Series = defaultdict(dict)
     for row in _read(path, _COLUMNS):
         found[row["series"]][row["recording"]] = row["value"]

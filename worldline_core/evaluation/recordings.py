@@ -130,7 +130,10 @@ def open_tracks(inputs: Mapping[str, Path]) -> ActionTracks | None:
 
 
 def open_rollouts(inputs: Mapping[str, Path]) -> dict[str, RolloutSet]:
-    """The RolloutSets among a step's inputs (``rollouts.<method>``), by method. Raises: ArtifactError without any."""
+    """The RolloutSets among a step's inputs (``rollouts.<method>``), by method.
+
+    Raises: ArtifactError without any.
+    """
     sets = {
         name.removeprefix(ROLLOUT_PREFIX): RolloutSet.open(path)
         for name, path in sorted(inputs.items())

@@ -132,7 +132,10 @@ class EpisodeVerdict(StrictModel):
 
 
 def examine(config: FilterConfig, episodes: EpisodeSet, i: int) -> EpisodeVerdict:
-    """The verdict on row i of a set. Raises: ArtifactError when what the set holds of it cannot be read."""
+    """The verdict on row i of a set.
+
+    Raises: ArtifactError when what the set holds of it cannot be read.
+    """
     row = episodes.rows[i]
     with reading_input(f"{episodes.root}, episode {row.episode_id}"):
         episode = episodes.episode(i)

@@ -167,7 +167,10 @@ class ImageTransform:
 
     @classmethod
     def of(cls, image_size: tuple[int, int]) -> ImageTransform:
-        """The transform that leaves images of this size as they are. Raises: ConfigError for a size without pixels."""
+        """The transform that leaves images of this size as they are.
+
+        Raises: ConfigError for a size without pixels.
+        """
         height, width = _whole(image_size)
         return cls((height, width))
 
@@ -202,7 +205,10 @@ class ImageTransform:
         return self if size == self.image_size else self._then(Resize(self.image_size, size))
 
     def crop(self, top: int, left: int, image_size: tuple[int, int]) -> ImageTransform:
-        """Then keep the window that begins at (top, left). Raises: ConfigError when it leaves the image."""
+        """Then keep the window that begins at (top, left).
+
+        Raises: ConfigError when it leaves the image.
+        """
         size = _whole(image_size)
         if min(top, left) < 0 or top + size[0] > self.image_size[0] or left + size[1] > self.image_size[1]:
             raise ConfigError(
@@ -214,7 +220,10 @@ class ImageTransform:
         return self if size == self.image_size else self._then(Window(top, left, size))
 
     def pad(self, top: int, bottom: int, left: int, right: int) -> ImageTransform:
-        """Then add empty rows and columns. Raises: ConfigError for a negative number of them."""
+        """Then add empty rows and columns.
+
+        Raises: ConfigError for a negative number of them.
+        """
         if min(top, bottom, left, right) < 0:
             raise ConfigError("Padding is negative", expected="at least 0 each", got=(top, bottom, left, right))
         height, width = self.image_size

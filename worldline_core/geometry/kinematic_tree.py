@@ -134,7 +134,10 @@ def _numbers(text: str, count: int, where: object) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray, where: object) -> np.ndarray:
-    """The vector at length 1. Raises: DataError when it is zero."""
+    """The vector at length 1.
+
+    Raises: DataError when it is zero.
+    """
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise DataError("A direction of length zero", where=where, expected="a vector that is not zero")

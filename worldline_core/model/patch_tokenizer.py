@@ -146,7 +146,11 @@ class PatchTokenizer(nn.Module):
         return rearrange(patches + self.mean, "b t h w (c p q) -> b c t (h p) (w q)", p=size, q=size)
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Codes of a clip of ``1 + 4 k`` frames in [-1, 1]. Raises DataError: the video has another shape."""
+        """Codes of a clip of ``1 + 4 k`` frames in [-1, 1].
+
+        Raises:
+            DataError: the video has another shape.
+        """
         check_video(self, video)
         with torch.autocast(device_type=video.device.type, enabled=False):
             patches = self._patches(video.float())

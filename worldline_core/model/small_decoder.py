@@ -128,7 +128,11 @@ class SmallDecoder(nn.Module):
 
     @torch.no_grad()
     def fit(self, clips: Iterable[Float[Tensor, "b 3 t h w"]]) -> None:
-        """Begin at the linear decode with the least squared error on these clips. Raises DataError: there are none."""
+        """Begin at the linear decode with the least squared error on these clips.
+
+        Raises:
+            DataError: there are none.
+        """
         gram = cross = torch.zeros(())
         for clip in clips:
             video = clip.to(self.linear.weight.device)
@@ -149,7 +153,11 @@ class SmallDecoder(nn.Module):
         self.linear.load_state_dict({"weight": weight, "bias": solution[-1]})
 
     def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]:
-        """Latents, as the tokenizer makes them. Raises ConfigError: this decoder stands alone."""
+        """Latents, as the tokenizer makes them.
+
+        Raises:
+            ConfigError: this decoder stands alone.
+        """
         if self._tokenizer[0] is None:
             raise ConfigError(
                 "A decoder does not encode", expected="SmallDecoder(config, tokenizer)", got="no tokenizer"

@@ -157,7 +157,11 @@ WAN22_SHAPE = {
 
 
 def _wan_shape(root: Path) -> dict[str, Any]:
-    """What an autoencoder's ``config.json`` says. Raises CheckpointError: it is damaged, or of another autoencoder."""
+    """What an autoencoder's ``config.json`` says.
+
+    Raises:
+        CheckpointError: it is damaged, or of another autoencoder.
+    """
     try:
         shape = json.loads((root / "config.json").read_text(encoding="utf-8"))
         name = shape.get("_class_name")

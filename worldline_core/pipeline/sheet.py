@@ -23,7 +23,11 @@ class Machine:
 
     @classmethod
     def of(cls, devices: int, memory: str, card: str, utilisation: float) -> Self:
-        """From what the command line says. Raises ConfigError: an unknown card, or a number that means nothing."""
+        """From what the command line says.
+
+        Raises:
+            ConfigError: an unknown card, or a number that means nothing.
+        """
         size = re.fullmatch(r"(\d+(?:\.\d+)?) ?(GB|GiB|TB)", memory)
         if card not in CARDS:
             raise ConfigError("Unknown card", where="--card", expected=", ".join(CARDS), got=card)

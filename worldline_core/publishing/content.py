@@ -84,7 +84,10 @@ class FileList:
 
     @classmethod
     def read(cls, path: Path, where: object) -> FileList:
-        """The list of a copy. Raises: ArtifactError when it is not understood."""
+        """The list of a copy.
+
+        Raises: ArtifactError when it is not understood.
+        """
         try:
             content = json.loads(path.read_text())
             if content["version"] != FILE_LIST_VERSION:

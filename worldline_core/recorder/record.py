@@ -208,7 +208,10 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
 
 
 def open_recorder(embodiment: str, held_out_camera: bool = False) -> EpisodeRecorder:
-    """The recorder of an embodiment. Raises: DataError for an unknown embodiment."""
+    """The recorder of an embodiment.
+
+    Raises: DataError for an unknown embodiment.
+    """
     return EpisodeRecorder(embodiment, "held_out" if held_out_camera else "training")
 
 
@@ -301,7 +304,10 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
 
 
 def check_recorded(output: Path, recorded: set[str], planned: set[str]) -> None:
-    """Every episode is accounted for. Raises: DataError where the set holds other episodes than were planned."""
+    """Every episode is accounted for.
+
+    Raises: DataError where the set holds other episodes than were planned.
+    """
     if recorded != planned:
         raise DataError(
             "The folder holds other episodes than the configuration plans",

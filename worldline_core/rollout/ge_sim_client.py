@@ -179,7 +179,11 @@ def pack_sections(sections: Any) -> bytes:
 
 
 def unpack_sections(content: bytes) -> list[bytes]:
-    """Sections of a whole body. Raises ValueError: it breaks off."""
+    """Sections of a whole body.
+
+    Raises:
+        ValueError: it breaks off.
+    """
     sections, position = [], 0
     while position < len(content):
         start = position + 4

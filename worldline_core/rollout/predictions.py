@@ -51,7 +51,11 @@ class Prediction:
 
 
 def choose_episodes(config: RolloutConfig, episodes: EpisodeSet) -> list[int]:
-    """Positions of the episodes to predict, in the order of the set. Raises DataError: none matches."""
+    """Positions of the episodes to predict, in the order of the set.
+
+    Raises:
+        DataError: none matches.
+    """
     counts: Counter[str] = Counter()
     chosen: list[int] = []
     limit = config.max_episodes_per_embodiment

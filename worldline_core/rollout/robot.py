@@ -53,7 +53,10 @@ class Response(StrictModel):
 
     @classmethod
     def load(cls, path: Path | str) -> Response:
-        """Read a file that :meth:`save` wrote. Raises: ArtifactError when it cannot be read, or is no such file."""
+        """Read a file that :meth:`save` wrote.
+
+        Raises: ArtifactError when it cannot be read, or is no such file.
+        """
         try:
             return cls.model_validate_json(Path(path).read_bytes())
         except (OSError, ValidationError) as error:

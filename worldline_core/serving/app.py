@@ -155,7 +155,10 @@ def make_app(host: SessionHost, token: str | None, held: HeldBytes) -> ASGIApp:
 
 
 async def send_in_time(websocket: WebSocket, content: bytes) -> None:
-    """Send to a client that reads. Raises: TimeoutError for one that does not."""
+    """Send to a client that reads.
+
+    Raises: TimeoutError for one that does not.
+    """
     async with asyncio.timeout(TAKE_S):
         await websocket.send_bytes(content)
 

@@ -77,7 +77,10 @@ class RecordedStarts:
         return self._kinematics.get(embodiment)
 
     def read(self, episode_id: str) -> RecordedStart:
-        """The first moment of a recording. Raises: DataError when there is none of this name, or it cannot be read."""
+        """The first moment of a recording.
+
+        Raises: DataError when there is none of this name, or it cannot be read.
+        """
         if episode_id not in self._positions:
             raise DataError(
                 "No recording of this name to start from", where=self._episodes.root, got=episode_id,

@@ -130,7 +130,10 @@ class SessionHost:
         return len(self._running)
 
     async def compute[T](self, work: Callable[[], T]) -> T:
-        """What ``work`` returns, done by the one worker. Raises: BusyError where too much is waiting."""
+        """What ``work`` returns, done by the one worker.
+
+        Raises: BusyError where too much is waiting.
+        """
         if self._waiting >= self.config.max_waiting:
             raise BusyError(
                 "The server is busy", expected=f"at most {self.config.max_waiting} waiting requests",

@@ -163,7 +163,10 @@ def is_remote(path: AnyPath) -> bool:
 
 
 def file_system(path: AnyPath) -> Any:
-    """The fsspec file system of a location. Raises: UnavailableError where the store's library is not installed."""
+    """The fsspec file system of a location.
+
+    Raises: UnavailableError where the store's library is not installed.
+    """
     try:
         return cast("UPath", path).fs
     except ImportError as error:

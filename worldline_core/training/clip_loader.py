@@ -126,7 +126,11 @@ class SkipLog:
         self._rows = read_json_lines(self.path)
 
     def add(self, skipped: Sequence[SkippedClip]) -> None:
-        """Write down what was skipped. Raises DataError: more than ``limit`` clips have been skipped."""
+        """Write down what was skipped.
+
+        Raises:
+            DataError: more than ``limit`` clips have been skipped.
+        """
         for item in skipped:
             row = {"index": item.index, "clip": str(item.clip), "reason": item.reason}
             if row not in self._rows:

@@ -139,7 +139,11 @@ class ClipSource(ABC):
         return len(self.rows)
 
     def row(self, episode_id: str) -> ClipRow:
-        """The row of an episode. Raises ArtifactError: the source does not hold it."""
+        """The row of an episode.
+
+        Raises:
+            ArtifactError: the source does not hold it.
+        """
         if episode_id not in self._by_id:
             raise ArtifactError(
                 f"The {type(self).__name__} does not hold this episode (or not all the views that are trained on).",

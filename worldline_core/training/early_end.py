@@ -46,7 +46,11 @@ def keep_batch(output: Path, batch: object, **facts: int) -> Path:
 
 
 def require_finite(scores: Mapping[str, float], states: TrainingStates, where: str) -> None:
-    """Refuse held-out losses that are not finite. Raises TrainingError: one is not."""
+    """Refuse held-out losses that are not finite.
+
+    Raises:
+        TrainingError: one is not.
+    """
     bad = {name: value for name, value in scores.items() if not math.isfinite(value)}
     if bad:
         raise TrainingError(

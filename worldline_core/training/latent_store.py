@@ -73,7 +73,11 @@ class LatentStore(ClipSource):
 
     @classmethod
     def open(cls, root: Path) -> LatentStore:
-        """Open a finished Latents folder. Raises ArtifactError: if the folder is not a Latents artifact."""
+        """Open a finished Latents folder.
+
+        Raises:
+            ArtifactError: if the folder is not a Latents artifact.
+        """
         missing = [name for name in (DESCRIPTION, INDEX) if not (root / name).is_file()]
         if missing:
             raise ArtifactError(

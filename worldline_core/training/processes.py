@@ -101,7 +101,11 @@ class BatchPlan:
 
     @classmethod
     def of(cls, wanted: int, together: int | None = None) -> BatchPlan:
-        """The plan for these processes. Raises ConfigError: the micro-batches of a step cannot be shared out evenly."""
+        """The plan for these processes.
+
+        Raises:
+            ConfigError: the micro-batches of a step cannot be shared out evenly.
+        """
         rank, world_size = processes()
         if wanted % world_size:
             counts = [str(count) for count in range(1, wanted + 1) if wanted % count == 0]

@@ -169,7 +169,10 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         return listed
 
     def _check_empty(self, listed: Sequence[Sequence[ListedEpisode]]) -> None:
-        """Warn of sources that list nothing. Raises: DataError where all do, or one that is required."""
+        """Warn of sources that list nothing.
+
+        Raises: DataError where all do, or one that is required.
+        """
         empty = [number for number, episodes in enumerate(listed) if not episodes]
         said = {
             number: nothing_found(self.config.sources[number], self._source(number), parse_location(self.roots[number]))
@@ -226,7 +229,10 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         return self.row(episode.identity)
 
     def row(self, identity: str) -> InputRow:
-        """The account of an episode that is done. Raises: DataError when it is not."""
+        """The account of an episode that is done.
+
+        Raises: DataError when it is not.
+        """
         found = self.writer.recorded(identity)
         if found is None:
             raise DataError("An episode was neither kept nor quarantined", where=self.output, got=identity)

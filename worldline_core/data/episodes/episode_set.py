@@ -52,7 +52,10 @@ class EpisodeSet:
         return len(self.rows)
 
     def position(self, episode_id: str) -> int:
-        """Position of an episode. Raises: DataError when the set has no such episode."""
+        """Position of an episode.
+
+        Raises: DataError when the set has no such episode.
+        """
         if episode_id not in self._position:
             raise DataError(
                 "No such episode in the set", where=self.root, got=episode_id, expected=f"one of {len(self)} ids"

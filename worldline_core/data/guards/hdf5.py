@@ -40,7 +40,10 @@ _BLOCK_BYTES = 64 << 20
 
 
 def require_h5py() -> Any:
-    """The module h5py. Raises: UnavailableError where it is not installed."""
+    """The module h5py.
+
+    Raises: UnavailableError where it is not installed.
+    """
     if importlib.util.find_spec("h5py") is None:
         raise UnavailableError(
             "Sources of HDF5 files need h5py, which is not installed",
@@ -122,7 +125,10 @@ class Hdf5File:
         return 1e-9 * (raw.astype(np.int64) - np.int64(raw[0])) if exact else seconds - seconds[0]
 
     def columns(self, key: str, length: int | None) -> np.ndarray:
-        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D). Raises: as `array`."""
+        """A numeric dataset (length, D), or (length,) with D = 1, as float64 (length, D).
+
+        Raises: as `array`.
+        """
         flat = self._dataset(key).ndim == 1
         values = self.array(key, (length,) if flat else (length, None))
         return values.reshape(len(values), -1)

@@ -41,7 +41,10 @@ def read_json(path: AnyPath) -> Any:
 
 
 def parse_json(text: str | bytes, where: object) -> Any:
-    """JSON of a text. Raises: RejectedInputError (unreadable)."""
+    """JSON of a text.
+
+    Raises: RejectedInputError (unreadable).
+    """
     # ValueError: of the decoder, of UTF-8, of a key given twice, of a number with too many digits.
     with unreadable("File is not valid JSON", where, (ValueError, RecursionError)):
         return json.loads(text, object_pairs_hook=_without_repetition)
@@ -58,7 +61,10 @@ def read_json_lines(path: AnyPath) -> Iterator[Any]:
 
 
 def read_text(path: AnyPath, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
-    """The text of a file. Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8)."""
+    """The text of a file.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (no UTF-8).
+    """
     file = regular_file(path, "Text file", max_bytes=max_bytes)
     with unreadable("File cannot be read as text", path, (OSError, UnicodeDecodeError)):
         return file.read_text(encoding=encoding)

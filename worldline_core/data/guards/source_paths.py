@@ -328,7 +328,10 @@ def safe_stem(name: str) -> str:
 
 
 def safe_name(name: str, what: str) -> str:
-    """`name` when it can serve as one path component. Raises: DataError otherwise."""
+    """`name` when it can serve as one path component.
+
+    Raises: DataError otherwise.
+    """
     if not _SAFE_NAME.fullmatch(name):
         raise DataError(
             f"{what} cannot be a file name", expected="letters, digits and . _ + = - (not leading)", got=repr(name)

@@ -80,10 +80,16 @@ class LeRobotDataset(ABC):
 
     @abstractmethod
     def clip(self, episode_index: int, key: str) -> VideoClip:
-        """One episode's video as it is encoded. Raises: DataError when the metadata lack the key."""
+        """One episode's video as it is encoded.
+
+        Raises: DataError when the metadata lack the key.
+        """
 
     def row(self, episode_index: int) -> dict[str, Any]:
-        """Metadata row of one episode. Raises: DataError when the episode is not listed, or listed twice."""
+        """Metadata row of one episode.
+
+        Raises: DataError when the episode is not listed, or listed twice.
+        """
         return self.episodes.row(episode_index)
 
     def video_size(self, episode_index: int, key: str) -> tuple[int, int, float]:

@@ -115,7 +115,10 @@ class McapFile:
 
     @property
     def first_log_ns(self) -> int:
-        """Log time of the first message. Raises: RejectedInputError (missing_topic) for a file without messages."""
+        """Log time of the first message.
+
+        Raises: RejectedInputError (missing_topic) for a file without messages.
+        """
         statistics = self._summary.statistics if self._summary is not None else None
         if statistics is None:
             first = min((record.log_time for _, _, record in self._records(None)), default=None)

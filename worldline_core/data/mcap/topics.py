@@ -65,7 +65,10 @@ class Segment:
 def read_topics_episode(
     config: McapTopicsSourceConfig, file: McapFile, segment: Segment, episode_id: str, scene: str
 ) -> LoadedEpisode:
-    """The episode; its images stay in the file until they are asked for. Raises: RejectedInputError with the reason."""
+    """The episode; its images stay in the file until they are asked for.
+
+    Raises: RejectedInputError with the reason.
+    """
     start_log, stop_log = segment.log_times(file)
     around = (
         None if start_log is None else max(start_log - _READING_MARGIN_NS, 0),

@@ -219,7 +219,10 @@ def first_posture(file: Hdf5File, length: int) -> dict[str, float]:
 
 
 def two_grippers(file: Hdf5File, track: str, length: int, path: AnyPath) -> np.ndarray:
-    """Readings (N, 2). Raises: RejectedInputError: invalid_gripper for dexterous hands, and as `Hdf5File.array`."""
+    """Readings (N, 2).
+
+    Raises: RejectedInputError: invalid_gripper for dexterous hands, and as `Hdf5File.array`.
+    """
     effector = file.array(f"{track}/effector/position", (length, None))
     if effector.shape[1] != 2:
         raise RejectedInputError(
@@ -233,7 +236,10 @@ def two_grippers(file: Hdf5File, track: str, length: int, path: AnyPath) -> np.n
 
 
 def timed_video_size(path: AnyPath, fps: float) -> tuple[int, int]:
-    """(height, width) of a video. Raises: RejectedInputError: wrong_fps, and as `video_size`."""
+    """(height, width) of a video.
+
+    Raises: RejectedInputError: wrong_fps, and as `video_size`.
+    """
     height, width, rate = video_size(path)
     check_rate(rate, fps, path, tolerance=0.02)
     return height, width

@@ -203,7 +203,10 @@ class VideoEncoder:
         self._out.close()
 
     def add(self, image: np.ndarray) -> None:
-        """The next picture, uint8 (H, W, 3) RGB. Raises: DataError when it has another size or type."""
+        """The next picture, uint8 (H, W, 3) RGB.
+
+        Raises: DataError when it has another size or type.
+        """
         if image.dtype != np.uint8 or image.shape != (*self.size, 3):
             raise DataError(
                 "Pictures of a video differ",

@@ -85,7 +85,10 @@ class ThumbnailMaker:
         self._gray.append(gray)
 
     def thumbnails(self) -> ViewThumbnails:
-        """Of all pictures added. Raises: RejectedInputError (truncated_video) when there were none."""
+        """Of all pictures added.
+
+        Raises: RejectedInputError (truncated_video) when there were none.
+        """
         if not self._gray:
             raise RejectedInputError("truncated_video", "View has no pictures", expected="at least one", got="none")
         sharpness = np.repeat(np.asarray(self._sharpness, dtype=np.float32), self._every)

@@ -31,7 +31,10 @@ FrechetDistances = tuple[dict[str, dict[str, dict[str, Any]]], dict[str, list[di
 
 
 def open_i3d(path: Path | None) -> Features:
-    """The features of I3D in a local file. Raises: UnavailableError without the file, or when it is no TorchScript."""
+    """The features of I3D in a local file.
+
+    Raises: UnavailableError without the file, or when it is no TorchScript.
+    """
     if path is None or not path.is_file():
         raise UnavailableError(
             "FVD is not available", where=path, expected="the TorchScript file of I3D",
