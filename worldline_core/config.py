@@ -8,9 +8,11 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from types import UnionType
-from typing import IO, Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeAliasType, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -60,18 +62,22 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
     return known[id(node)]
 
 
-def _read(text: str | IO[str]) -> Any:
-    """A YAML value.
+@lru_cache(maxsize=32)
+def _parsed(text: str, name: str) -> Any:
+    loader = _StrictLoader(text)  # derives from SafeLoader: no object construction
+    loader.name = name
+    return loader.get_single_data()
+
+
+def _read(text: str, name: str = "<text>") -> Any:
+    """A YAML value; the same text is parsed once, which takes up to a tenth of a second.
 
     Raises: yaml.YAMLError for whatever is no YAML.
     """
     try:
-        # _StrictLoader derives from SafeLoader: no object construction.
-        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506
+        return deepcopy(_parsed(text, name))
     except RecursionError:
         raise yaml.YAMLError("nested too deeply") from None
-    except UnicodeDecodeError as error:
-        raise yaml.YAMLError(f"no UTF-8: {error}") from error
 
 
 def _construct_mapping(loader: _StrictLoader, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -113,9 +119,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError("No such configuration file", where=path, next_step="check the path, or use --preset NAME")
     try:
-        with path.open(encoding="utf-8") as stream:
-            content = _read(stream)
-    except yaml.YAMLError as error:
+        content = _read(path.read_text(encoding="utf-8"), str(path))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError("Not valid YAML", where=path, got=str(error)) from error
     if not isinstance(content, dict):
         raise ConfigError(
