@@ -167,11 +167,11 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
     Raises:
         ArtifactError: a symbolic link leads out of the folder.
     """
-    root = folder.resolve()
+    root, depth = folder.resolve(), len(folder.parts)
     files = []
     for path in sorted(folder.rglob("*")):
-        relative = path.relative_to(folder)
-        ours = relative.parts[0] == VOLATILE_FOLDER or relative == Path(MANIFEST_NAME)
+        relative = path.parts[depth:]
+        ours = relative[0] == VOLATILE_FOLDER or relative == (MANIFEST_NAME,)
         if (ours and not everything) or path.is_dir():
             continue
         if path.is_symlink() and not path.resolve().is_relative_to(root):
