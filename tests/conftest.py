@@ -33,6 +33,9 @@ CHECKED_PACKAGES = ("geometry", "actions", "model", "training", "distillation", 
 """Of the core: their functions are called with shapes and types checked against the annotations, in tests only."""
 check_shapes_of([f"worldline_core.{name}" for name in CHECKED_PACKAGES])
 
+IDLE_SERVICES = ("SCHEDULER", "LATE_RUNS", "CANCELLATION_CLEANUP", "PAUSE_EXPIRATIONS", "FOREMAN", "TRIGGERS")
+"""Of Prefect's server: for schedules, workers and automations."""
+
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -165,6 +168,8 @@ def _start_prefect_server(folder: Path) -> tuple[int, int]:
         "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "PREFECT_UI_ENABLED": "false",
+        # What looks every few seconds for work that no test gives would take a share of a core from all others.
+        **{f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in IDLE_SERVICES},
         # A command that a test ran in this process has chosen a temporary server, which keeps no task runs.
         "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_ENABLED": "true",
         "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "true",

@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
 from pathlib import Path
 
@@ -53,6 +53,24 @@ def closure(requirements: Iterable[str]) -> set[str]:
     return found
 
 
+def modules(package: str) -> set[str]:
+    """What an installed package is imported as; `packages_distributions` reads the file lists of all of them."""
+    try:
+        found = distribution(package)
+    except PackageNotFoundError:
+        return set()
+    named = (found.read_text("top_level.txt") or "").split()
+    return set(named) or {file.parts[0].removesuffix(".py") for file in found.files or ()}
+
+
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below this one; expressions hold no imports, and are most of a file."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+            yield child
+            yield from statements(child)
+
+
 def imported(project_root: Path) -> dict[str, set[str]]:
     """Third-party module -> files of the project that import it."""
     own = {*sys.stdlib_module_names, *PACKAGES, "worldline_assets"}
@@ -60,7 +78,7 @@ def imported(project_root: Path) -> dict[str, set[str]]:
     files = [file for package in PACKAGES for file in (project_root / package).rglob("*.py")]
     assert len(files) > 100
     for file in files:
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in statements(ast.parse(file.read_text())):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.level == 0:
                 modules = [str(node.module)]
@@ -70,17 +88,19 @@ def imported(project_root: Path) -> dict[str, set[str]]:
 
 
 def test_every_import_is_declared_and_every_dependency_imported(project_root: Path, project: dict) -> None:
-    distributions = packages_distributions()
     declared = names(project["dependencies"])
     extras = project["optional-dependencies"]
     optional = {
         *extras,
         *(name for extra in extras.values() for name in names(extra)),
     }  # dask comes by the extra `dask`
+    distributions: dict[str, set[str]] = {}
+    for name in declared | optional:
+        for module in modules(name):
+            distributions.setdefault(module, set()).add(name)
     used: set[str] = set()
     for module, files in imported(project_root).items():
-        owners = {canonical(name) for name in distributions.get(module, ())}
-        owners = owners or {canonical(module)}  # of an extra that is not installed
+        owners = distributions.get(module) or {canonical(module)}  # of an extra that is not installed
         assert owners & (declared | optional), f"{module} of {sorted(files)} is not declared"
         used |= owners
     assert declared - used == set(NOT_IMPORTED)

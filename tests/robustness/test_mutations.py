@@ -31,6 +31,7 @@ LAYOUTS = (
     "video_folder",
 )
 CASES = 60
+"""Of which the first fifteen are tried after every change, all with the slow tests."""
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +40,12 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SourceConfig]
     return {name: TypeAdapter(SourceConfig).validate_python(source) for name, source in written.items()}
 
 
+@pytest.mark.parametrize("cases", [CASES // 4, pytest.param(CASES, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_damage_ends_in_a_named_error(sources: dict[str, SourceConfig], layout: str) -> None:
+def test_damage_ends_in_a_named_error(sources: dict[str, SourceConfig], layout: str, cases: int) -> None:
     config = sources[layout]
     read_everything(config, config.path)
-    unexpected = list(attack(config, config.path, CASES, seed=1))
+    unexpected = list(attack(config, config.path, cases, seed=1))
     assert not unexpected, unexpected
     read_everything(config, config.path)
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -52,8 +53,10 @@ def store(store_server: object) -> Iterator[object]:
 
 @pytest.fixture
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stores are asked again at once."""
+    """Stores are asked again at once, by our own patience alone: s3fs waits two seconds before it gives up."""
     monkeypatch.setattr(remote, "FIRST_PAUSE_SECONDS", 0.01)
+    if find_spec("s3fs") is not None:
+        monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
 
 
 @pytest.fixture(scope="session")
