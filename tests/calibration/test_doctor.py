@@ -63,6 +63,7 @@ def test_late_states_are_two_lags_at_once(benchmark: ModuleType, healthy: list) 
     assert diagnosis.best.mistake == "camera_lag_frames+image_lag_frames"
 
 
+@pytest.mark.slow
 def test_what_no_usual_mistake_explains_is_called_unexplained(benchmark: ModuleType, healthy: list) -> None:
     item = healthy[0]
     head = item.joints.cameras["head"]

@@ -131,6 +131,7 @@ def test_inverse_and_late(healthy: list, late: str) -> None:
     assert (together.verdict, together.best.conventions) == ("explained", conventions)
 
 
+@pytest.mark.slow
 def test_one_good_and_one_bad_episode_prescribe_nothing_for_both(benchmark: ModuleType, healthy: list) -> None:
     good, bad = of_robot(healthy, "xarm7"), of_robot(healthy, "ur5e")
     fine = diagnose(good.joints, good.gray, good.kinematics, CONFIG)

@@ -41,13 +41,9 @@ def written(folder: Path, shipped: EpisodeSet, conventions: RecordedConventions)
             writer.add(corrupt(healthy, conventions), frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "mistake",
-    [
-        {"extrinsics": "base_to_camera"},
-        *(pytest.param(one, marks=pytest.mark.slow) for one in ({"image_lag_frames": 3}, {"gripper": "inverted"})),
-    ],
-    ids=str,
+    "mistake", [{"extrinsics": "base_to_camera"}, {"image_lag_frames": 3}, {"gripper": "inverted"}], ids=str
 )
 def test_curate_with_the_printed_line(tmp_path: Path, shipped: EpisodeSet, mistake: dict[str, Any]) -> None:
     conventions = RecordedConventions(**mistake)

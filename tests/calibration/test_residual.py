@@ -108,6 +108,7 @@ def test_what_was_put_into_a_wrist_view_is_found(kind: str, sizes: tuple[float, 
     assert solved(view, kind) == pytest.approx(sizes, rel=0.1, abs=0.1 * np.abs(sizes).max())
 
 
+@pytest.mark.slow
 def test_five_degrees_and_a_wrong_focal_length_are_found_in_one_episode(healthy: list) -> None:
     item = healthy[4]
     turned = quickly(item, spoiled(item.joints, "head", "rotation", 0.0, 5.0, 0.0))

@@ -25,6 +25,7 @@ from worldline_core.errors import ConfigError, DataError
 Make = Callable[..., tuple]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
 def test_lerobots_own_class_reads_the_same_frames_and_values(
     tmp_path: Path, sample: Make, monkeypatch: pytest.MonkeyPatch

@@ -206,6 +206,7 @@ def test_sharpness_falls_with_blur_and_is_that_of_the_definition(tmp_path: Path)
     assert found.sharpness[1] < 0.05 * found.sharpness[0]
 
 
+@pytest.mark.slow
 def test_an_enlarged_picture_is_as_sharp_as_its_recording(tmp_path: Path, sample: Make) -> None:
     raw = recordings(tmp_path, sample, 1)
     recorded = EpisodeSet.open(raw).thumbnails(0, "head").sharpness

@@ -202,7 +202,8 @@ def killing(function: Callable, at_call: int) -> Callable:
     return wrapped
 
 
-@pytest.mark.parametrize("real_score", ["stage2", pytest.param("causal_teacher", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("real_score", ["stage2", "causal_teacher"])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_score: str
 ) -> None:

@@ -120,12 +120,14 @@ def test_it_is_an_environment_with_the_spaces_of_the_simulator(world: MujocoEnv)
         world.step(np.zeros(13))
 
 
+@pytest.mark.slow
 def test_attempts_of_one_bank_are_one_start(compared: Path) -> None:
     starts = EpisodeStarts(compared, embodiment=ROBOT, splits=("test",), views=("head",), fps=8)
     assert len(EpisodeSet.open(compared)) == 6
     assert len({starts.row(number).bank for number in range(len(starts))}) == len(starts) == 2
 
 
+@pytest.mark.slow
 def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(
     compared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,6 +193,7 @@ def test_recorded_policies_are_compared_in_both_worlds(
     assert (tmp_path / "attempts.jsonl").read_text() == lines
 
 
+@pytest.mark.slow
 def test_a_learned_policy_meets_the_same_start_in_both_worlds(shipped: Path, compared: Path) -> None:
     """Its first commands follow from what the cameras saw there, in MuJoCo and inside alike."""
     script = policies_inside(shipped.parents[1])

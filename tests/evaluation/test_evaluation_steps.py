@@ -146,6 +146,7 @@ def test_policy_evaluation_is_balanced(recordings, tmp_path):
     assert {row["outcome"] for row in rows} == {"success", "failure"}
 
 
+@pytest.mark.slow
 def test_a_method_with_few_videos_narrows_no_other_method(recordings, tmp_path):
     good = RolloutSet.open(recordings.inputs["rollouts.good"])
     few = RolloutSetWriter(tmp_path / "few", "few", 8.0)

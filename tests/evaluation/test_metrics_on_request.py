@@ -124,6 +124,7 @@ def test_a_plan_asks_only_for_pairs_that_it_predicts(project_root: Path):
     assert next(node.config for node in nodes if node.name == "evaluate_video").changed_controls == {}
 
 
+@pytest.mark.slow
 def test_controls_that_were_ignored_are_told_from_those_that_were_followed(recordings, tmp_path):
     """Under delayed controls one model predicts the delayed video, another one the same video again."""
     good = RolloutSet.open(recordings.inputs["rollouts.good"])

@@ -106,7 +106,7 @@ def read_mcap(recorded: Recorded, output: Path) -> None:
 
 WITH_THUMBNAILS = ("episode as mcap", "episode as lerobot", "curate")
 """Thumbnails of each view grow, and messages are collected in chunks: together less than the frames of one view."""
-SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "overlay", "curate")
+SLOW = ("episode as mcap", "episode as rrd", "rollout as mcap and rrd", "inspect", "overlay", "curate", "exact masks")
 OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "side by side": lambda recorded, output: write_side_by_side(
         output / "a.mp4", {"true": recorded.videos["head"], "again": recorded.videos["head"]}, FPS, tile_height=96

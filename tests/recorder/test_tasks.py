@@ -115,6 +115,7 @@ def test_a_success_shows_throughout_the_last_quarter(recorder: EpisodeRecorder) 
     assert shown > 0
 
 
+@pytest.mark.slow
 def test_in_a_long_recording_arms_go_on_after_the_task(recorder: EpisodeRecorder) -> None:
     held = 0
     for number in range(10):

@@ -142,6 +142,7 @@ def test_what_cannot_be_made_small_is_named(tmp_path: Path) -> None:
         write_outside_models(tmp_path, [OutsideModel("Other", "org/other", "other", write)])
 
 
+@pytest.mark.slow
 def test_recordings_are_those_of_a_robot_at_thirty_frames_a_second(tmp_path: Path) -> None:
     write_recordings(tmp_path / "two", TWO_VIEWS, split="test")
     episodes = EpisodeSet.open(tmp_path / "two")

@@ -107,6 +107,7 @@ def test_without_kinematics_frames_are_shown_and_it_is_said(run_artifacts: dict[
         inspect(folder, tmp_path, video=True)
 
 
+@pytest.mark.slow
 def test_the_page_shows_each_episode_or_says_why_not(
     run_artifacts: dict[str, Path], hostile_text: str, tmp_path: Path
 ) -> None:

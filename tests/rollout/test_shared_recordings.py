@@ -97,7 +97,8 @@ def droid(shared_data: Path, tmp_path_factory: pytest.TempPathFactory, make_mode
     return inputs_of(root, [(labelled, frames)], 4.0, make_model, make_contract)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("causal", marks=pytest.mark.slow), "stage2"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["causal", "stage2"])
 def test_droid_goes_through_in_its_two_views(droid: dict[str, str], tmp_path: Path, kind: str) -> None:
     done = run_chain(tmp_path, chain(droid, kind, None))
     rollouts = RolloutSet.open(tmp_path / "rollout")
@@ -175,6 +176,7 @@ def test_a_minute_goes_through_in_the_memory_of_a_quarter(
     assert peaks[1] - peaks[0] < 35, peaks
 
 
+@pytest.mark.slow
 def test_tools_are_in_the_pictures_of_both_views(droid: dict[str, str]) -> None:
     """Controls are drawn into both views: neither map is empty."""
     from worldline_core.actions.episode_tracks import ActionTracks

@@ -122,6 +122,7 @@ def test_clips_of_a_batch_are_those_of_single_simulations(causal: WorldLine, sta
         assert np.array_equal(batch.tool_poses[clip], alone.tool_poses[0])
 
 
+@pytest.mark.slow
 def test_branches_share_their_history_and_equal_separate_rollouts(causal: WorldLine, starts: list[Start]) -> None:
     start = starts[0].head()
     shared, own = start.controls[None, 1:17], start.controls[17:33]

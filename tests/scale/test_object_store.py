@@ -71,9 +71,8 @@ def test_a_missing_and_a_damaged_object_cost_their_episodes_only(
     assert all("worldline-remote" not in row.detail and "127.0.0.1" not in row.detail for row in rows)
 
 
-@pytest.mark.parametrize(
-    "fault", ["busy", *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("broken", "hang up"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["busy", "broken", "hang up"])
 def test_a_store_that_flickers_changes_nothing(
     tmp_path: Path, recordings: Path, store: ObjectStore, fault: str
 ) -> None:
@@ -213,6 +212,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_samples_come_through_the_store(tmp_path: Path, store: ObjectStore, name: str) -> None:
     folder, settings = REAL[name]

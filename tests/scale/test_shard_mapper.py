@@ -114,6 +114,7 @@ def test_few_episodes_stay_in_this_process(tmp_path: Path) -> None:
     assert processes(tmp_path) == {str(os.getpid())}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_server")
 def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten shards wait as plain values; no more than `in_flight` are with the runner when one is answered."""

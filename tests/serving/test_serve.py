@@ -148,6 +148,7 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
         other.call({"op": "step", "session": sent.session, "controls": np.zeros((2, 4, 14))})
 
 
+@pytest.mark.slow
 def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) -> None:
     """The short version of `benchmarks/serve_load.py`; one client in four vanishes in the middle."""
     episodes = [EPISODE, "aloha_viperx-test-s1-00000"]

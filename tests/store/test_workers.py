@@ -59,7 +59,8 @@ def launch(root: Path, *, distributed: bool) -> list[tuple[int, str, str, bool]]
     return sorted(found)
 
 
-@pytest.mark.parametrize("distributed", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("distributed", [True, False])
 def test_one_process_owns_the_artifact(tmp_path: Path, distributed: bool) -> None:
     first, second = launch(tmp_path, distributed=distributed)
     assert first[1:3] == second[1:3]

@@ -67,6 +67,7 @@ def _shown(expected: dict[str, str]) -> dict[str, str]:
     return states
 
 
+@pytest.mark.slow
 def test_prefect_shows_what_the_store_has(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,15 +120,9 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind",
-    [
-        "pickle",
-        *(
-            pytest.param(kind, marks=pytest.mark.slow)
-            for kind in ("a decoder", "another place", "a class", "no record", "half a character", "a folder")
-        ),
-    ],
+    "kind", ["pickle", "a decoder", "another place", "a class", "no record", "half a character", "a folder"]
 )
 def test_prefects_records_are_not_believed(
     prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str

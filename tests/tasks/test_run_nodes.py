@@ -111,6 +111,7 @@ def test_a_node_starts_when_its_inputs_are_finished_and_is_found_the_second_time
     ]
 
 
+@pytest.mark.slow
 def test_prefect_shows_what_depends_on_what(storage: Path) -> None:
     run(storage)
     deadline, runs = time.monotonic() + 30, {}
@@ -123,6 +124,7 @@ def test_prefect_shows_what_depends_on_what(storage: Path) -> None:
     assert [source.model_dump()["id"] for source in waited_for] == [runs["write_first"].id]
 
 
+@pytest.mark.slow
 def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path: Path) -> None:
     success = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 9}
     summary = {"methods": {"causal": {"budgets": {"32": {"success": success}}}}}
@@ -149,6 +151,7 @@ def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path
             assert (reply.headers["Content-type"], reply.read()) == ("image/jpeg", picture.read_bytes())
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_error_that_ended_the_run(storage: Path) -> None:
     with pytest.raises(DataError, match="This node cannot work"), RunPage(storage, ["write_next.second", "write_first"]) as page:  # fmt: skip
         run(storage, "broken", page)

@@ -112,6 +112,7 @@ def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     assert len({job.episode_id for task in everything for job in task.jobs}) == sum(len(t.jobs) for t in everything)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("rendering")
 def test_the_shipped_model_predicts_what_the_tool_records(tmp_path: Path) -> None:
     task = plan_files(tmp_path, 3000, ["small_world_test"])[0]

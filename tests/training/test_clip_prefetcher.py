@@ -94,6 +94,7 @@ def test_batches_do_not_depend_on_the_number_of_processes(world: Any) -> None:
                 assert torch.equal(read.data, plain.read(index).data)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_no_more_is_read_ahead_than_there_are_slots(world: Any, tmp_path: Path) -> None:
     log = tmp_path / "read.txt"
@@ -107,6 +108,7 @@ def test_no_more_is_read_ahead_than_there_are_slots(world: Any, tmp_path: Path) 
         assert len(log.read_text().splitlines()) == 2 * (3 + 5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_errors_name_their_clips_and_end_cleanly(world: Any) -> None:
     first = next(
