@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -38,7 +39,7 @@ def test_lerobots_own_class_reads_the_same_frames_and_values(
     stored = EpisodeSet.open(tmp_path / "set")
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    opened = LeRobotDataset("local/set", root=tmp_path / "set/datasets/ur5e_pair", video_backend="pyav")
+    opened: Any = LeRobotDataset("local/set", root=tmp_path / "set/datasets/ur5e_pair", video_backend="pyav")
     assert (opened.num_episodes, len(opened), opened.fps) == (3, 5 + 6 + 7, 8)
     assert opened.meta.stats["observation.state"]["mean"].shape == (14,)
     for position, (episode, frame) in {0: (0, 0), 4: (0, 4), 5: (1, 0), 12: (2, 1), 17: (2, 6)}.items():
@@ -61,7 +62,7 @@ def test_lerobots_own_class_reads_the_same_frames_and_values(
             clip = VideoClip.whole_file(path, 15, 8.0)
             only_head = replace(episode, cameras={"head": episode.cameras["head"]})
             writer.add(only_head, {"head": RecordedView(lambda: iter(()), 15, clip)})
-    copied = LeRobotDataset("local/copied", root=tmp_path / "copied/datasets/ur5e_pair", video_backend="pyav")
+    copied: Any = LeRobotDataset("local/copied", root=tmp_path / "copied/datasets/ur5e_pair", video_backend="pyav")
     for position in (0, 1, 7, 14, 15, 22, 29):
         pixels = (copied[position]["observation.images.head"].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
         assert np.array_equal(pixels, shown[position // 15][position % 15])

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -59,7 +60,7 @@ def config(raw: Path, **changes: object) -> CurateConfig:
     return CurateConfig.model_validate({"sources": [{"kind": "episode_set", "path": str(raw)}], **changes})
 
 
-def packets(path: Path) -> list[bytes]:
+def packets(path: Path) -> list[bytes]:  # pyright: ignore[reportReturnType]
     with av.open(str(path)) as container:
         return [bytes(packet) for packet in container.demux(video=0) if packet.size]
 
@@ -212,9 +213,8 @@ def test_an_enlarged_picture_is_as_sharp_as_its_recording(tmp_path: Path, sample
     recorded = EpisodeSet.open(raw).thumbnails(0, "head").sharpness
     assert "recorded_size" not in EpisodeSet.open(raw).rows[0].conventions
     head = {"views": ["head"], "video_preset": "ultrafast"}
-    large = curate(config(raw, image_size=[300, 384], **head), {}, tmp_path / "large") and EpisodeSet.open(
-        tmp_path / "large"
-    )
+    curate(config(raw, image_size=[300, 384], **head), {}, tmp_path / "large")
+    large = EpisodeSet.open(tmp_path / "large")
     assert json.loads(large.rows[0].conventions)["recorded_size.head"] == "128x192"
     assert large.thumbnails(0, "head").sharpness == pytest.approx(recorded, rel=0.25)
 
@@ -300,7 +300,7 @@ def test_a_source_without_clips_gives_its_images_one_by_one(sample: Make) -> Non
 
 def test_read_clip_says_the_range_of_its_luma(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "full.mp4"), "w") as out:
-        stream = out.add_stream("mjpeg", rate=8)
+        stream: Any = out.add_stream("mjpeg", rate=8)
         stream.height, stream.width, stream.pix_fmt = 64, 96, "yuvj420p"
         out.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 96, 3), 255, np.uint8), format="rgb24")))
         out.mux(stream.encode(None))

@@ -3,6 +3,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -79,7 +80,7 @@ def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, 
 def test_names_of_episodes_and_banks_never_become_names_of_files(oddly_named, tmp_path):
     recordings, bank = oddly_named
     _seal(bank.inputs["banks"], bank.outcomes)
-    steps = (
+    steps: Any = (
         (evaluate_video, VIDEO, recordings), (evaluate_policy, POLICY, recordings),
         (evaluate_planning, PLANNING.model_copy(update={"budgets": (2, 4)}), bank),
     )  # fmt: skip

@@ -54,7 +54,7 @@ def measured(recordings, tmp_path_factory) -> Path:
 def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones(measured):
     summary = json.loads((measured / "summary.json").read_text())
     good, copy = (summary["metrics"]["test"][method] for method in ("good", "copy"))
-    assert {metric_of(name).name for name in good} | {"lpips"} == set(METRICS)
+    assert {metric_of(name).name for name in good} | {"lpips"} == set(METRICS)  # pyright: ignore[reportOptionalMemberAccess]
     for name, metric in METRICS.items():
         if name == "lpips" or metric.needs == "changed_controls":
             continue
@@ -71,21 +71,21 @@ def test_every_metric_of_the_registry_tells_good_videos_from_bad_ones(measured):
 
 
 def test_the_report_and_the_table_of_scores_follow_from_the_registry(measured, tmp_path):
-    page = quality_section(ReportContext(ReportConfig(), {"evaluate_video": measured}, tmp_path)).body
+    page = str(quality_section(ReportContext(ReportConfig(), {"evaluate_video": measured}, tmp_path)).body)
     for name in ON_REQUEST:
         assert METRICS[name].heading in page
         assert METRICS[name].title in page
     tidy = pq.read_table(measured / "scores.parquet").to_pandas()
-    assert {metric_of(name).name for name in tidy["metric"]} >= set(ON_REQUEST) - {"fvd"}
+    assert {metric_of(name).name for name in tidy["metric"]} >= set(ON_REQUEST) - {"fvd"}  # pyright: ignore[reportOptionalMemberAccess]
     assert not tidy.duplicated(["method", "episode_id", "view", "seed", "metric"]).any()
 
 
 def test_without_a_request_nothing_changes(recordings, tmp_path, measured):
     evaluate_video(ALWAYS, recordings.inputs, tmp_path)
     names = set(pq.read_table(tmp_path / "scores.parquet")["metric"].to_pylist())
-    assert not {metric_of(name).name for name in names} & set(ON_REQUEST)
+    assert not {metric_of(name).name for name in names} & set(ON_REQUEST)  # pyright: ignore[reportOptionalMemberAccess]
     before, after = (pq.read_table(folder / "scores.parquet").to_pylist() for folder in (tmp_path, measured))
-    assert before == [row for row in after if metric_of(row["metric"]).name not in ON_REQUEST]
+    assert before == [row for row in after if metric_of(row["metric"]).name not in ON_REQUEST]  # pyright: ignore[reportOptionalMemberAccess]
     assert set(ALWAYS.model_dump()) == {
         "views", "segmenters", "sam3_weights", "lpips_weights", "comparisons", "resamples", "seed",
     }  # fmt: skip
@@ -121,7 +121,7 @@ def test_a_plan_asks_only_for_pairs_that_it_predicts(project_root: Path):
     assert whole == nightly == config.evaluate_video
     fewer = {name: run for name, run in config.rollouts.items() if name != "shipped_stage2_shuffled"}
     nodes = plan(config.model_copy(update={"rollouts": fewer}), project_root)
-    assert next(node.config for node in nodes if node.name == "evaluate_video").changed_controls == {}
+    assert next(node.config for node in nodes if node.name == "evaluate_video").changed_controls == {}  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_scenes_that_change_are_told_from_those_that_stay():
         assert scene_consistency(SceneFrames(still, predicted, first, first, robots)) == pytest.approx(expected)
     values = scene_consistency(SceneFrames(still, changed, first, first, robots))
     assert values[1] == pytest.approx(1.0)
-    assert values[2] < 0.95
+    assert values[2] < 0.95  # pyright: ignore[reportOptionalOperand]
     # What moves in the recording as well is no fault of the prediction.
     assert scene_consistency(SceneFrames(changed, changed, first, first, robots))[2] == pytest.approx(1.0)
     assert scene_consistency(SceneFrames(still, still, first, first, np.ones_like(robots))) == [None, None, None]
@@ -194,7 +194,7 @@ def test_frechet_distances_are_compared_over_the_same_recordings():
         true = rng.normal(size=4)
         features["near"][f"e{number}"] = (true, true + 0.1 * rng.normal(size=4))
         features["far"][f"e{number}"] = (true, true + 2.0)
-    features["near"]["alone"] = (true, true)
+    features["near"]["alone"] = (true, true)  # pyright: ignore[reportPossiblyUnboundVariable]
     names = {"test": [f"e{number}" for number in range(12)] + ["alone"]}
     metrics, differences = distances(features, names, [("near", "far")], seed=0)
     assert metrics["test"]["near"]["mean"] < 1 < metrics["test"]["far"]["low"]

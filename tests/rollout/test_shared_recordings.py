@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from tests.rollout.run_chain import run_chain
+from tests.rollout.run_chain import run_chain  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
@@ -42,7 +42,7 @@ def inputs_of(
     with EpisodeSetWriter(root / "episodes", fps=fps, image_size=SIZE) as writer:
         for episode, frames in recordings:
             writer.add(episode, frames)
-    config = RenderActionsConfig(source="state", sigma_px_ref=SIGMA_PX_REF, previews=0)
+    config = RenderActionsConfig(source="state", sigma_px_ref=SIGMA_PX_REF, previews=0)  # pyright: ignore[reportCallIssue]
     counts = render_actions(config, {"episodes": root / "episodes"}, root / "tracks")
     assert counts["kept"] == len(recordings)
     clip = frames_to_video(recordings[0][1]["head"][:9])
@@ -86,7 +86,7 @@ def droid(shared_data: Path, tmp_path_factory: pytest.TempPathFactory, make_mode
     curated = EpisodeSet.open(root / "curated")
     episode = curated.episode(0)
     recorded = json.loads((folder / "selfcal_droid_new_setup_0003.json").read_text())
-    head = resized(recorded["camera_0"], *recorded["image_size"], "head")
+    head = resized(recorded["camera_0"], *recorded["image_size"], "head")  # pyright: ignore[reportCallIssue]
     mount = np.eye(4)
     mount[2, 3] = -0.12
     assert episode.T_base_ee is not None

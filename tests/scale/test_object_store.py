@@ -123,13 +123,13 @@ def test_a_folder_that_could_not_be_listed_is_not_left_out(monkeypatch: pytest.M
     fs = Forgetful()
     for name in ("a.txt", "one/b.txt"):
         fs.pipe_file(f"/bucket/{name}", b"x")
-    location = UPath("memory://bucket")
+    location: Any = UPath("memory://bucket")
     monkeypatch.setattr(type(location), "fs", fs)
     with pytest.raises(UnreachableInputError, match="could not be reached"):  # every attempt in the second folder
         list_files(location)
     monkeypatch.setattr(Forgetful, "ls", MemoryFileSystem.ls)
     assert list(list_files(location)) == ["a.txt", "one/b.txt"]
-    assert list_files(UPath("memory://bucket/none")) == {}
+    assert list_files(location / "none") == {}
 
 
 @pytest.mark.parametrize("relative", ["../other/x.mp4", "a/../../x", "/etc/passwd", "s3://other/x", "a\0b"])
@@ -159,7 +159,7 @@ def test_copies_stay_within_their_bound(tmp_path: Path, store: ObjectStore) -> N
 def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "a.bin").write_bytes(b"x" * 5000)
-    root = parse_location(store.upload(tmp_path / "files", "cut"))
+    root: Any = parse_location(store.upload(tmp_path / "files", "cut"))
     fetched = 0
     whole = root.fs.get_file
 
@@ -178,7 +178,7 @@ def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypat
 
 def test_the_key_of_a_remote_input_follows_its_content(tmp_path: Path, recordings: Path, store: ObjectStore) -> None:
     artifacts = ArtifactStore(tmp_path / "artifacts")
-    url = parse_location(store.upload(recordings, "key"))
+    url: Any = parse_location(store.upload(recordings, "key"))
     first = artifacts.input_digest(url)
     fetched = [path for method, path in store.requests if method == "GET" and "/key/" in path]
     assert fetched == []  # the listing says enough

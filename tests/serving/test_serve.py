@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from tests.policies.test_openpi import policy_server
+from tests.policies.test_openpi import policy_server  # pyright: ignore[reportMissingImports]
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.policies.array_messages import pack, unpack
@@ -33,7 +33,7 @@ TOKEN, EPISODE = "correct horse", "ur5e_silver-test-s1-00000"
 @pytest.fixture(scope="module")
 def url(serving: Callable) -> Sequence[str]:  # type: ignore[misc]
     with serving() as address:
-        yield address
+        yield address  # pyright: ignore[reportReturnType]
 
 
 def drive(simulation: RemoteSimulation, steps: int, seed: int) -> str:
@@ -127,7 +127,7 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
             ({"seeds": [0] * 10_000}, "Too many clips"),
         ):
             with pytest.raises(DataError, match=match):
-                client.start(**(given | change))
+                client.start(**(given | change))  # pyright: ignore[reportArgumentType]
         with pytest.raises(DataError, match="No recording of this name"):
             client.start("nobody")
         with pytest.raises(DataError, match=r"(?s)Controls of a step have another shape.*\(2, 4, 14\)"):
@@ -274,16 +274,16 @@ def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> 
         with connect(url + "/v1?token=correct%20horse", proxy=None) as page:
             page.recv()
             page.send("no bytes")
-            assert "not understood" in unpack(page.recv(), "server")["error"]["what"]
+            assert "not understood" in unpack(page.recv(), "server")["error"]["what"]  # pyright: ignore[reportArgumentType]
             with pytest.raises(ConnectionClosed, match="1007"):
                 page.recv()
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    assert server_token(ServeConfig()) is None
-    assert server_token(ServeConfig(host="::1")) is None
+    assert server_token(ServeConfig()) is None  # pyright: ignore[reportCallIssue]
+    assert server_token(ServeConfig(host="::1")) is None  # pyright: ignore[reportCallIssue]
     with pytest.raises(ConfigError, match=r"(?s)needs a token.*0\.0\.0\.0.*WORLDLINE_TOKEN="):
-        server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104
+        server_token(ServeConfig(host="0.0.0.0"))  # noqa: S104  # pyright: ignore[reportCallIssue]
     monkeypatch.setenv(TOKEN_VARIABLE, "abc\r\n")  # no header can carry the end of a line
-    assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104
+    assert server_token(ServeConfig(host="0.0.0.0")) == "abc"  # noqa: S104  # pyright: ignore[reportCallIssue]
 
 
 def test_connections_that_say_nothing_are_closed_and_bounded(

@@ -15,6 +15,7 @@ import pytest
 from prefect import flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowFilter, FlowFilterName
+from prefect.client.schemas.sorting import TaskRunSort
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from tasks.artifact_task import ArtifactReference, artifact_task
@@ -54,9 +55,9 @@ def _run(root: Path, first: str, second: str) -> tuple[ArtifactReference, Artifa
 def _last_states() -> dict[str, str]:
     with get_client(sync_client=True) as client:
         runs = client.read_task_runs(
-            flow_filter=FlowFilter(name=FlowFilterName(any_=["two-steps"])), sort="EXPECTED_START_TIME_ASC"
-        )  # type: ignore[arg-type]
-    return {run.name: run.state.name for run in runs if run.state is not None}
+            flow_filter=FlowFilter(name=FlowFilterName(any_=["two-steps"])), sort=TaskRunSort.EXPECTED_START_TIME_ASC
+        )
+    return {run.name: str(run.state.name) for run in runs if run.state is not None}
 
 
 def _shown(expected: dict[str, str]) -> dict[str, str]:
