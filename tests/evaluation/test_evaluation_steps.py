@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.evaluation.planning import evaluate_planning as outcomes
 from worldline_core.evaluation.planning.evaluate_planning import CHOICES_FILE, SEALED_FILE, evaluate_planning
-from worldline_core.evaluation.policy.evaluate_policy import evaluate_policy
+from worldline_core.evaluation.policy.evaluate_policy import choose_trajectories, evaluate_policy
 from worldline_core.evaluation.policy.evidence import SCHEMAS, MotionEvidence, Reconciliation
 from worldline_core.evaluation.video.evaluate_video import evaluate_video
 from worldline_core.evaluation.vlm import Part, Text
@@ -72,7 +74,10 @@ def test_interrupted_evaluation_ends_with_the_same_bytes(recordings, evaluated, 
     parts = sorted((tmp_path / "again/run/parts").rglob("*.json"))
     for path in [*parts[::2], tmp_path / "again/scores.parquet", tmp_path / "again/summary.json"]:
         path.unlink()
+    written = {path: path.stat().st_mtime_ns for path in parts[1::2]}
+    assert len(written) >= 4
     evaluate_video(VIDEO, recordings.inputs, tmp_path / "again")
+    assert {path: path.stat().st_mtime_ns for path in written} == written  # what was there is not measured again
     assert contents(evaluated) == contents(tmp_path / "again")
 
 
@@ -139,12 +144,15 @@ def test_no_bank_large_enough_is_an_error(sealed, tmp_path):
         evaluate_planning(PLANNING.model_copy(update={"budgets": (32,)}), sealed, tmp_path)
 
 
-def test_policy_evaluation_is_balanced(recordings, tmp_path):
-    limited = POLICY.model_copy(update={"max_per_group": 1})
-    assert evaluate_policy(limited, recordings.inputs, tmp_path)["trajectories"] == 2
-    rows = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
-    assert sorted({(row["episode_id"], row["outcome"]) for row in rows})[0][1] != "unknown"
-    assert {row["outcome"] for row in rows} == {"success", "failure"}
+@pytest.mark.parametrize(
+    ("changes", "counts"), [({}, (4, 4)), ({"balanced": False}, (5, 4)), ({"max_per_group": 1}, (1, 1))]
+)
+def test_as_many_successes_as_failures_are_judged(policies, changes, counts):
+    """Of nine attempts five succeed."""
+    rows = EpisodeSet.open(policies.inputs["episodes"]).rows
+    chosen = choose_trajectories(POLICY.model_copy(update=changes), rows, Counter())
+    found = Counter(row.outcome for row in chosen)
+    assert (found["success"], found["failure"]) == counts
 
 
 @pytest.mark.slow
@@ -263,17 +271,28 @@ class OddJudge:
 
 @pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
 def test_odd_values_of_a_judge_go_through_the_whole_step(recordings, tmp_path, monkeypatch, odd):
-    judge = OddJudge(odd)
+    judge, seen = OddJudge(odd), r"\ud800 \x1b[2J" if "observations" in odd else ""
     monkeypatch.setattr("worldline_core.evaluation.policy.evaluate_policy.open_vlm", lambda kind, config: judge)
     evaluate_policy(POLICY.model_copy(update={"judge": "openai"}), recordings.inputs, tmp_path)
     judge.asked.encode()  # a tokenizer takes nothing else
-    for row in pq.read_table(tmp_path / "decisions.parquet").to_pylist():
-        json.dumps(json.loads(row["evidence"]), allow_nan=False, ensure_ascii=False).encode()
+    rows = pq.read_table(tmp_path / "decisions.parquet").to_pylist()
+    assert len(rows) == 3 * 4  # two methods and the recordings
+    for row in rows:
+        assert (row["answers"], row["malformed_answers"], row["predicted"]) == (3, 0, "failure")
+        evidence = json.loads(row["evidence"])
+        json.dumps(evidence, allow_nan=False, ensure_ascii=False).encode()
+        assert len(evidence) == 3
+        assert {statement.get("confidence", 0.0) for statement in evidence} == {0.0}
+        assert {statement["observations"] for statement in evidence} == {seen}
 
 
 @pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
 def test_odd_values_of_a_selector_go_through_the_whole_step(sealed, tmp_path, monkeypatch, odd):
     monkeypatch.setattr(outcomes, "open_vlm", lambda kind, config: OddJudge(odd))
     evaluate_planning(PLANNING.model_copy(update={"selector": "openai"}), sealed, tmp_path / "out")
-    for row in pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist():
-        assert json.loads(row["trace"])["malformed_answers"] == 0, row
+    rows = pq.read_table(tmp_path / "out" / CHOICES_FILE).to_pylist()
+    assert len(rows) == 3 * 2 * 3  # methods, runs, budgets
+    for trace in (json.loads(row["trace"]) for row in rows):
+        assert trace["malformed_answers"] == 0
+        assert trace["answers"] >= 3
+        assert set(trace["scores"].values()) == {50}
