@@ -14,7 +14,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from tests.rollout.conftest import SIZE, digests, write_recordings
+from tests.rollout.conftest import SIZE, digests, write_recordings  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import read_quarantine
@@ -232,7 +232,8 @@ def test_recordings_of_another_rate_are_left_out(mixed: dict[str, Path]) -> None
     chosen = [episodes.position(name) for name in ("three", "two")]
 
     class Any3:
-        views, frames_per_unit, needs_cameras = VIEWS, 16, True
+        views: tuple[str, ...] = VIEWS
+        frames_per_unit, needs_cameras = 16, True
 
         def unit(self, frames: int) -> int:
             return 16
