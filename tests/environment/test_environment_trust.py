@@ -43,19 +43,20 @@ def test_info_says_how_far_the_judge_is_to_be_trusted(project_root: Path, tmp_pa
     body, place = setup_vectors(seen[0])
     near = [0.01 * random.normal(size=vectors.shape) for _ in range(8)]
     saved = SavedTrust(
-        JudgedBy(
+        format=1,
+        judged_by=JudgedBy(
             judge="measured", views=("head",), segmenter="learned",
             segmenter_weights=content_digest(shipped / "models" / "segmenter"),
         ),
-        (ROBOT,), 0.6, 8,
-        {"causal": SavedMethod(
+        embodiments=(ROBOT,), least_trust=0.6, training_recordings=8,
+        methods={"causal": SavedMethod(
             predicted_by=PredictedBy(
                 checkpoint=content_digest(shipped / "models" / "causal"), sampler="block_causal", steps=None
             ),
             signals=("doubt", "new_controls"), weights=(2.0, 0.0, -0.5),
         )},
-        KnownRecordings([(arms, vectors), *((arms, vectors + noise) for noise in near)]),
-        KnownRecordings([(body, place + 0.01 * random.normal(size=place.shape)) for _ in range(8)]),
+        controls=KnownRecordings([(arms, vectors), *((arms, vectors + noise) for noise in near)]),
+        setups=KnownRecordings([(body, place + 0.01 * random.normal(size=place.shape)) for _ in range(8)]),
     )  # fmt: skip
     saved.write(tmp_path)
     environment = WorldLineEnv(trust=tmp_path, **options)

@@ -96,11 +96,9 @@ def intrinsics_of_other_size(recording: Recording, random: np.random.Generator) 
 
 
 DEFECTS: dict[str, Callable[[Recording, np.random.Generator], Recording]] = {
-    "static_lead_in": static_lead_in,
-    "reset_segment": reset_segment,
-    "frozen_camera": frozen_camera,
-    "corrupted_frames": corrupted_frames,
-    "lagged_state": lagged_state,
-    "inverted_extrinsics": inverted_extrinsics,
-    "intrinsics_of_other_size": intrinsics_of_other_size,
-}
+    spoil.__name__: spoil
+    for spoil in (
+        static_lead_in, reset_segment, frozen_camera, corrupted_frames, lagged_state, inverted_extrinsics,
+        intrinsics_of_other_size,
+    )
+}  # fmt: skip

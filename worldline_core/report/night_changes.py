@@ -1,4 +1,5 @@
-"""What changed since earlier nights: each metric held against the last good night, and against several for slow drift.
+"""What changed since earlier nights: each metric held against the last good night, and against several for slow drift; and
+pictures of the recordings that lost most.
 
 Where nights have scores by recording, losses are tested on the same recordings (`evaluation.paired`), all metrics and
 questions together, at a chance of FALSE_ALARM a night that any of them is red although nothing changed:
@@ -13,14 +14,24 @@ at once), a metric became worse when its mean left the interval of the good nigh
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.evaluation.paired import PairedTest, Series, differences, margin_of, paired_tests, sign_of
+from worldline_core.evaluation.recordings import HEAD, stride_of
 from worldline_core.evaluation.scores import Interval
+from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
+from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.rollout.rollout_set import RolloutSet
+from worldline_core.store.artifact_files import digest_value
+from worldline_core.store.atomic import write_bytes_atomic
 
 FALSE_ALARM = 0.02
 DRIFT_NIGHTS = 7
@@ -170,3 +181,50 @@ def trends(nights: Sequence[Series]) -> Series:
         name: {r: sign_of(name) * float(weights @ [night[name][r] for night in nights]) for r in recordings}
         for name, recordings in _shared(nights)
     }
+
+
+PICTURES = "pictures"
+MOST_PICTURES = 4
+MOMENTS = 6
+
+
+def write_night_pictures(history: Path, compared: NightlyComparison, artifacts: Mapping[str, Path]) -> dict[str, str]:
+    """Head views of the recordings that lost most, or of the first recording of each method when none did.
+
+    Args:
+        artifacts: ``filter`` (the episodes) and ``rollout.<method>``; without them there are no pictures.
+
+    Returns:
+        files below ``history`` by what they show; those of the night before are removed.
+    """
+    shutil.rmtree(history / PICTURES, ignore_errors=True)
+    rollouts = {
+        name.partition(".")[2]: RolloutSet.open(path) for name, path in artifacts.items() if name.startswith("rollout.")
+    }
+    if "filter" not in artifacts or not rollouts:
+        return {}
+    episodes = EpisodeSet.open(artifacts["filter"])
+    recorded = {row.episode_id for row in episodes.rows}
+    written: dict[str, str] = {}
+    for method, recording in _wanted(compared, rollouts):
+        rollout = rollouts.get(method)
+        what = f"{recording}, {method}"
+        if rollout is None or recording not in recorded or what in written or len(written) == MOST_PICTURES:
+            continue
+        if HEAD not in rollout.views(recording):
+            continue
+        predicted, position = VideoFrames(rollout.clip(recording, HEAD)), episodes.position(recording)
+        moments = evenly_spaced(len(predicted), MOMENTS)
+        stride = stride_of(rollout, episodes.rows[position])
+        true = episodes.frames(position, HEAD, [stride * moment for moment in moments])
+        rows = [SheetRow("recorded", true), SheetRow(f"predicted by {method}", predicted[moments])]
+        file = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
+        write_bytes_atomic(history / file, jpeg_bytes(contact_sheet(rows, title=f"{compared.night}: {recording}")))
+        written[what] = file
+    return written
+
+
+def _wanted(compared: NightlyComparison, rollouts: Mapping[str, RolloutSet]) -> Iterator[tuple[str, str]]:
+    """(method, recording) in the order of interest."""
+    lost = [(change.metric.split("/")[2], recording) for change in compared.worse for recording, _ in change.worst]
+    yield from lost or [(method, rollout.episode_ids[0]) for method, rollout in rollouts.items()]

@@ -27,8 +27,14 @@ from worldline_core.pages.charts import Series, line_chart
 from worldline_core.pages.page import Table, code, interval, render, words
 from worldline_core.report.context import ReportConfig, ReportContext, Section
 from worldline_core.report.decisions import planning_section, policy_section
-from worldline_core.report.night_changes import DRIFT_NIGHTS, QUESTIONS, Change, NightlyComparison, compare_series
-from worldline_core.report.night_pictures import write_night_pictures
+from worldline_core.report.night_changes import (
+    DRIFT_NIGHTS,
+    QUESTIONS,
+    Change,
+    NightlyComparison,
+    compare_series,
+    write_night_pictures,
+)
 from worldline_core.report.quality import quality_section
 from worldline_core.store.artifact_files import JsonObject, digest_value, read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -113,8 +119,24 @@ def record_night(history: Path, night: str | None, inputs: Mapping[str, Path]) -
             expected=f"inputs named {', '.join(EVALUATIONS)}",
             got=", ".join(sorted(inputs)) or "none",
         )
+    series = _series(inputs)
     with exclusive_lock(history / ".lock"):
-        return _recorded(history, night, metrics, _series(inputs))
+        nights = read_history(history)
+        known = {found.night: index for index, found in enumerate(nights)}
+        name = night or time.strftime("%Y-%m-%d", time.gmtime())
+        if name in known and nights[known[name]].metrics == metrics:
+            return compare_nights(nights[: known[name] + 1], history)
+        if name in known and night is not None:
+            raise ArtifactError(
+                "This night is recorded with other scores", where=history / HISTORY_FILE, got=name,
+                next_step="give another name with --night, or none",
+            )  # fmt: skip
+        if name in known:
+            name = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime())
+        write_series(scores_file(history, name), series)
+        compared = compare_nights([*nights, Night(name, metrics)], history)
+        _write_history(history, [*nights, Night(name, metrics, good=not compared.regressions)])
+        return compared
 
 
 def _series(inputs: Mapping[str, Path]) -> ScoreSeries:
@@ -132,28 +154,6 @@ def _series(inputs: Mapping[str, Path]) -> ScoreSeries:
 def scores_file(history: Path, night: str) -> Path:
     """Where the scores by recording of a night lie."""
     return history / "scores" / f"{digest_value(night)[:16]}.parquet"
-
-
-def _recorded(
-    history: Path, night: str | None, metrics: Mapping[str, Interval], series: ScoreSeries
-) -> NightlyComparison:
-    """`record_night` of these metrics, by one process at a time."""
-    nights = read_history(history)
-    known = {found.night: index for index, found in enumerate(nights)}
-    name = night or time.strftime("%Y-%m-%d", time.gmtime())
-    if name in known and nights[known[name]].metrics == metrics:
-        return compare_nights(nights[: known[name] + 1], history)
-    if name in known and night is not None:
-        raise ArtifactError(
-            "This night is recorded with other scores", where=history / HISTORY_FILE, got=name,
-            next_step="give another name with --night, or none",
-        )  # fmt: skip
-    if name in known:
-        name = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime())
-    write_series(scores_file(history, name), series)
-    compared = compare_nights([*nights, Night(name, metrics)], history)
-    _write_history(history, [*nights, Night(name, metrics, good=not compared.regressions)])
-    return compared
 
 
 def accept_night(history: Path, night: str) -> None:

@@ -92,13 +92,8 @@ class CurateConfig(StrictModel):
         """The configuration as it holds for sources[number]: what the source says of itself goes before what is said for
         all."""
         source = self.sources[number]
-        changes: dict[str, object] = {}
-        if source.image_size is not None:
-            changes["image_size"] = source.image_size
-        if source.fit is not None:
-            changes["fit"] = source.fit
-        if source.primary_view is not None:
-            changes["primary_view"] = source.primary_view
+        own = {name: getattr(source, name) for name in ("image_size", "fit", "primary_view")}
+        changes = {name: value for name, value in own.items() if value is not None}
         if source.target_fps is not None or source.stride is not None:
             changes |= {"fps": source.target_fps, "stride": source.stride}
         return self.model_copy(update=changes) if changes else self

@@ -24,7 +24,7 @@ from av.video.stream import VideoStream
 
 from worldline_core.data.guards.plain_files import well_formed
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.lerobot.statistics import ImageSampler
+from worldline_core.data.lerobot.metadata import ImageSampler
 from worldline_core.data.lerobot.v3_writer import EpisodeVideo
 from worldline_core.data.video.clip import (
     FRAME_TOLERANCE,

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from worldline_core.data.lerobot.dataset import DATA_PATH, IMAGE_PREFIX, VERSION, VIDEO_PATH
-from worldline_core.data.lerobot.statistics import as_json, image_statistics, vector_statistics
+from worldline_core.data.lerobot.metadata import as_json, image_statistics, vector_statistics
 from worldline_core.data.video.encoder import concatenate_videos
 from worldline_core.data.video.thumbnails import cache_path
 from worldline_core.store.atomic import atomic_path, write_json_atomic, write_table_atomic

@@ -185,8 +185,10 @@ def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], 
                 for found in (calibrated([row for row in trusted if row["method"] == method]),)
             }
             robots = tuple(sorted({row.embodiment for row in chosen}))
-            least = config.trust.least_trust
-            SavedTrust(judged_by, robots, least, known.count, calibrations, known.controls, known.setups).write(output)
+            SavedTrust(
+                format=1, judged_by=judged_by, embodiments=robots, least_trust=config.trust.least_trust,
+                training_recordings=known.count, methods=calibrations, controls=known.controls, setups=known.setups,
+            ).write(output)  # fmt: skip
     return counts | _write(config, decisions, facts, judge.name, output)
 
 

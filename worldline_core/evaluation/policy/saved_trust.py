@@ -7,13 +7,13 @@ tensors are the training recordings that novelty is measured against (:mod:`worl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 
 from worldline_core.config import StrictModel
@@ -55,36 +55,25 @@ class SavedMethod(StrictModel):
     weights: tuple[float, ...]
 
 
-class _Header(StrictModel):
+class SavedTrust(StrictModel):
+    """A saved calibration, and the training recordings that it measures novelty against, which are no part of the header."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
     format: Literal[1]
     judged_by: JudgedBy
     embodiments: tuple[str, ...]
     least_trust: float
     training_recordings: int
     methods: dict[str, SavedMethod]
-
-
-@dataclass(frozen=True)
-class SavedTrust:
-    """A saved calibration, and the training recordings that it measures novelty against."""
-
-    judged_by: JudgedBy
-    embodiments: tuple[str, ...]
-    least_trust: float
-    training_recordings: int
-    methods: Mapping[str, SavedMethod]
-    controls: KnownRecordings
-    setups: KnownRecordings
+    controls: KnownRecordings = Field(exclude=True)
+    setups: KnownRecordings = Field(exclude=True)
 
     def write(self, folder: Path) -> None:
         """Write ``trust.safetensors``."""
-        header = _Header(
-            format=1, judged_by=self.judged_by, embodiments=self.embodiments, least_trust=self.least_trust,
-            training_recordings=self.training_recordings, methods=dict(self.methods),
-        )  # fmt: skip
         known = {"controls": self.controls, "setups": self.setups}
         arrays = {f"{what}/{name}": array for what, found in known.items() for name, array in found.arrays().items()}
-        write_arrays_atomic(folder / TRUST_FILE, arrays, {_HEADER: header.model_dump_json()})
+        write_arrays_atomic(folder / TRUST_FILE, arrays, {_HEADER: self.model_dump_json()})
 
     @classmethod
     def read(cls, path: Path) -> SavedTrust:
@@ -100,21 +89,21 @@ class SavedTrust:
             )  # fmt: skip
         try:
             with safe_open(file, framework="np") as opened:
-                header = _Header.model_validate_json((opened.metadata() or {}).get(_HEADER, ""))
+                header = json.loads((opened.metadata() or {}).get(_HEADER, ""))
                 arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-            known = [
-                KnownRecordings.of_arrays(
+            known = {
+                what: KnownRecordings.of_arrays(
                     {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith(f"{what}/")}
                 )
                 for what in ("controls", "setups")
-            ]
-        except (SafetensorError, ValidationError, ValueError, KeyError) as error:
+            }
+            saved = cls.model_validate({**header, **known})
+        except (SafetensorError, ValidationError, ValueError, KeyError, TypeError) as error:
             raise ArtifactError("Not a saved calibration of trust", where=file, got=error) from error
-        wrong = [name for name, found in header.methods.items() if len(found.weights) != 1 + len(found.signals)]
+        wrong = [name for name, found in saved.methods.items() if len(found.weights) != 1 + len(found.signals)]
         if wrong or not all(np.isfinite(array).all() for array in arrays.values()):
             raise ArtifactError("A saved calibration of trust is damaged", where=file, got=wrong or "not finite")
-        facts = header.embodiments, header.least_trust, header.training_recordings, header.methods
-        return cls(header.judged_by, *facts, *known)
+        return saved
 
     def require(self, judged_by: JudgedBy, embodiments: Iterable[str]) -> None:
         """Raises: ConfigError when the verdicts are of another judge, or on robots that it was not made with."""
