@@ -8,8 +8,7 @@ from prefect import flow
 
 from tasks.artifact_task import ArtifactReference
 from tasks.prefect_artifacts import report_pictures, show_in_prefect
-from tasks.run_nodes import run_nodes
-from tasks.run_page import RunPage
+from tasks.run_nodes import RunPage, run_nodes
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan

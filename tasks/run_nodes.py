@@ -1,15 +1,18 @@
-"""The nodes of a run as Prefect tasks: each starts when the artifacts that it needs are finished, some side by side."""
+"""The nodes of a run as Prefect tasks: each starts when the artifacts that it needs are finished, some side by side; and the
+page that says how far the run is, kept true while they run."""
 
 from __future__ import annotations
 
 import functools
 import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, Self
 
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import State
@@ -20,22 +23,81 @@ from prefect.task_runners import ProcessPoolTaskRunner
 from tasks.artifact_task import ArtifactReference, FindArtifact, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
-from worldline_core.report.progress import share
+from worldline_core.report.progress import DoneNode, estimate_left, share, write_finished_page, write_progress_page
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 
 POLL_SECONDS = 0.1
+REFRESH_SECONDS = 10.0
 
 
-class RunWatcher(Protocol):
-    """Is told what happens to the nodes of a run."""
+class RunPage:
+    """Writes ``report/latest/index.html`` in a store: after every node and every ten seconds while the run goes on.
 
-    def started(self, node: str) -> None: ...
+    A context: when it is left, the page leads to the finished report, or shows the error that ended the run.
+    """
 
-    def finished(self, node: str, artifact: ArtifactReference, cached: bool) -> None: ...
+    def __init__(self, artifacts: Path, nodes: Sequence[str], at_once: int = 1) -> None:
+        self.artifacts = artifacts
+        self.folder = artifacts / "report" / "latest"
+        self._at_once = at_once
+        self._to_come = list(nodes)
+        self._running: dict[str, float] = {}
+        self._done: list[DoneNode] = []
+        self._report: Path | None = None
+        self._began = time.monotonic()
+        self._change = threading.RLock()
+        self._over = threading.Event()
+        self._clock = threading.Thread(target=self._keep_true, name="run page", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._clock.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._clock.join()
+        if error is not None:
+            self._write(failed=str(error) or type(error).__name__)
+        elif self._report is not None:
+            write_finished_page(self.folder, self._report)
+
+    def started(self, node: str) -> None:
+        """A node has been started."""
+        with self._change:
+            self._to_come.remove(node)
+            self._running[node] = time.monotonic()
+
+    def finished(self, node: str, artifact: ArtifactReference, cached: bool) -> None:
+        """A node has ended, or was found finished."""
+        with self._change:
+            began = self._running.pop(node)
+            folder = Path(str(artifact.path))
+            self._done.append(DoneNode(node, folder, 0.0 if cached else time.monotonic() - began, cached))
+            if artifact.step == "report":
+                self._report = folder
+        self._write()
+
+    def _keep_true(self) -> None:
+        while not self._over.wait(REFRESH_SECONDS):
+            if self._done:
+                self._write()
+
+    def _write(self, failed: str = "") -> None:
+        with self._change:
+            now = time.monotonic()
+            left = estimate_left(
+                self.artifacts, self._done, list(self._running), self._to_come,
+                sum(now - began for began in self._running.values()), self._at_once,
+            )  # fmt: skip
+            write_progress_page(
+                self.folder, self._done, list(self._running), self._to_come, now - self._began, left, failed
+            )
 
 
 def run_nodes(
-    nodes: Sequence[Node], store_root: Path, runner: RunnerConfig, watcher: RunWatcher | None = None
+    nodes: Sequence[Node], store_root: Path, runner: RunnerConfig, watcher: RunPage | None = None
 ) -> dict[str, ArtifactReference]:
     """Run every node, or find its artifact; returns the artifacts by the nodes' names.
 
@@ -73,7 +135,7 @@ class _Run:
         self,
         store_root: Path,
         runner: RunnerConfig,
-        watcher: RunWatcher | None,
+        watcher: RunPage | None,
         pool: Callable[[], ProcessPoolTaskRunner] | None,
     ) -> None:
         self.store_root = store_root

@@ -23,8 +23,7 @@ from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, tempor
 
 from tasks.artifact_task import ArtifactReference
 from tasks.prefect_artifacts import is_worth_saying, show_in_prefect
-from tasks.run_nodes import by_urgency, run_nodes
-from tasks.run_page import RunPage
+from tasks.run_nodes import RunPage, by_urgency, run_nodes
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import DataError
 from worldline_core.pipeline import steps

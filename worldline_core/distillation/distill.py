@@ -70,6 +70,7 @@ __all__ = ["DistillConfig", "distill"]
 logger = logging.getLogger(__name__)
 
 STEPS = ("teacher_forcing", "trajectory_regression", "distribution_matching")
+TRAJECTORIES = "trajectories"
 LPIPS_OFF = "off: no LPIPS weights configured"
 
 
@@ -215,18 +216,14 @@ class DistillationRun:
         )
 
     def _work(self, step: str) -> Path:
-        """Where a step keeps its training state and its log until it is finished."""
+        """Where a step keeps its training state and its log until it is finished, and where the offline trajectories lie."""
         return self.output / "run" / step
-
-    @property
-    def _trajectory_folder(self) -> Path:
-        return self.output / "run" / "trajectories"
 
     def _make_trajectories(self, teacher_info: CheckpointInfo) -> None:
         """The offline trajectories of the causal teacher; shards that exist are kept."""
         settings = self.config.trajectory_regression.trajectories
         trainer = self.config.trajectory_regression.trainer
-        folder = self._trajectory_folder
+        folder = self._work(TRAJECTORIES)
         if not (folder / INDEX).is_file():
             teacher, _ = load_checkpoint(self.folder(STEPS[0]), expect_kind="causal")
             teacher.to(trainer.device).eval().requires_grad_(False)
@@ -252,7 +249,7 @@ class DistillationRun:
     def _load_trajectories(self, step: str) -> Callable[[int], TrajectoryBatch]:
         trainer: TrainerConfig = getattr(self.config, step).trainer
         loader = TrajectoryLoader(
-            TrajectoryStore.open(self._trajectory_folder),
+            TrajectoryStore.open(self._work(TRAJECTORIES)),
             self.loader,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
@@ -283,25 +280,19 @@ class DistillationRun:
         folder, log = self.folder(step), self.output / step / "metrics.jsonl"
         if (folder / "checkpoint.json").is_file() and log.is_file():
             return {f"{step}/{name}": value for name, value in read_checkpoint_info(folder).metadata["metrics"].items()}
-        work, model = self._work(step), objective.model
+        config, work, model = self.config, self._work(step), objective.model
         result = train(
             trainer,
             groups=(ParameterGroup("student", _named_parameters(model)), *(group for group, _ in others)),
             objective=objective,
             load=load,
             validate=validation_function(
-                self.loader,
-                self.config.clips,
-                self.config.validation_splits,
-                trainer,
-                self.rows,
-                objective,
-                self.config.input,
+                self.loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
             ),
             output=work,
             identity={
                 "step": step,
-                "config": self.config.model_dump(mode="json"),
+                "config": config.model_dump(mode="json"),
                 "parent": parent.weights_sha256,
                 "stage2": self.stage2_info.weights_sha256,
                 "episodes": named_rows(self.rows),
@@ -318,7 +309,7 @@ class DistillationRun:
                 model,
                 kind="causal",
                 action_contract=self.stage2_info.contract,
-                causal=self.config.spec,
+                causal=config.spec,
                 trained=self._trained(model.config.views),
                 metadata={
                     "distillation": step,
@@ -328,7 +319,7 @@ class DistillationRun:
                     "tokenizer": self.store.description["tokenizer"],
                     "lpips": self.lpips,
                     "metrics": result.metrics,
-                    **input_facts(self.config.input, self.store, self._work(STEPS[0]), self._trajectory_folder),
+                    **input_facts(config.input, self.store, self._work(STEPS[0]), self._work(TRAJECTORIES)),
                 },
                 state_dict=weights,
             )
