@@ -88,7 +88,7 @@ def test_variety_is_drawn_within_its_limits_and_changes_nothing_else():
     jobs = plan_jobs(config)
     policies = [job.policy for job in jobs]
     assert None not in policies
-    assert {policy.mistakes for policy in policies} == {None}
+    assert {policy.mistakes for policy in policies} == {None}  # pyright: ignore[reportOptionalMemberAccess]
     noise, delay, gripper = (
         np.array([getattr(policy, name) for policy in policies])
         for name in ("noise_m", "delay_frames", "gripper_delay_frames")

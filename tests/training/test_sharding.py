@@ -60,7 +60,7 @@ PASSES = [clip_pass, teacher_forcing_pass, rollout_pass]
 def gradients(model: WorldModel, passing: Callable[[WorldModel], torch.Tensor]) -> tuple[dict[str, torch.Tensor], int]:
     """Gradients of a pass, and how often the first block ran."""
     calls: list[int] = []
-    model.layers[0].mlp_moe_gen.up_proj.register_forward_hook(lambda *_: calls.append(1))
+    model.layers[0].mlp_moe_gen.up_proj.register_forward_hook(lambda *_: calls.append(1))  # pyright: ignore[reportAttributeAccessIssue]
     passing(model).square().mean().backward()
     return {name: value.grad for name, value in model.named_parameters() if value.grad is not None}, len(calls)
 
