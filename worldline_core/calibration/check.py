@@ -26,7 +26,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.data.video.frames import MadeFrames
@@ -270,15 +270,8 @@ def _images(loaded: LoadedEpisode, view: str) -> MadeFrames:
         for image in loaded.each_image(view):
             yield image
             found += 1
-        if found != expected:
-            raise RejectedInputError(
-                "length_mismatch",
-                "Video and states differ in length",
-                where=f"episode {loaded.episode.episode_id}, view {view}",
-                expected=f"{expected} frames",
-                got=f"{found} frames",
-                evidence={"states": expected, "frames": found},
-            )
+        where = f"episode {loaded.episode.episode_id}, view {view}"
+        check_length("Video", where, states=expected, unit="frames", found=found)
 
     return MadeFrames(counted, (expected,), np.uint8)
 

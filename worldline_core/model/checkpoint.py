@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import torch
-from pydantic import ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ValidationError, field_validator, model_validator
 from torch import Tensor
 
 from worldline_core.config import StrictModel
@@ -257,6 +257,14 @@ def read_description(path: Path, form: str, noun: str, *, version: int | None = 
     if not isinstance(content, dict) or found != (form, version):
         raise CheckpointError(f"Not a {noun} of this version", where=path, expected=(form, version), got=found)
     return content
+
+
+def described[M: BaseModel](model: type[M], values: object, what: str, path: Path) -> M:
+    """Values of a description as a model. Raises: CheckpointError where they are not valid."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise CheckpointError(f"{what} is not valid", where=path, got=str(error)) from error
 
 
 def fill(model: torch.nn.Module, tensors: Mapping[str, Tensor], *, where: object, dtype: torch.dtype) -> None:

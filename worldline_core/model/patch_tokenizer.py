@@ -18,13 +18,13 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
 from jaxtyping import Float
-from pydantic import Field, ValidationError
+from pydantic import Field
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, DataError
-from worldline_core.model.checkpoint import fill, read_description
+from worldline_core.model.checkpoint import described, fill, read_description
 from worldline_core.model.video_tokenizer import GroupDecoder, check_latents, check_video
 from worldline_core.model.weight_files import read_weights
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -250,10 +250,7 @@ class PatchTokenizer(nn.Module):
         content = read_description(path, FORMAT, "tokenizer", version=VERSION)
         if content.get("kind") != cls.KIND:
             raise CheckpointError("Unknown kind of tokenizer", where=path, expected=cls.KIND, got=content.get("kind"))
-        try:
-            tokenizer = cls(PatchTokenizerConfig.model_validate(content.get("config")))
-        except ValidationError as error:
-            raise CheckpointError("The tokenizer's config is not valid", where=path, got=str(error)) from error
+        tokenizer = cls(described(PatchTokenizerConfig, content.get("config"), "The tokenizer's config", path))
         tokenizer.weights_sha256 = content["weights_sha256"]
         return tokenizer.eval().requires_grad_(False)
 

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import fill, read_description
+from worldline_core.model.checkpoint import described, fill, read_description
 from worldline_core.model.patch_tokenizer import Residual
 from worldline_core.model.video_tokenizer import VideoTokenizer, check_latents
 from worldline_core.model.weight_files import read_weights
@@ -195,7 +195,7 @@ class SmallDecoder(nn.Module):
         """
         path, weights = folder / DESCRIPTION, folder / WEIGHTS
         content = read_description(path, FORMAT, "decoder", version=VERSION)
-        config = _read_config(content, path)
+        config = described(SmallDecoderConfig, content.get("config"), "The decoder's config", path)
         layout = {"tokenizer": fingerprint, **{name: getattr(tokenizer, name) for name in _LAYOUT}}
         found = {name: getattr(config, name) for name in layout}
         if found != layout:
@@ -216,16 +216,10 @@ class SmallDecoder(nn.Module):
         """
         size, path = dict[str, int](), folder / DESCRIPTION
         if path.is_file():
-            config = _read_config(read_description(path, FORMAT, "decoder", version=VERSION), path)
+            content = read_description(path, FORMAT, "decoder", version=VERSION)
+            config = described(SmallDecoderConfig, content.get("config"), "The decoder's config", path)
             size = {"width": config.width, "depth": config.depth}
         return cls(SmallDecoderConfig.of(tokenizer, "", **size), tokenizer).eval().requires_grad_(False)
-
-
-def _read_config(content: Mapping[str, Any], path: Path) -> SmallDecoderConfig:
-    try:
-        return SmallDecoderConfig.model_validate(content.get("config"))
-    except ValidationError as error:
-        raise CheckpointError("The decoder's config is not valid", where=path, got=str(error)) from error
 
 
 def windows(

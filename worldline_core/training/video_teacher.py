@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float
-from pydantic import ValidationError
 from torch import Tensor, nn
 from torch.nn import functional
 
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.checkpoint import fill, read_description
+from worldline_core.model.checkpoint import described, fill, read_description
 from worldline_core.model.weight_files import read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape
@@ -207,8 +206,7 @@ VJEPA2_GIANT = {"hidden_size": 1408, "num_hidden_layers": 40, "num_attention_hea
 def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], Tensor]]:
     """A teacher of the right shape without trained weights, to count with, and its features: of the folder, else V-JEPA 2."""
     if folder is not None and (folder / DESCRIPTION).is_file():
-        description = read_description(folder / DESCRIPTION, FORMAT, "small teacher")
-        small = SmallVideoTeacher(SmallTeacherShape.model_validate(description.get("shape")))
+        small = SmallVideoTeacher(_small_shape(folder / DESCRIPTION))
         return small.eval().requires_grad_(False), small.features
     from transformers import VJEPA2Config, VJEPA2Model
 
@@ -217,6 +215,11 @@ def teacher_outline(folder: Path | None) -> tuple[nn.Module, Callable[[Tensor], 
         shape = read_json(folder / "config.json")
     model = VJEPA2Model(VJEPA2Config(**shape))
     return model, VJepa2Teacher.of(model).features
+
+
+def _small_shape(path: Path) -> SmallTeacherShape:
+    found = read_description(path, FORMAT, "small teacher").get("shape")
+    return described(SmallTeacherShape, found, "The small teacher's shape", path)
 
 
 def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
@@ -228,11 +231,7 @@ def load_teacher(folder: Path, device: str = "cpu") -> VideoTeacher:
     """
     path = folder / DESCRIPTION
     if path.is_file():
-        try:
-            shape = SmallTeacherShape.model_validate(read_description(path, FORMAT, "small teacher").get("shape"))
-        except ValidationError as error:
-            raise CheckpointError("The small teacher's shape is not valid", where=path, got=str(error)) from error
-        teacher = SmallVideoTeacher(shape)
+        teacher = SmallVideoTeacher(_small_shape(path))
         fill(teacher, read_weights(folder / WEIGHTS, None), where=folder / WEIGHTS, dtype=torch.float32)
         return teacher.eval().requires_grad_(False).to(device)
     config = folder / "config.json"
