@@ -17,7 +17,7 @@ from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard, Take
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.training import encode_latents as encoding
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.encode_latents import EncodeWork, claim_device, encode_latents, shard_name
+from worldline_core.training.encode_latents import SHARD_FILE, EncodeWork, claim_device, encode_latents
 
 CONFIG = EncodeLatentsConfig(image_size=(32, 32), episodes_per_shard=2)
 
@@ -48,7 +48,9 @@ def test_killed_and_resumed_in_another_order_with_other_threads(
     with pytest.raises(KeyboardInterrupt):
         encode_latents(CONFIG, inputs, tmp_path, KilledMapper())
     shards = undisturbed[1]["shards"]
-    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [shard_name(n) for n in range(shards)[-2:]]
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [
+        SHARD_FILE.format(n) for n in range(shards)[-2:]
+    ]
     encoded: list[str] = []
     whole = encoding.encode_episode
 
@@ -115,6 +117,6 @@ def test_every_process_has_a_device_of_its_own(
     workers = {}
     for device in ("cpu", "cuda", "cuda:1"):
         config = CONFIG.model_copy(update={"device": device})
-        work = EncodeWork(tmp_path, config, inputs["episodes"], inputs["tokenizer"], "groups")
+        work = EncodeWork(tmp_path, inputs["episodes"], config, inputs["tokenizer"], "groups")
         workers[device] = mapper._workers([Shard(work, 0, (0,))])
     assert workers == {"cpu": 16, "cuda": 2, "cuda:1": 1}

@@ -34,6 +34,7 @@ from worldline_core.store.artifact_files import how_to_rebuild
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_json_atomic
 
 HEAD_VIEW = "head"
+SHARD_FILE = "tracks-{:05d}.safetensors"
 INDEX_FILE, DESCRIPTION_FILE = "index.parquet", "tracks.json"
 SAMPLES = ("uv", "depth", "rot6d", "gripper", "valid")
 """Arrays with one entry per frame, view and arm: what action maps are rendered from."""
@@ -186,11 +187,6 @@ def collate_tracks(clips: Sequence[EpisodeTracks], views: Sequence[str] | None =
     return TrackBatch(**{name: torch.from_numpy(np.stack(column)) for name, column in columns.items()})
 
 
-def shard_name(number: int) -> str:
-    """File name of a shard."""
-    return f"tracks-{number:05d}.safetensors"
-
-
 def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> list[dict[str, Any]]:
     """Write one shard atomically; returns its index rows."""
     arrays: dict[str, np.ndarray] = {}
@@ -202,7 +198,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
         rows.append(
             {
                 "episode_id": episode.episode_id,
-                "shard": shard_name(number),
+                "shard": SHARD_FILE.format(number),
                 "embodiment": episode.embodiment,
                 "num_frames": episode.num_frames,
                 "views": list(episode.views),
@@ -213,7 +209,7 @@ def write_shard(root: Path, number: int, tracks: Sequence[EpisodeTracks]) -> lis
                 "camera_motion": list(episode.camera_motion),
             }
         )
-    write_arrays_atomic(root / shard_name(number), arrays)
+    write_arrays_atomic(root / SHARD_FILE.format(number), arrays)
     return rows
 
 

@@ -16,9 +16,9 @@ from worldline_core.actions.action_tracks import MissingActionsError, compute_tr
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import (
     ARRAYS,
+    SHARD_FILE,
     ActionTracks,
     EpisodeTracks,
-    shard_name,
     write_index,
     write_shard,
 )
@@ -28,14 +28,14 @@ from worldline_core.actions.tool_projection import TrackCounts, add_counts
 from worldline_core.data.episodes.episode import UNDESCRIBED
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
 from worldline_core.pictures.contact_sheet import evenly_spaced
 from worldline_core.pictures.labels import png_bytes
 from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_transient
 
@@ -59,22 +59,14 @@ class ProjectedEpisode(InputRow):
 
 
 @dataclass(frozen=True)
-class RenderWork(EpisodeWork[int, ProjectedEpisode]):
-    """Computes the tracks of each episode, named by its position in the set; a shard becomes one file of the artifact.
-
-    Attributes:
-        folder: of the set.
-    """
+class RenderWork(ShardFilesWork[ProjectedEpisode]):
+    """Computes the tracks of each episode; a shard becomes one file of the artifact."""
 
     step: ClassVar[str] = "render_actions"
     doing: ClassVar[str] = "Projecting"
+    shard_file = SHARD_FILE
 
     config: RenderActionsConfig
-    folder: Path
-
-    @cached_property
-    def episodes(self) -> EpisodeSet:
-        return EpisodeSet.open(self.folder)
 
     @cached_property
     def _kinematics(self) -> KinematicsByName:
@@ -88,10 +80,6 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
                 next_step="declare the robot and its arms in the source; without, Stage I alone learns from it",
             )  # fmt: skip
         return self._kinematics.get(embodiment)
-
-    def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
-        done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()
-        return () if done else episodes
 
     def do(self, episode: int) -> ProjectedEpisode:
         with reading_input(f"{self.folder}, episode {self.episodes.rows[episode].episode_id}"):
@@ -138,7 +126,7 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
         return self._reject(episode, "crashed", detail, evidence)
 
     def finish_shard(self, number: int, results: Sequence[ProjectedEpisode]) -> None:
-        """Write the tracks of a shard into one file, and what is known of its episodes into another."""
+        """Write the tracks of a shard into one file; index rows, rejections, counts and account of its episodes into another."""
         counts: dict[str, list[TrackCounts]] = {}
         for result in results:
             if result.counts is not None:
@@ -150,14 +138,7 @@ class RenderWork(EpisodeWork[int, ProjectedEpisode]):
             "counts": {name: add_counts(parts) for name, parts in counts.items()},
             "account": [{name: getattr(result, name) for name in _ACCOUNT} for result in results],
         }
-        write_json_atomic(self._summary_path(number), summary)
-
-    def summary(self, number: int) -> dict[str, Any]:
-        """Index rows, rejections, counts by embodiment and account of a finished shard."""
-        return json.loads(self._summary_path(number).read_text(encoding="utf-8"))
-
-    def _summary_path(self, number: int) -> Path:
-        return self.output / "run" / f"shard-{number:05d}.json"
+        write_json_atomic(self.summary_path(number), summary)
 
     def _reject(self, position: int, reason: str, detail: str, evidence: Mapping[str, Any]) -> ProjectedEpisode:
         row = self.episodes.rows[position]
@@ -194,7 +175,7 @@ def render_actions(
     """
     if "episodes" not in inputs:
         raise ConfigError("render_actions needs an EpisodeSet", expected="input episodes", got=sorted(inputs))
-    work = RenderWork(output, config, inputs["episodes"])
+    work = RenderWork(output, inputs["episodes"], config)
     episodes = work.episodes
     pieces = list(batched(range(len(episodes)), config.episodes_per_shard))
     map_episodes(mapper or SerialMapper(), work, pieces)

@@ -16,7 +16,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from itertools import batched
 from pathlib import Path
 from typing import Any, ClassVar
@@ -34,7 +33,7 @@ from worldline_core.data.episodes.episode_index import (
     write_quarantine,
 )
 from worldline_core.data.episodes.episode_parts import part_name
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
 from worldline_core.filters.alignment import find_lags, find_projection
 from worldline_core.filters.calibration import find_calibration_faults, find_mistake
 from worldline_core.filters.filter_config import FilterConfig
@@ -43,7 +42,7 @@ from worldline_core.filters.pictures import find_picture_faults
 from worldline_core.filters.signals import Signals, measure
 from worldline_core.filters.verdict import Finding, Verdict, runs
 from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.artifact_files import row_schema
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
 
@@ -214,7 +213,7 @@ def filter_episodes(
         be read for a reason that passes (what is done stays, the next call does the rest).
     """
     mapper = mapper or SerialMapper()
-    work = FilterWork(output, config, inputs["episodes"])
+    work = FilterWork(output, inputs["episodes"], config)
     episodes = work.episodes
     map_episodes(mapper, work, list(batched(range(len(episodes)), mapper.episodes_per_shard)))
     account: list[InputRow] = []
@@ -256,22 +255,13 @@ def filter_episodes(
 
 
 @dataclass(frozen=True)
-class FilterWork(EpisodeWork[int, InputRow]):
-    """Writes the verdict on each episode, named by its position in the set.
-
-    Attributes:
-        folder: of the set.
-    """
+class FilterWork(EpisodeSetWork[InputRow]):
+    """Writes the verdict on each episode."""
 
     step: ClassVar[str] = "filter"
     doing: ClassVar[str] = "Examining"
 
     config: FilterConfig
-    folder: Path
-
-    @cached_property
-    def episodes(self) -> EpisodeSet:
-        return EpisodeSet.open(self.folder)
 
     def remaining(self, number: int, episodes: Sequence[int]) -> list[int]:
         del number

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,17 +21,18 @@ from torch import Tensor
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
-from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import resized_video
 from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes, reading_input
+from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.latent_store import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
 
+SHARD_FILE = "{:05d}.safetensors"
 _SPAN = 2 * TEMPORAL_FACTOR + 1
 
 
@@ -159,19 +159,18 @@ class EncodedEpisode(InputRow):
 
 
 @dataclass(frozen=True)
-class EncodeWork(EpisodeWork[int, EncodedEpisode]):
-    """Encodes each episode, named by its position in the set; a shard becomes one file of the artifact.
+class EncodeWork(ShardFilesWork[EncodedEpisode]):
+    """Encodes each episode; a shard becomes one file of the artifact.
 
     Attributes:
-        folder: of the set.
         codec: the tokenizer's folder.
     """
 
     step: ClassVar[str] = "encode_latents"
     doing: ClassVar[str] = "Encoding"
+    shard_file = SHARD_FILE
 
     config: EncodeLatentsConfig
-    folder: Path
     codec: Path
     layout: Layout
 
@@ -182,20 +181,12 @@ class EncodeWork(EpisodeWork[int, EncodedEpisode]):
         return torch.cuda.device_count() if self.config.device == "cuda" else 1
 
     @cached_property
-    def episodes(self) -> EpisodeSet:
-        return EpisodeSet.open(self.folder)
-
-    @cached_property
     def _device(self) -> tuple[str, IO[str] | None]:
         return claim_device(self.config.device, self.output / "run")
 
     @cached_property
     def _tokenizer(self) -> Encoder:
         return load_tokenizer(self.codec, self._device[0])
-
-    def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
-        done = self._summary_path(number).is_file() and (self.output / shard_name(number)).is_file()
-        return () if done else episodes
 
     def do(self, episode: int) -> EncodedEpisode:
         row = self.episodes.rows[episode]
@@ -219,28 +210,16 @@ class EncodeWork(EpisodeWork[int, EncodedEpisode]):
         )
 
     def finish_shard(self, number: int, results: Sequence[EncodedEpisode]) -> None:
-        """Write the latents of a shard into one file, and what is known of its episodes into another."""
+        """Write the latents of a shard into one file; their shape (c, h, w), and bytes by episode, into another."""
         tensors = {name: tensor for result in results for name, tensor in result.tensors.items()}
-        with atomic_path(self.output / shard_name(number)) as temporary:
+        with atomic_path(self.output / SHARD_FILE.format(number)) as temporary:
             save_file(dict(sorted(tensors.items())), temporary)
         shape = next(iter(tensors.values())).shape
         summary = {
             "latent_shape": [shape[1], *shape[3:]],
             "stored_bytes": {result.episode_id: result.stored_bytes for result in results},
         }
-        write_json_atomic(self._summary_path(number), summary)
-
-    def summary(self, number: int) -> dict[str, Any]:
-        """Shape of the latents (c, h, w) and bytes by episode of a finished shard."""
-        return json.loads(self._summary_path(number).read_text(encoding="utf-8"))
-
-    def _summary_path(self, number: int) -> Path:
-        return self.output / "run" / f"shard-{number:05d}.json"
-
-
-def shard_name(number: int) -> str:
-    """File of a shard."""
-    return f"{number:05d}.safetensors"
+        write_json_atomic(self.summary_path(number), summary)
 
 
 def encode_latents(
@@ -263,7 +242,7 @@ def encode_latents(
     fingerprint = tokenizer_fingerprint(tokenizer, Path(inputs["tokenizer"]))
     del tokenizer  # each process that encodes loads its own
     (output / "run").mkdir(parents=True, exist_ok=True)
-    work = EncodeWork(output, config, inputs["episodes"], inputs["tokenizer"], layout)
+    work = EncodeWork(output, inputs["episodes"], config, inputs["tokenizer"], layout)
     pieces = list(batched(selected, config.episodes_per_shard))
     map_episodes(mapper or SerialMapper(), work, pieces)
     summaries = [work.summary(number) for number in range(len(pieces))]
@@ -271,7 +250,7 @@ def encode_latents(
     account: list[InputRow] = []
     for number, (members, summary) in enumerate(zip(pieces, summaries, strict=True)):
         for row in (episodes.rows[index] for index in members):
-            rows.append(LatentRow.of(row, _views(row, config), shard=shard_name(number)))
+            rows.append(LatentRow.of(row, _views(row, config), shard=SHARD_FILE.format(number)))
             size = summary["stored_bytes"][row.episode_id]
             account.append(InputRow(episode_id=row.episode_id, source=row.source, status="kept", stored_bytes=size))
     write_account(output, account)

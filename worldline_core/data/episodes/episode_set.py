@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,6 +25,8 @@ from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.data.video.thumbnails import ThumbnailMaker, ViewThumbnails, cache_path, read_thumbnails
 from worldline_core.errors import DataError
+from worldline_core.scale.account import InputRow
+from worldline_core.scale.mapping import EpisodeWork
 from worldline_core.store.remote import is_remote
 
 __all__ = ["EpisodeRow", "EpisodeSet", "EpisodeSetWriter", "QuarantineRow"]
@@ -203,6 +208,43 @@ class EpisodeSet:
         row = self.rows[i]
         labels = self._open(i)[1].things(row.episode_index, view)
         return None if labels is None else labels[row.start : row.start + row.video_frames]
+
+
+@dataclass(frozen=True)
+class EpisodeSetWork[R: InputRow](EpisodeWork[int, R]):
+    """Work on the episodes of a set, each named by its position in it.
+
+    Attributes:
+        folder: of the set.
+    """
+
+    folder: Path
+
+    @cached_property
+    def episodes(self) -> EpisodeSet:
+        return EpisodeSet.open(self.folder)
+
+
+class ShardFilesWork[R: InputRow](EpisodeSetWork[R]):
+    """Work whose shards become a file each. What is known of a shard's episodes lies in `run/` until all shards are done.
+
+    Attributes:
+        shard_file: pattern of their names.
+    """
+
+    shard_file: ClassVar[str]
+
+    def remaining(self, number: int, episodes: Sequence[int]) -> Sequence[int]:
+        done = self.summary_path(number).is_file() and (self.output / self.shard_file.format(number)).is_file()
+        return () if done else episodes
+
+    def summary(self, number: int) -> dict[str, Any]:
+        """What `finish_shard` wrote of a shard's episodes."""
+        return json.loads(self.summary_path(number).read_text(encoding="utf-8"))
+
+    def summary_path(self, number: int) -> Path:
+        """Where `finish_shard` writes it."""
+        return self.output / "run" / f"shard-{number:05d}.json"
 
 
 def _conventions(row: EpisodeRow) -> dict[str, str | float | int]:
