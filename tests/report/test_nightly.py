@@ -171,13 +171,13 @@ NIGHT = '{"good": true, "metrics": {"x": {"count": 9, "high": 0.6, "low": 0.4, "
         (NIGHT + NIGHT, "a second time"),
         # The file is written as a whole: what is cut is damage, and would be lost with the next night.
         (NIGHT + NIGHT[:40], "not JSON"),
-        (NIGHT.replace("0.5", "NaN"), "a number that is none"),
-        (NIGHT.replace("0.5", "1e999"), "a number that is none"),
+        (NIGHT.replace("0.5", "NaN"), "a value that is not a finite number"),
+        (NIGHT.replace("0.5", "1e999"), "a value that is not a finite number"),
         (NIGHT.replace("0.5", '"0.5"'), "not a night"),
         (NIGHT.replace("0.5", "null"), "not a night"),
-        (NIGHT.replace("0.5", "true"), "a number that is none"),
-        (NIGHT.replace("true", '"false"'), "good or not"),
-        (NIGHT.replace('"2026-11-20"', "null"), "name is text"),
+        (NIGHT.replace("0.5", "true"), "a value that is not a finite number"),
+        (NIGHT.replace("true", '"false"'), "good true or false"),
+        (NIGHT.replace('"2026-11-20"', "null"), "night must be a text"),
     ],
 )
 def test_a_damaged_history_is_named(tmp_path: Path, line: str, match: str) -> None:

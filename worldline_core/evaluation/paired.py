@@ -1,4 +1,5 @@
-"""Evaluations of the same recordings compared, value by value: series of scores, and which of their differences are no chance.
+"""Evaluations of the same recordings compared, value by value: series of scores, and which differences are more than
+chance.
 
 A series is one metric of one method in one group of recordings: a value for each recording (or candidate bank). Its name is
 ``<what>/<group>/<method>/<metric>``: ``video/test/shipped_stage2/ssim@head``, ``planning/N=32/true/success``.
@@ -29,9 +30,9 @@ Series = dict[str, dict[str, float]]
 """By name of the series, the value of each recording."""
 EVALUATIONS = ("evaluate_video", "evaluate_policy", "evaluate_planning")
 LEAST_RECORDINGS = 8
-"""Fewer say too little of their own spread to be tested."""
+"""With fewer recordings their spread is too uncertain for a test."""
 DECISION_MARGIN = 0.01
-"""Of shares of right verdicts and successful plans: a smaller loss is no regression."""
+"""For accuracies and success rates: a smaller loss is no regression."""
 _COLUMNS = ("series", "recording", "value")
 _OPTIONAL = {field.name for field in fields(Score) if field.default == ""}
 _RESAMPLES = 2000

@@ -1,14 +1,14 @@
-"""What changed since earlier nights: each metric held against the last good night, and against several for slow drift; and
+"""What changed since earlier nights: each metric compared with the last good night, and with several for slow drift; and
 pictures of the recordings that lost most.
 
 Where nights have scores by recording, losses are tested on the same recordings (`evaluation.paired`), all metrics and
-questions together, at a chance of FALSE_ALARM a night that any of them is red although nothing changed:
+questions together; the probability that any of them turns red on a night without a change is FALSE_ALARM:
 
 - ``step``: against the last good night, the mean difference over recordings;
 - ``level``: against the median of each recording over the last DRIFT_NIGHTS good nights, which has less noise of its own;
 - ``drift``: the trend of each recording (least squares) over these nights and this one.
 
-A loss smaller than the metric's margin is none. Where a night has intervals only (older histories, metrics of all recordings
+A loss smaller than the metric's margin does not count. Where a night has intervals only (older histories, metrics of all recordings
 at once), a metric became worse when its mean left the interval of the good night.
 """
 
@@ -36,7 +36,7 @@ from worldline_core.store.atomic import write_bytes_atomic
 FALSE_ALARM = 0.02
 DRIFT_NIGHTS = 7
 LEAST_NIGHTS = 4
-"""Good nights before this one, from which on a level and a trend are looked at."""
+"""Level and drift are tested once there are so many good nights before this one."""
 LOWER_IS_BETTER = ("lpips", "error", "seconds", "malformed", "fvd")
 
 
@@ -61,18 +61,18 @@ class Tested:
 
     @property
     def worse_by(self) -> str | None:
-        """The question whose answer is a loss."""
+        """The question with the most certain loss; None without a loss."""
         losses = [(t.p_worse, q) for q, t in self.tests.items() if t.p_worse <= FALSE_ALARM and -t.mean > self.margin]
         return min(losses)[1] if losses else None
 
     @property
     def better(self) -> bool:
-        """Beside the last good night."""
+        """Whether it is better than on the last good night."""
         return self.tests["step"].p_better <= FALSE_ALARM and self.tests["step"].mean > self.margin
 
     @property
     def shown(self) -> tuple[str, PairedTest]:
-        """The question that decides, and its test."""
+        """The question that decides the verdict, and its test."""
         question = self.worse_by or "step"
         return question, self.tests[question]
 
@@ -225,6 +225,6 @@ def write_night_pictures(history: Path, compared: NightlyComparison, artifacts: 
 
 
 def _wanted(compared: NightlyComparison, rollouts: Mapping[str, RolloutSet]) -> Iterator[tuple[str, str]]:
-    """(method, recording) in the order of interest."""
+    """(method, recording) of the losses; without any, the first recording of each method."""
     lost = [(change.metric.split("/")[2], recording) for change in compared.worse for recording, _ in change.worst]
     yield from lost or [(method, rollout.episode_ids[0]) for method, rollout in rollouts.items()]

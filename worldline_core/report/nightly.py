@@ -2,9 +2,9 @@
 
 The history is one JSON object a line, oldest first: `{"night": "2026-11-21", "good": true, "metrics": {name: {mean, low,
 high, count}}}`; the scores of each recording lie in `scores/`, a Parquet file a night. Metrics are named
-`<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`, `planning/N=32/true/success`. How a night is held
-against earlier ones says `night_changes`. A night with regressions is not good: the next one is held against the same
-reference, until the loss is repaired or accepted.
+`<what>/<where>/<method>/<metric>`: `video/test/shipped_stage2/ssim@head`, `planning/N=32/true/success`. `night_changes`
+says how a night is compared with earlier ones. A night with regressions is not good: later nights are compared with the same
+reference until the loss is repaired or accepted.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", 
 
 @dataclass(frozen=True)
 class Night:
-    """What one night measured: means with 95 % intervals over trajectories, by metric; and whether later ones may be
-    held against it."""
+    """What one night measured: means with 95 % intervals over trajectories, by metric. ``good``: later nights may be
+    compared with it."""
 
     night: str
     metrics: Mapping[str, Interval]
@@ -65,9 +65,9 @@ def compare_with_history(
     Args:
         scores: finished Scores by step name.
         history: folder of the history.
-        night: as `record_night` has it.
+        night: its name, as in `record_night`.
         artifacts: the episodes (``filter``) and predictions (``rollout.<method>``) of this night, for pictures of the
-            recordings that lost most; a few of the first recordings when none did.
+            recordings that lost most, or else of the first recording of each method.
 
     Raises:
         ArtifactError: nothing was measured, the night is recorded with other scores, or the history is damaged.
@@ -157,7 +157,7 @@ def scores_file(history: Path, night: str) -> Path:
 
 
 def accept_night(history: Path, night: str) -> None:
-    """Make a night good: later ones are held against it.
+    """Mark a night as good: later ones are compared with it.
 
     Raises:
         ArtifactError: there is no such night, or the history is damaged.
@@ -201,17 +201,17 @@ def _night(row: JsonObject) -> Night:
     night = Night(row["night"], {name: Interval(**v) for name, v in row["metrics"].items()}, row.get("good", True))
     numbers = [number for value in night.metrics.values() for number in asdict(value).values()]
     if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
-        raise ValueError("a number that is none")
+        raise ValueError("a value that is not a finite number")
     if not isinstance(night.night, str) or not isinstance(night.good, bool):
-        raise TypeError("a night's name is text, and it is good or not")
+        raise TypeError("night must be a text, good true or false")
     return night
 
 
 def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
     """The intervals that are watched, by name: `<what>/<where>/<method>/<metric>`.
 
-    Watched are whole splits and every number of candidates; embodiments and families apart would make a false alarm
-    likely on any night. What has no finite mean and bounds is left out.
+    Whole splits and every number of candidates are watched. Embodiments and task families are not watched separately: so
+    many tests would make a false alarm likely every night. Metrics without a finite mean and bounds are left out.
 
     Raises: ArtifactError when a summary has another form than its evaluation writes.
     """
@@ -287,7 +287,7 @@ def nights_section(context: ReportContext, compared: NightlyComparison | None = 
 
 
 def history_table(nights: Sequence[Night]) -> Table:
-    """Every night, the latest first: whether later ones are held against it, and its headline metrics."""
+    """Every night, the latest first: whether later ones are compared with it, and its headline metrics."""
     headlines = [n for n in nights[-1].metrics if n.split("/")[-1].startswith(HEADLINES)][:MOST_COLUMNS]
     rows = [
         [night.night, "good" if night.good else "red"]

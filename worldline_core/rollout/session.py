@@ -1,9 +1,10 @@
-"""A prediction that goes on: what the cameras see now, then unit after unit, each under controls given after the last.
+"""A running prediction: it begins at what the cameras see now and predicts one unit (a block or a clip) at a time, each
+under controls that may be given as late as the step itself.
 
-A causal model goes on block by block: what it keeps is a window of constant size, whose positions are those of a trained
-clip however long the rollout is. A Stage II model goes on by chaining: it predicts a clip, and the last predicted picture
-of every view is the observed one of the next clip (they overlap by this one frame). Pictures are decoded unit by unit, so
-memory does not grow with the length.
+A causal model predicts block by block. Its KV cache is a window of constant size whose positions count from the window's
+start, so they stay within those of a training clip however long the rollout is. A Stage II model chains clips: the last
+predicted picture of every view is the observed one of the next clip (they overlap by this one frame). Pictures are decoded
+unit by unit, so memory does not grow with the length.
 
 Axis legend: b clips, v views, a channels of the action maps, t latent frames, n frames, h w pixels or latent cells.
 """
@@ -33,7 +34,8 @@ Frames = list[dict[str, np.ndarray]]
 
 
 class UnitSampler(Protocol):
-    """Samples latents unit by unit. ``chained``: every unit is a clip of its own, which begins where the last one ended."""
+    """Samples latents unit by unit. ``chained``: every unit is a clip of its own that begins at the last picture of the
+    one before."""
 
     views: tuple[str, ...]
     chained: bool
@@ -43,16 +45,16 @@ class UnitSampler(Protocol):
         ...
 
     def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
-        """Latents of the next ``n = t - 1`` latent frames, under controls that begin with the last known frame's."""
+        """Latents of the next ``n = t - 1`` latent frames, under controls from the last known frame on."""
         ...
 
     def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> Self:
-        """A sampler of these clips in the state that they are in; ``seeds``: of their noise from here on."""
+        """A sampler that continues these clips from their present state; ``seeds``: of the noise from here on."""
         ...
 
 
 class BlockSampler:
-    """The causal model, a block a step; ``seconds``: wall seconds of each block so far."""
+    """Samples one block per step with a causal model; ``seconds``: wall-clock time of each block so far."""
 
     chained = False
 
@@ -81,7 +83,7 @@ class BlockSampler:
 
 
 class ClipSampler:
-    """A Stage II model, a clip a step."""
+    """Samples one clip per step with a Stage II model."""
 
     chained = True
 
@@ -125,7 +127,7 @@ class Session:
         images: what each view sees now, in [-1, 1] at the model's size.
 
     Attributes:
-        observed: the given images as the tokenizer shows them, one frame a view.
+        observed: the given images, encoded and decoded by the tokenizer; one frame per view.
     """
 
     def __init__(
@@ -150,13 +152,13 @@ class Session:
         """Predict the next unit.
 
         Args:
-            maps: of the last latent frame that is known, and of those to predict.
+            maps: action maps of the last known latent frame and of those to predict.
 
         Returns:
             The predicted frames, without the known one.
 
         Raises:
-            DataError: a causal model is not given the controls of one block.
+            DataError: the controls given to a causal model are not those of one block.
         """
         if self._ended is not None:
             self._observe(torch.stack([self._last_pictures(clip) for clip in self._ended]))
@@ -167,11 +169,12 @@ class Session:
     def steps(
         self, maps: Iterable[Float[Tensor, "b v a t h w"]], *, overlapped: bool | None = None
     ) -> Iterator[Frames]:
-        """As `step`, for controls that are known beforehand: one block is decoded while the next is sampled.
+        """Like `step`, for controls that are known in advance: one block is decoded while the next is sampled.
 
         Args:
-            overlapped: None does so on a GPU, where decoding has a stream of its own; a CPU's cores are busy anyway. A
-                clip that begins at the last picture of the one before has to wait for it.
+            overlapped: whether to decode while sampling. None: on a GPU, where decoding gets a stream of its own, but not on
+                a CPU, whose cores are busy anyway. Chained clips never overlap: each begins at the last picture of the
+                one before.
         """
         on_gpu = torch.device(self._device).type == "cuda"
         if self._sampler.chained or not (on_gpu if overlapped is None else overlapped):
@@ -202,11 +205,11 @@ class Session:
             return self._decode(latents)
 
     def select(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Session:
-        """These clips in the state that they are in, to go on separately. One that is named several times is branched,
-        and what a causal model keeps of its history is shared.
+        """A session of these clips that continues from their present state, independently of this one. Naming a clip several
+        times makes branches of it, which share the cached history of a causal model.
 
         Args:
-            seeds: of the noise from here on, one for each of ``clips``; by default it goes on as it would.
+            seeds: of the noise from here on, one for each of ``clips``; by default the noise continues unchanged.
         """
         other = copy(self)
         other._sampler = self._sampler.select(clips, seeds)

@@ -1,9 +1,9 @@
-"""Work on many episodes, cut into shards that any process or machine sharing the folders can do.
+"""Processes many episodes in shards, in any process or on any machine that sees the same folders.
 
-A step says what it does with one episode (`EpisodeWork`); everything else is here, once: what is left to do, retries, crashes,
-workers that die, the account. An episode's result (or a shard's) appears on disk whole or not at all, so doing a shard
-again only does what is missing: a retry, another shard size and a resumed run give the same result. Where work runs never
-changes a result, and is part of no cache key.
+A step says what it does with one episode (`EpisodeWork`); this module does the rest for all steps: which episodes are left,
+retries, crashes, dead workers, and the record of what was done. An episode's result (or a shard's) appears on disk whole or not
+at all, so running a shard again only adds what is missing: a retry, another shard size and a resumed run give the same result.
+Where the work runs never changes a result and is part of no cache key.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MACHINE_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE
 
 
 class WorkerDiedError(WorldLineError):
-    """The process that did a shard ended without an answer: a crash in compiled code, or killed for its memory."""
+    """The worker process of a shard ended without an answer: it crashed in compiled code or was killed for its memory."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class EpisodeWork[E, R: InputRow](ABC):
 
     step: ClassVar[str]
     doing: ClassVar[str]
-    """Begins the detail of a crash: "Filtering ended with ..."."""
+    """First words of a crash message: "Filtering" of "Filtering ended with ..."."""
 
     output: Path
     run: str = field(default_factory=lambda: uuid.uuid4().hex, kw_only=True)
@@ -67,13 +67,14 @@ class EpisodeWork[E, R: InputRow](ABC):
 
     @abstractmethod
     def remaining(self, number: int, episodes: Sequence[E]) -> Sequence[E]:
-        """Of the episodes of shard `number` those that are not done yet."""
+        """The episodes of shard `number` that are not done yet."""
 
     @abstractmethod
     def do(self, episode: E) -> R:
-        """Keep or quarantine one episode.
+        """Process one episode: keep it or quarantine it.
 
-        Raises: what is transient or ends the run; every other error quarantines the episode as crashed.
+        Raises: transient errors (`is_transient`) and those that end the run (`ends_the_run`); for any other error the caller
+            quarantines the episode as crashed.
         """
 
     @abstractmethod
@@ -81,16 +82,17 @@ class EpisodeWork[E, R: InputRow](ABC):
         """Quarantine an episode whose processing ended in an unforeseen way."""
 
     def finish_shard(self, number: int, results: Sequence[R]) -> None:  # noqa: B027 - most steps have nothing to write
-        """Write what a shard has as a whole, when all of its episodes are done. Nothing by default."""
+        """Write the files that belong to a shard as a whole, once all of its episodes are done. Nothing by default."""
 
 
 @dataclass(frozen=True)
 class Shard[E]:
-    """Some episodes of a step, sent to whoever does them.
+    """Some episodes of a step: what a worker is given at a time.
 
     Attributes:
-        alone: one suspected episode, done to see whether it ends its worker; the whole shard is finished afterwards.
-        crashed: evidence for the episodes that did.
+        alone: the shard is one episode that may have killed a worker, run by itself to find out; the shard that it came from
+            is finished afterwards.
+        crashed: evidence of the crash, by episode that killed its worker: these are quarantined, not processed.
     """
 
     work: EpisodeWork[E, Any]
@@ -109,14 +111,14 @@ class Shard[E]:
 
 
 _current_work: dict[str, EpisodeWork[Any, Any]] = {}
-"""The work of the run that this process works on, by the run's name: at most one."""
+"""The work of the present run by the run's name, at most one: all shards of a run share what it has opened."""
 
 
 def do_shard(shard: Shard[Any]) -> None:
-    """Do what is left of a shard and write its account; called in any process.
+    """Process the episodes of a shard that are not done yet and record what became of them; runs in any process.
 
-    Raises: UnreachableInputError when the inputs of some episodes could not be read for a reason that passes (all others
-        are done); what ends the run.
+    Raises: UnreachableInputError when inputs of some episodes could not be read for a temporary reason (all others are done);
+        errors that end the run.
     """
     if shard.work.run not in _current_work:
         _current_work.clear()
@@ -161,9 +163,9 @@ def _do_episode[E](work: EpisodeWork[E, Any], episode: E, crash: Mapping[str, An
 
 @contextmanager
 def reading_input(where: object) -> Iterator[None]:
-    """Around the reading of what an earlier step has stored: a fault there is the run's, never a verdict on an episode.
+    """Wraps the reading of an earlier step's output: an error there ends the run and never quarantines an episode.
 
-    Raises: ArtifactError; as it is, what is transient or ends the run.
+    Raises: ArtifactError; transient errors and those that end the run pass unchanged.
     """
     try:
         yield
@@ -177,7 +179,7 @@ def reading_input(where: object) -> Iterator[None]:
 
 
 def ends_the_run(error: BaseException) -> bool:
-    """Whether every other episode would fail as well, for a reason that the user must remove first."""
+    """Whether every other episode would fail as well until the user removes the cause (a full disk, a wrong configuration)."""
     if isinstance(error, UnreachableInputError):
         return False
     if isinstance(error, OSError) and error.errno in _MACHINE_FULL:
@@ -186,11 +188,11 @@ def ends_the_run(error: BaseException) -> bool:
 
 
 type TakeOutcome = Callable[[Shard[Any], Exception | None], None]
-"""Is given each shard with the error that ended it (None: it is done); an error that it raises ends the work."""
+"""Called with each shard and the error that it ended with (None: it is done). If it raises, the work stops."""
 
 
 class ShardMapper(Protocol):
-    """Does shards somewhere, a bounded number at a time, and says what became of each."""
+    """Runs shards (here, in processes, on a cluster), a bounded number at a time, and reports the outcome of each."""
 
     @property
     def episodes_per_shard(self) -> int: ...
@@ -199,20 +201,20 @@ class ShardMapper(Protocol):
         """Call `do_shard` for each shard, in any order.
 
         Args:
-            take: is called here with each outcome, as they come.
-            one_at_a_time: no two shards at once, so that only the one shard can be what ends a worker.
+            take: called in this process with each outcome, in the order in which shards end.
+            one_at_a_time: never run two shards at once, so that it is clear which one killed a worker.
         """
         ...
 
 
 def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequence[Sequence[E]]) -> None:
-    """Do all episodes, each of `pieces` as a shard; one that fails does not keep the others from being done.
+    """Process all episodes, each of `pieces` as a shard. An episode that fails does not stop the others.
 
-    The episodes of a shard that failed, or whose worker died, are done again one at a time. Those that fail again are
-    quarantined as crashed.
+    When a shard fails or its worker dies, its episodes are run again one at a time; those that fail again are quarantined
+    as crashed.
 
-    Raises: UnreachableInputError, after everything else is done, when inputs could not be read for a reason that
-        passes; at once, what ends the run (a wrong configuration, a full disk).
+    Raises: UnreachableInputError, after everything else is done, when inputs could not be read for a temporary reason; at
+        once, errors that end the run (a wrong configuration, a full disk).
     """
     shards = [Shard(work, number, tuple(piece)) for number, piece in enumerate(pieces)]
     unfinished = [shard for shard in shards if work.remaining(shard.number, shard.episodes)]
@@ -245,7 +247,7 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
             "Some episodes could not be processed",
             where=shard.label,
             got=first_line(error),
-            next_step="run the step again; if it stays, look at the machine's memory",
+            next_step="run the step again; if it fails again, check how much memory the machine has left",
         ) from error
 
     total = sum(map(len, shards))
@@ -271,9 +273,9 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
 
 
 class RunnerConfig(StrictModel):
-    """What does the work on many episodes.
+    """Where the work on many episodes runs.
 
-    `auto` takes this process for few episodes, since starting others takes longer than the work, and processes for many.
+    `auto`: in this process for few episodes, because starting others would take longer than the work; else in several.
     """
 
     kind: Literal["auto", "serial", "processes", "dask", "ray"] = "auto"

@@ -35,16 +35,16 @@ from worldline_core.model.lpips import LPIPS
 from worldline_core.rollout.rollout_set import RolloutSet
 
 PIECE_FRAMES = 32
-"""Frames of a video that are in memory at once; at least as many as the colour of a thing is looked for in."""
+"""Frames of a video in memory at once; no fewer than `own_colour` needs to find the colour of a thing."""
 MOVED_IOU = 0.5
-"""A thing has moved where less than this of it (IoU) lies where it lay in the first frame."""
+"""A thing counts as moved where the IoU of its mask with that of the first frame is below this."""
 FrameValues = dict[str, list[float | None]]
 """Values of each frame by metric; None where a frame is left out."""
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """Some frames of the recorded head view, and what is known of them."""
+    """Consecutive frames of the recorded head view with their masks and tool positions."""
 
     frames: np.ndarray
     points: np.ndarray
@@ -53,11 +53,11 @@ class _Piece:
     """The video's first frame, and its mask by the first segmenter."""
     exact: np.ndarray | None
     moved: tuple[np.ndarray, np.ndarray] | None
-    """Exact masks of what the task moves, and where they have moved (n,)."""
+    """Exact masks of the thing that the task moves (n, h, w), and in which frames it has moved (n,)."""
 
 
 class _Video:
-    """One video on its way: its segmenters follow it, and its values are collected."""
+    """One video while it is measured: segmenters that follow it from piece to piece, and its values so far."""
 
     def __init__(self, pieces: Iterator[np.ndarray], segmenters: Mapping[str, Segmenter], thing: ColouredThing | None):
         self.pieces = pieces
@@ -76,12 +76,12 @@ class _Video:
         return {suffix: stream(frames, points) for suffix, stream in self._streams.items()}
 
     def add(self, **values: Sequence[float | None]) -> None:
-        """Values of the next frames."""
+        """Append values of the next frames, by metric."""
         for name, found in values.items():
             self.values[name] += found
 
     def add_object(self, frames: np.ndarray, moved: tuple[np.ndarray, np.ndarray] | None) -> None:
-        """IoU of what the task moves; a frame in which it lies where it lay, or is hidden, is left out."""
+        """IoU of the thing that the task moves; frames in which it has not moved, or is hidden, are left out."""
         if self._thing is None or moved is None:
             return
         if not self._begun:
@@ -96,7 +96,7 @@ class EpisodeMeasurement:
     Args:
         segmenters: by the suffix of their metrics.
         lpips: None where it is not available.
-        metrics: further ones that are asked for.
+        metrics: the metrics on request that are wanted, by name.
     """
 
     def __init__(
@@ -118,8 +118,8 @@ class EpisodeMeasurement:
         self.thing = next(iter(named_things(row.instruction)), None)
 
     def measure(self, rollouts: Mapping[str, RolloutSet]) -> dict[str, dict[str, Any]]:
-        """Values of every frame, by method, for every view and seed that was predicted; and, as the method ``true``, how
-        good masks of the recording itself are, of robot and moved thing, where the exact ones are known.
+        """Values of every frame, by method, for every view and seed that was predicted. Under the method ``true``: how
+        accurate the segmenters' masks of robot and moved thing are on the recording itself, where it has exact masks.
 
         Raises: DataError when a prediction has another frame size, another rate or more frames than the recording.
         """
@@ -166,7 +166,7 @@ class EpisodeMeasurement:
     def _pass(
         self, rollouts: Mapping[str, RolloutSet], view: str, stride: int
     ) -> tuple[dict[tuple[str, int, str], FrameValues], FrameValues, dict[tuple[str, int, str], np.ndarray]]:
-        """Values of one view's predictions by (method, seed, view), of the recording's own masks, and where tools are."""
+        """For one view: values of its predictions by (method, seed, view), accuracy of masks of the recording, places of tools."""
         segmenters = self.segmenters if view == HEAD else {}
         recording = VideoFrames(self.episodes.clip(self.position, view), stride)
         videos: dict[tuple[str, int, str], _Video] = {}
@@ -222,7 +222,7 @@ class EpisodeMeasurement:
             video.add(lpips=self.lpips(p, t).tolist())
 
     def _robot(self, video: _Video, predicted: np.ndarray, true: _Piece) -> None:
-        """Metrics of predicted head frames, as many of the recorded ones as they are."""
+        """Metrics of predicted head frames, compared with the first as many recorded ones."""
         part = slice(0, len(predicted))
         points = true.points[part]
         errors = end_effector_error(true.frames[part], predicted, points)
@@ -246,7 +246,7 @@ class EpisodeMeasurement:
                 video.add(**{name: metric.load()(scene)})
 
     def _known(self, stride: int, count: int) -> _Known:
-        """What is known of the first ``count`` frames of the recorded head view, every ``stride``-th.
+        """Masks and tool positions of ``count`` frames of the recorded head view, every ``stride``-th of the recording.
 
         Raises: DataError when fewer exact masks than frames are there.
         """
@@ -263,7 +263,7 @@ class EpisodeMeasurement:
 
 
 class _Known:
-    """Of the frames of the recorded head view: projected tool centres, exact masks of the robot and of the moved thing."""
+    """The recorded head view, piece by piece: projected tool centres, exact masks of the robot and of the moved thing."""
 
     def __init__(self, points: np.ndarray, exact: MadeFrames | None, labels: MadeFrames | None, stride: int) -> None:
         self.points = points
@@ -272,7 +272,7 @@ class _Known:
         self._thing_at_first = np.zeros(0, dtype=bool)
 
     def next(self, begin: int, frames: np.ndarray, video: _Video) -> _Piece:
-        """What is known of the next recorded ``frames``, which begin at ``begin``, with their segmenters' masks."""
+        """The next recorded ``frames``, from frame ``begin`` on, with exact masks, segmenters' masks and tool positions."""
         points, moved = self.points[begin : begin + len(frames)], None
         if self._labels is not None:
             now = next(self._labels)[: len(frames)] == 1
@@ -288,7 +288,7 @@ class _Known:
 
 
 def finite_mean(values: Sequence[float | None] | np.ndarray) -> float | None:
-    """Mean of the values that are there; None without any."""
+    """Mean of the finite values; None if there are none."""
     finite = [float(value) for value in values if value is not None and np.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
