@@ -141,6 +141,7 @@ def test_droid_subset_with_its_kinematics(tmp_path: Path, shared_data: Path) -> 
         assert np.abs(tools[..., :3, 2] - episode.T_base_ee[..., :3, 2]).max() < 1e-2, row.episode_id
 
 
+@pytest.mark.slow
 def test_unitree_with_its_arms_named(tmp_path: Path, shared_data: Path) -> None:
     root = shared_data / "lerobot_unitree_g1"
     order = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")

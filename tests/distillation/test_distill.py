@@ -264,6 +264,7 @@ def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[
     assert centre[1] > centre[0]
 
 
+@pytest.mark.slow
 def test_controls_of_whole_intervals_reach_every_step(
     inputs: dict[str, Path], tmp_path: Path, make_model: Callable[..., WorldModel], make_contract: Callable
 ) -> None:

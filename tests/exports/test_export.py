@@ -52,6 +52,7 @@ def linked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "filtered"
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # importing LeRobot alone takes minutes on a busy machine
 def test_lerobots_own_class_and_tools_work_on_an_export(
     linked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
