@@ -200,7 +200,8 @@ def _task(arguments: argparse.Namespace) -> None:
 
 def _record(arguments: argparse.Namespace) -> None:
     from worldline_core.config import load_config, read_yaml
-    from worldline_core.recorder.banks import RecordBanksConfig, RecordPoliciesConfig, record_banks, record_policies
+    from worldline_core.recorder.banks import RecordBanksConfig, record_banks
+    from worldline_core.recorder.policies import RecordPoliciesConfig, record_policies
     from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
 
     path, overrides, output = arguments.config, arguments.overrides, arguments.output

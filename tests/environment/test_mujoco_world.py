@@ -24,8 +24,9 @@ from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.video_tokenizer import resize_frame
-from worldline_core.recorder.banks import BankGrid, RecordPoliciesConfig, draw_start, record_policies
+from worldline_core.recorder.banks import BankGrid
 from worldline_core.recorder.controllers import ScriptedPolicy
+from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies
 from worldline_core.recorder.record import record_with_manifest
 
 ROBOT = "ur5e_silver"

@@ -15,6 +15,7 @@ from worldline_core.evaluation.policy.measurements import (
     measure_press,
     measure_push,
 )
+from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
     OwnColour,
@@ -23,7 +24,6 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     named_things,
     own_colour,
 )
-from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter
 
 CUBE = ColouredThing("red", "cube")
 

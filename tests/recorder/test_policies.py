@@ -14,8 +14,9 @@ from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.clip import read_clip
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.recorder.banks import BankGrid, RecordPoliciesConfig, draw_start, record_policies
+from worldline_core.recorder.banks import BankGrid
 from worldline_core.recorder.controllers import ScriptedPolicy, plan_waypoints
+from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies
 from worldline_core.recorder.record import RecordConfig, Variety, open_recorder, plan_jobs
 from worldline_core.recorder.things import sample_layout
 

@@ -13,7 +13,8 @@ from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.errors import ConfigError
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.processes import ExponentialAverage, own_part, place_model
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.sharding import own_part, place_model
 from worldline_core.training.training_config import ShardingConfig
 
 VIEWS = ("head", "left_wrist", "right_wrist")

@@ -1,7 +1,7 @@
 """The training loop of every model that is trained here: optimiser, averages, metrics, and a state to continue from.
 
 A model states its parameters, its objective and its batches; see `train`. With torchrun, several processes share every
-step and every weight (`processes.py`).
+step and every weight (`sharding.py`).
 """
 
 from __future__ import annotations
@@ -21,15 +21,9 @@ from torch import Tensor, nn
 from worldline_core.errors import ConfigError, StoppedError, TrainingError
 from worldline_core.progress import Progress
 from worldline_core.training.early_end import keep_batch, require_finite, stop_requests
-from worldline_core.training.processes import (
-    BatchPlan,
-    ExponentialAverage,
-    average_values,
-    processes,
-    reduce_gradients,
-    reporting_lost_processes,
-    whole,
-)
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.processes import BatchPlan, average_values, processes, reporting_lost_processes
+from worldline_core.training.sharding import reduce_gradients, whole
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.training.training_state import (
     MetricsLog,

@@ -28,13 +28,9 @@ from worldline_core.config import what_is_made
 from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.processes import (
-    ExponentialAverage,
-    another_process_ended,
-    own_part,
-    processes,
-    wait_for_all,
-)
+from worldline_core.training.exponential_average import ExponentialAverage
+from worldline_core.training.processes import another_process_ended, processes, wait_for_all
+from worldline_core.training.sharding import own_part
 from worldline_core.training.training_config import SavingConfig
 
 logger = logging.getLogger(__name__)

@@ -23,11 +23,12 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
-from worldline_core.evaluation.policy.judge import Judge, VLMJudge, confidence_of, judge_trajectory
+from worldline_core.evaluation.policy.judge import Judge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.novelty import KnownSetting
 from worldline_core.evaluation.policy.saved_trust import JudgedBy, SavedMethod, SavedTrust, content_digest, predicted_by
 from worldline_core.evaluation.policy.trust import TRUST_COLUMNS, calibrated, trust_verdicts
+from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import (
     TRUE_METHOD,
     open_rollouts,
