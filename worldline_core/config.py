@@ -203,8 +203,9 @@ def validate[Model: BaseModel](model: type[Model], values: Mapping[str, Any], *,
                 continue  # it is short because of an item that is wrong itself
             dotted = ".".join(str(part) for part in problem["loc"])
             if problem["type"] == "extra_forbidden":
-                known = _known_keys(model, problem["loc"][:-1])
-                close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
+                key, known = str(problem["loc"][-1]), _known_keys(model, problem["loc"][:-1])
+                sections = (section for section in model.model_fields if key in _known_keys(model, (section,)))
+                close = difflib.get_close_matches(key, known, n=1) or [f"{section}.{key}" for section in sections]
                 hint = f"; did you mean {close[0]!r}?" if close else f"; known keys: {', '.join(known)}"
                 lines.append(f"{dotted}: unknown key{hint}")
             else:

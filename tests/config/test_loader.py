@@ -136,6 +136,7 @@ type Fruit = Annotated[Apple | Pear, Field(discriminator="kind")]
 class Basket(StrictModel):
     fruits: tuple[Fruit, ...] = Field(min_length=1)
     named: dict[str, Inner | None] = Field(default_factory=dict)
+    inner: Inner = Inner()
 
 
 @pytest.mark.parametrize(
@@ -147,6 +148,7 @@ class Basket(StrictModel):
         ),
         ({"fruits": [{"kind": "pear", "x": 1}]}, r"fruits\.0\.pear\.x: unknown key; known keys: kind, weight$"),
         ({"fruits": [{"kind": "pear"}], "named": {"a": {"stepz": 1}}}, r"stepz: unknown key; did you mean 'steps'"),
+        ({"fruits": [{"kind": "pear", "steps": 1}]}, r"pear\.steps: unknown key; did you mean 'inner\.steps'"),
     ],
 )
 def test_keys_inside_of_unions_lists_and_mappings_are_known(values: dict[str, Any], message: str) -> None:
