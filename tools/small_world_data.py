@@ -94,8 +94,14 @@ def recordings(last_seed: int) -> list[tuple[str, RecordConfig]]:
     return [*first, *turns]
 
 
-def plan_files(folder: Path, last_seed: int, only: Collection[str] | None) -> list[FileTask]:
-    """All files, numbered in the order of `recordings`; of some of them alone with `only`, under the same numbers."""
+def plan_files(
+    folder: Path, last_seed: int, only: Collection[str] | None, first_seed: int = FIRST_SEED
+) -> list[FileTask]:
+    """All files, numbered in the order of `recordings`.
+
+    Args:
+        only, first_seed: leave out other recordings, and chunks of "small_world" before this seed; the rest keep their numbers.
+    """
     wanted: list[FileTask] = []
     first = 0
     for name, config in recordings(last_seed):
@@ -115,7 +121,8 @@ def plan_files(folder: Path, last_seed: int, only: Collection[str] | None) -> li
             for number, index in enumerate(order, first)
         ]
         first += len(tasks)
-        if only is None or name in only:
+        early = name == "small_world" and config.seed < first_seed
+        if (only is None or name in only) and not early:
             wanted += tasks
     return wanted
 

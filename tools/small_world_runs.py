@@ -123,6 +123,8 @@ class ForcingSettings(Timed):
     a window that moves; 0 does without them.
     ``sigmas``: nodes of the sampler, saved with the model; (1, 0) is one step a block.
     ``history``: what a block sees before it, the recorded blocks or the model's own, as in a rollout.
+    ``teacher``: Stage II model; ``teacher_share`` of what a block of a short clip should become is its one-step prediction,
+    which knows the later controls too, the rest the recording. None: the recording alone.
     """
 
     batch: int = Field(default=192, ge=3)
@@ -133,6 +135,8 @@ class ForcingSettings(Timed):
     long_every: int = Field(default=4, ge=0)
     sigmas: tuple[float, ...] = CAUSAL_SIGMAS
     history: Literal["recorded", "generated"] = "recorded"
+    teacher: Path | None = None
+    teacher_share: float = Field(default=0.5, gt=0, le=1)
     compile: bool = False
 
     @model_validator(mode="after")

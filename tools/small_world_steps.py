@@ -25,7 +25,8 @@ from tools.small_world_runs import (
     Stage2Settings,
     Timed,
 )
-from worldline_core.distillation.causal_objective import CausalObjective, maps_of
+from worldline_core.actions.actions_config import TEMPORAL_FACTOR
+from worldline_core.distillation.causal_objective import CausalObjective, maps_of, with_observed_frame
 from worldline_core.distillation.causal_teacher_forcing import teacher_forcing_loss
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
@@ -39,6 +40,7 @@ from worldline_core.model.contracts import CAUSAL_SIGMAS, NATIVE_VECTORS, Action
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
+from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -52,6 +54,8 @@ VIEW_SHARES = (0.5, 0.25, 0.25)
 """Of steps or clips on single views: the head view counts as much as both wrist views."""
 LONG_BLOCKS = 4
 """Blocks of a cut of a long recording: 65 frames."""
+SHORT_LATENTS = 1 + (SHORT - 1) // TEMPORAL_FACTOR
+"""Latent frames of a short recording."""
 
 
 @dataclass(frozen=True)
@@ -269,16 +273,34 @@ class ForcingObjective(CausalObjective[Batch]):
     """Teacher forcing where the blocks before are not exact, as in a rollout.
 
     They are disturbed by noise of a level of its own for each clip, or what the model itself makes of them.
+
+    Args:
+        teacher: Stage II model that says in part what blocks should become; None: the recording does.
     """
 
-    def __init__(self, model: WorldModel, config: DistillConfig, settings: ForcingSettings) -> None:
+    def __init__(
+        self, model: WorldModel, config: DistillConfig, settings: ForcingSettings, teacher: WorldModel | None = None
+    ) -> None:
         super().__init__(model, config)
-        self.settings = settings
+        self.settings, self.teacher = settings, teacher
+
+    def target(self, batch: Batch, noise: Tensor) -> Tensor:
+        """Latents (b v c t h w) that the blocks should become; the observed frame is the recorded one."""
+        latents, teacher, share = batch.latents, self.teacher, self.settings.teacher_share
+        if teacher is None or latents.shape[3] != SHORT_LATENTS:  # it knows clips of one length
+            return latents
+        state, level = with_observed_frame(latents[..., :1, :, :], noise[..., 1:, :, :]), latents.new_ones(len(latents))
+        with torch.no_grad():
+            velocity = teacher(state, level, action_maps=maps_of(batch), views=batch.views).velocity
+        predicted = euler_step(state, velocity, 1.0, 0.0)
+        mixed = torch.lerp(latents, predicted, share)
+        return with_observed_frame(latents[..., :1, :, :], mixed[..., 1:, :, :])
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """Teacher-forcing loss of one batch."""
-        latents, device = batch.latents, batch.latents.device
-        disturbance = torch.randn(latents.shape, generator=generator, device=device)
+        device = batch.latents.device
+        disturbance = torch.randn(batch.latents.shape, generator=generator, device=device)
+        latents = self.target(batch, disturbance)
         if self.settings.history == "generated":
             size = self.spec.block_size  # the last block is nobody's history
             maps, noise = (value[..., :-size, :, :] for value in (maps_of(batch), disturbance))
@@ -287,7 +309,7 @@ class ForcingObjective(CausalObjective[Batch]):
         else:
             level = torch.rand((len(latents), 1, 1, 1, 1, 1), generator=generator, device=device)
             disturbance[..., :1, :, :] = 0
-            history = latents + self.settings.history_noise * level * disturbance
+            history = batch.latents + self.settings.history_noise * level * disturbance
         loss = teacher_forcing_loss(
             self.model,
             latents,
@@ -328,7 +350,8 @@ def causal_step(start: Start, settings: ForcingSettings | RegressionSettings | M
             long = is_long(index, settings.long_every)
             return recorded_batch(memory, settings.batch, start.draws(index), long=long, things=settings.things)
 
-        return Step(ForcingObjective(model, config, settings), groups, forcing, saved)
+        teacher = None if settings.teacher is None else start.loaded(settings.teacher, "stage2")[0].eval()
+        return Step(ForcingObjective(model, config, settings, teacher), groups, forcing, saved)
     if isinstance(settings, MatchingSettings):
         real, fake = (start.loaded(start.stage2, "stage2")[0] for _ in range(2))
         matching = DistributionMatchingObjective(model, real, fake.train(), config, None)

@@ -33,10 +33,19 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from tools.small_world_data import NAMES, SHORT, VIEWS, Recorded, plan_files, record_files
+from tools.small_world_data import FIRST_SEED, NAMES, SHORT, VIEWS, Recorded, plan_files, record_files
 from tools.small_world_measures import Facts, Measuring, Predictor, drift, judge_processes
 from tools.small_world_memory import Memory, recorded_files
-from tools.small_world_runs import STEPS, MatchingSettings, Plan, RunPlan, Timed, TokenizerSettings, key_of
+from tools.small_world_runs import (
+    STEPS,
+    ForcingSettings,
+    MatchingSettings,
+    Plan,
+    RunPlan,
+    Timed,
+    TokenizerSettings,
+    key_of,
+)
 from tools.small_world_steps import VIEW_SHARES, Start, Step, open_step
 from tools.small_world_table import COLUMNS, markdown, table
 from worldline_core.config import load_config
@@ -209,13 +218,17 @@ class Training:
         """The folder of a step's checkpoint, trained where it is not there yet."""
         tokenizer = self.memory.tokenizer.encoder_digest[:16]
         parent = None if start.parent is None else read_checkpoint_info(start.parent)
-        stage2 = None if start.stage2 is None else read_checkpoint_info(start.stage2).weights_sha256
+        follows = None
+        if isinstance(settings, ForcingSettings):
+            follows = settings.teacher
+        elif isinstance(settings, MatchingSettings):
+            follows = start.stage2
         identity: Facts = {
             "step": name,
             "settings": settings.model_dump(mode="json"),
             "seed": seed,
             "start": start.config.model_dump(mode="json") if parent is None else parent.weights_sha256,
-            "stage2": stage2 if isinstance(settings, MatchingSettings) else None,
+            "stage2": None if follows is None else read_checkpoint_info(follows).weights_sha256,
             "tokenizer": tokenizer,
             "recordings": key_of({"names": self.memory.names}),
         }
@@ -295,6 +308,9 @@ def main() -> None:
     recording.add_argument(
         "--last-seed", type=int, default=3019, help="chunks of training recordings end with this one"
     )
+    recording.add_argument(
+        "--first-seed", type=int, default=FIRST_SEED, help="leave out chunks before this one (%(default)s)"
+    )
     recording.add_argument("--only", nargs="+", choices=NAMES, help="recordings of some configurations alone")
     recording.add_argument("--start", type=int, default=0, help="leave out so many files, to share work among machines")
     recording.add_argument("--files", type=int, help="record so many files")
@@ -309,8 +325,8 @@ def main() -> None:
     # `timeout` ends a call so: what runs beside this process is ended with it, and a training saves its state first.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     if arguments.command == "record":
-        tasks = plan_files(arguments.folder, arguments.last_seed, arguments.only)[arguments.start :]
-        record_files(tasks[: arguments.files], arguments.workers)
+        tasks = plan_files(arguments.folder, arguments.last_seed, arguments.only, arguments.first_seed)
+        record_files(tasks[arguments.start :][: arguments.files], arguments.workers)
         return
     torch.set_float32_matmul_precision("high")
     device = "cuda" if torch.cuda.is_available() else "cpu"

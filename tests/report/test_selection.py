@@ -18,7 +18,7 @@ from worldline_core.report.videos import best_median_worst, choose_episodes
         ("stage1", "stage1", "baseline", "Stage I, text, no actions"),
         ("backbone", "backbone", "baseline", "backbone, text, no actions"),
         ("stage1_20_steps", "other", "run", "stage1 20 steps"),
-        ("banks_shipped_causal", "causal", "shipped", "causal, 4 steps"),
+        ("banks_shipped_causal", "causal", "shipped", "causal"),
         ("copy_first_frame", "copy", "baseline", "copy first frame"),
         ("cosmos_predict", "other", "run", "cosmos predict"),
     ],

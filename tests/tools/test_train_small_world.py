@@ -104,8 +104,12 @@ def test_what_comes_later_follows_what_is_there() -> None:
 def test_a_file_keeps_its_number_when_it_is_recorded_alone() -> None:
     everything = plan_files(Path(), 3000, None)
     long = plan_files(Path(), 3000, ["small_world_long"])
+    first = plan_files(Path(), 3001, ["small_world"])
+    second = plan_files(Path(), 3001, ["small_world"], first_seed=3001)
     assert [task.path.name for task in everything] == [f"{number:05d}.safetensors" for number in range(len(everything))]
     assert long == [task for task in everything if task.num_frames == 129]
+    assert second == [task for task in first if task.jobs[0].episode_id.split("-")[2] == "s3001"]
+    assert 2 * len(second) == len(first)
     assert all(task.with_masks for task in long)
     assert all(len({(job.embodiment, job.split, job.held_out_camera) for job in task.jobs}) == 1 for task in everything)
     assert {job.embodiment for task in everything for job in task.jobs} == set(BODIES) - {"xarm7_single"}
@@ -409,6 +413,39 @@ def test_a_block_sees_what_the_model_itself_makes_of_the_blocks_before(
     rolled = step.objective.rollout(alone, maps, noise[:, :, :, :9], 0, with_gradient=False)
     torch.testing.assert_close(shown[:, :, :, :9], rolled)
     assert (shown[:, :, :, 9:13] - recorded[:, :, :, 9:13]).abs().mean() > 0.01
+
+
+def test_a_teacher_says_in_part_what_blocks_of_short_clips_should_become(
+    measuring: Measuring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def target(share: float | None, long_every: int = 0) -> tuple[Tensor, Batch]:
+        """What the blocks of the first batch should become."""
+        targets: list[Tensor] = []
+        monkeypatch.setattr(
+            small_world_steps,
+            "teacher_forcing_loss",
+            lambda model, latents, maps, **given: targets.append(latents) or latents.sum(),
+        )
+        teacher: dict[str, Any] = {} if share is None else {"teacher": MODELS / "stage2", "teacher_share": share}
+        settings = ForcingSettings(steps=1, batch=3, history_noise=0.2, long_every=long_every, **teacher)
+        step = open_step(Start(measuring.memory, 0, plan_of().model, MODELS / "causal", None), settings)
+        batch = step.load(0)
+        assert isinstance(batch, Batch)
+        step.objective.loss(batch, torch.Generator().manual_seed(5), 0)
+        return targets[0], batch
+
+    recorded, batch = target(None)
+    assert torch.equal(recorded, batch.latents)
+    predicted, _ = target(1.0)
+    noise = torch.randn(recorded.shape, generator=torch.Generator().manual_seed(5))
+    noise[:, :, :, :1] = recorded[:, :, :, :1]
+    stage2 = load_checkpoint(MODELS / "stage2")[0].eval()
+    with torch.no_grad():
+        velocity = stage2(noise, torch.ones(3), action_maps=maps_of(batch), views=VIEWS).velocity
+    torch.testing.assert_close(predicted, noise - velocity)
+    torch.testing.assert_close(target(0.25)[0], 0.75 * recorded + 0.25 * predicted)
+    long, batch = target(1.0, long_every=1)
+    assert torch.equal(long, batch.latents)
 
 
 @pytest.mark.slow

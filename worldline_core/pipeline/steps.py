@@ -300,7 +300,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        13,
+        14,
         "worldline_core.report.report",
         "report",
         "report.context.ReportConfig",

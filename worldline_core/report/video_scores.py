@@ -18,7 +18,7 @@ TRUE_METHOD = "true"
 KINDS = {
     TRUE_METHOD: ("recorded videos (ceiling)", "c2"),
     "stage2": ("Stage II", "c0"),
-    "causal": ("causal, 4 steps", "c1"),
+    "causal": ("causal", "c1"),
     "stage2_zero": ("Stage II, no actions", "c4"),
     "stage2_shuffled": ("Stage II, shuffled actions", "c3"),
     "causal_zero": ("causal, no actions", "c4"),
@@ -59,7 +59,7 @@ class Method:
     def label(self) -> str:
         found = STEPS_NAME.fullmatch(self.name)
         if found:
-            return f"{KINDS[found['base']][0].split(',')[0]}, {found['steps']} steps"
+            return f"{KINDS[found['base']][0]}, {found['steps']} steps"
         return KINDS[self.kind][0] or self.name.replace("_", " ")
 
     @property
