@@ -125,6 +125,8 @@ class ForcingSettings(Timed):
     ``history``: what a block sees before it, the recorded blocks or the model's own, as in a rollout.
     ``teacher``: Stage II model; ``teacher_share`` of what a block of a short clip should become is its one-step prediction,
     which knows the later controls too, the rest the recording. None: the recording alone.
+    ``validate_every``: every so many steps, and after the last, ``metrics.jsonl`` gets the error of the averaged weights'
+    rollouts on up to 120 validation recordings, where there are any; 0: after the last alone.
     """
 
     batch: int = Field(default=192, ge=3)
@@ -137,6 +139,7 @@ class ForcingSettings(Timed):
     history: Literal["recorded", "generated"] = "recorded"
     teacher: Path | None = None
     teacher_share: float = Field(default=0.5, gt=0, le=1)
+    validate_every: int = Field(default=0, ge=0)
     compile: bool = False
 
     @model_validator(mode="after")
@@ -146,6 +149,10 @@ class ForcingSettings(Timed):
                 "history_noise: the model's own blocks are not exact anyway; with history: generated it is 0"
             )
         return self
+
+    def trainer(self, steps: int, seed: int, device: str, log_every: int = 5 * CYCLE) -> TrainerConfig:
+        loop = super().trainer(steps, seed, device, log_every)
+        return loop.model_copy(update={"validate_every": self.validate_every})
 
 
 class RegressionSettings(Timed):

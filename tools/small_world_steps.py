@@ -45,27 +45,42 @@ from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.relational import RelationalTerm
+from worldline_core.training.stage import VALIDATION_SEED
 from worldline_core.training.stage1 import stage1_groups
 from worldline_core.training.stage2 import stage2_groups
-from worldline_core.training.trainer import NamedBatch, Objective, ParameterGroup, step_generator
-from worldline_core.training.training_config import LossWeighting, RelationalConfig, SigmaSampling
+from worldline_core.training.trainer import (
+    NamedBatch,
+    Objective,
+    ParameterGroup,
+    held_out_losses,
+    step_generator,
+)
+from worldline_core.training.training_config import LossWeighting, RelationalConfig, SigmaSampling, TrainerConfig
 
 VIEW_SHARES = (0.5, 0.25, 0.25)
 """Of steps or clips on single views: the head view counts as much as both wrist views."""
 LONG_BLOCKS = 4
 """Blocks of a cut of a long recording: 65 frames."""
+MOST_VALIDATED = 120
+"""Validation recordings that are looked at while a model trains."""
 SHORT_LATENTS = 1 + (SHORT - 1) // TEMPORAL_FACTOR
 """Latent frames of a short recording."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is ready to train; ``saved``: what `save_checkpoint` is told of a model besides averaged weights and metadata."""
+    """What is ready to train.
+
+    Attributes:
+        saved: what `save_checkpoint` is told of a model besides averaged weights and metadata.
+        held_out: losses on validation recordings; None where none are measured while it trains.
+    """
 
     objective: Objective[Any]
     groups: list[ParameterGroup]
     load: Callable[[int], NamedBatch]
     saved: dict[str, Any] = field(default_factory=dict)
+    held_out: Callable[[TrainerConfig], dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -351,7 +366,20 @@ def causal_step(start: Start, settings: ForcingSettings | RegressionSettings | M
             return recorded_batch(memory, settings.batch, start.draws(index), long=long, things=settings.things)
 
         teacher = None if settings.teacher is None else start.loaded(settings.teacher, "stage2")[0].eval()
-        return Step(ForcingObjective(model, config, settings, teacher), groups, forcing, saved)
+        objective = ForcingObjective(model, config, settings, teacher)
+
+        def held_out(trainer: TrainerConfig) -> dict[str, float]:
+            episodes, batches = memory.episodes("validation"), trainer.validation_batches
+            size = max(1, min(MOST_VALIDATED, len(episodes)) // batches)
+
+            def batch(index: int) -> Batch:
+                rows = torch.arange(index * size, (index + 1) * size) % len(episodes)
+                latents, maps, _, _ = episodes.clips(rows)
+                return Batch(named(episodes, rows), VIEWS, latents, maps)
+
+            return held_out_losses(trainer, batch, objective.validation_losses, VALIDATION_SEED)
+
+        return Step(objective, groups, forcing, saved, held_out if memory.count("validation") else None)
     if isinstance(settings, MatchingSettings):
         real, fake = (start.loaded(start.stage2, "stage2")[0] for _ in range(2))
         matching = DistributionMatchingObjective(model, real, fake.train(), config, None)

@@ -82,11 +82,13 @@ def trained(
     """
 
     def run(step: Step, folder: Path, steps: int, log_every: int) -> TrainingResult:
+        config = settings.trainer(steps, seed, device, log_every)
         return train(
-            settings.trainer(steps, seed, device, log_every),
+            config,
             groups=step.groups,
             objective=step.objective,
             load=step.load,
+            validate=None if step.held_out is None else partial(step.held_out, config),
             output=folder,
             identity={**identity, "steps": steps},
             title=title,

@@ -448,6 +448,27 @@ def test_a_teacher_says_in_part_what_blocks_of_short_clips_should_become(
     assert torch.equal(long, batch.latents)
 
 
+def test_rollouts_of_validation_recordings_are_measured_while_a_model_trains(
+    measuring: Measuring, tmp_path: Path
+) -> None:
+    for number, (split, count) in enumerate((("train", 2), ("validation", 4))):
+        arrays, header = recording(split, ["success"] * count, number, 33)
+        save_file(arrays, tmp_path / f"{number:05d}.safetensors", metadata=header)
+    memory = Memory(tmp_path, ["00000.safetensors", "00001.safetensors"], measuring.memory.tokenizer)
+    settings = ForcingSettings(
+        steps=3, batch=3, lr=1e-3, warmup=0, long_every=0, sigmas=(1.0, 0.0), validate_every=2, ema=0.5
+    )
+    training = Training(memory, plan_of(), tmp_path / "output", measuring)
+    folder = training.step("teacher_forcing", settings, Start(memory, 0, plan_of().model, MODELS / "causal", None), 0)
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    measured = {row["step"]: row for row in rows if "validation/rollout_error" in row}
+    assert list(measured) == [2, 3]
+    latents = memory.episodes("validation").latents.float()
+    copied = (latents[:, :, :, :1] - latents)[:, :, :, 1:].square().mean()
+    assert measured[3]["validation/rollout_error_copy"] == pytest.approx(float(copied), rel=1e-5)
+    assert measured[2]["validation/rollout_error"] != measured[3]["validation/rollout_error"]
+
+
 @pytest.mark.slow
 def test_a_run_that_was_stopped_ends_with_the_same_bits(
     measuring: Measuring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
