@@ -270,7 +270,7 @@ def further_numbers(context: ReportContext, view: HeadView | None) -> list[list[
                 rows.append([number(float(found["mean"]), signed=True), what, how])
         causal, main = view.value(view.method("causal", view.primary.group)), view.value(view.primary)
         if causal and main and main["mean"]:
-            how = f"IoU {causal['mean']:.3f} against Stage II's {main['mean']:.3f}"
+            how = f"IoU {causal['mean']:.3f} against {view.primary.label}'s {main['mean']:.3f}"
             rows.append([percent(causal["mean"] / main["mean"]), "of its robot IoU kept by the causal model", how])
     counts = episode_counts(context)
     if counts is not None:
