@@ -250,6 +250,13 @@ class Recorded:
             facts = [Fact(**values) for values in json.loads(file.metadata()["facts"])]
             return cls(facts, **{name: file.get_tensor(name) for name in names})
 
+    @staticmethod
+    def outline(path: Path) -> tuple[list[Fact], int]:
+        """Facts of a file's episodes and their number of frames, without its arrays."""
+        with safe_open(path, framework="numpy") as file:
+            facts = [Fact(**values) for values in json.loads(file.metadata()["facts"])]
+            return facts, file.get_slice("frames").get_shape()[2]
+
     @property
     def split(self) -> str:
         return self.facts[0].split

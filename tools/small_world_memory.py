@@ -6,9 +6,9 @@ Axes: n episodes, v views, c latent channels, f video frames, t latent frames, h
 from __future__ import annotations
 
 import json
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from tools.small_world_data import GRID, VIEWS, Fact, Recorded
+from tools.small_world_data import GRID, SHORT, VIEWS, Fact, Recorded
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import DataError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
@@ -87,15 +87,28 @@ class Episodes:
         return torch.cat((first, later), dim=3).float(), maps.float(), robot.float(), things.float()
 
 
-def joined(parts: list[Episodes]) -> Episodes:
-    """Episodes of several parts, in their order."""
-    names = [field.name for field in fields(Episodes) if field.name != "facts"]
-    tensors = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name in names
-        if getattr(parts[0], name) is not None
-    }
-    return Episodes(facts=[fact for part in parts for fact in part.facts], **tensors)
+class Gathered:
+    """Tensors of so many episodes, filled file by file.
+
+    Each is allocated once, whole: parts that are joined in the end leave gaps that a CPU's allocator keeps.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count, self.facts = count, list[Fact]()
+        self.tensors: dict[str, Tensor] = {}
+
+    def add(self, facts: list[Fact], tensors: Mapping[str, Tensor]) -> None:
+        """The next episodes."""
+        rows = slice(len(self.facts), len(self.facts) + len(facts))
+        for name, tensor in tensors.items():
+            if name not in self.tensors:
+                self.tensors[name] = tensor.new_empty((self.count, *tensor.shape[1:]))
+            self.tensors[name][rows] = tensor
+        self.facts += facts
+
+    def episodes(self) -> Episodes:
+        """All of them, in their order."""
+        return Episodes(facts=self.facts, **self.tensors)
 
 
 def recorded_files(folder: Path) -> list[str]:
@@ -135,15 +148,19 @@ class Memory:
             )
         self.folder, self.names, self.tokenizer, self.teacher = folder, tuple(names), tokenizer, teacher
         self.held: list[Recorded] = []
-        parts: dict[tuple[bool, str], list[Episodes]] = defaultdict(list)
+        counts: Counter[tuple[bool, str]] = Counter()
+        for name in names:
+            facts, frames = Recorded.outline(folder / name)
+            counts[frames == SHORT, facts[0].split] += len(facts)
+        found = {kind: Gathered(count) for kind, count in counts.items()}
         for name in names:
             recorded = Recorded.read(folder / name)
-            parts[recorded.short, recorded.split].append(self._encoded(recorded))
+            found[recorded.short, recorded.split].add(recorded.facts, self._encoded(recorded))
             if recorded.short and recorded.split != "train":
                 self.held.append(recorded)
-        self._episodes = {kind: joined(found) for kind, found in parts.items()}
-        counts = {f"{'short' if short else 'long'} {split}": len(e) for (short, split), e in self._episodes.items()}
-        print("recordings", json.dumps(counts), flush=True)
+        self._episodes = {kind: gathered.episodes() for kind, gathered in found.items()}
+        said = {f"{'short' if short else 'long'} {split}": count for (short, split), count in counts.items()}
+        print("recordings", json.dumps(said), flush=True)
 
     @property
     def device(self) -> str:
@@ -168,7 +185,8 @@ class Memory:
         return self._episodes[short, split]
 
     @torch.no_grad()
-    def _encoded(self, recorded: Recorded) -> Episodes:
+    def _encoded(self, recorded: Recorded) -> dict[str, Tensor]:
+        """What `Episodes` hold of a file, by name."""
         video = videos(recorded.frames, self.device)
         given = {name: torch.from_numpy(getattr(recorded, name)).to(self.device) for name in GIVEN}
         latents = self.encode(video)
@@ -181,7 +199,7 @@ class Memory:
             grid = (latents.shape[3], GRID[0] // PATCH, GRID[1] // PATCH)
             found = relations(features, common_shape(RelationalConfig(), grid, features.shape[2:5]))
             given |= {"intra": found.intra.half(), "cross": found.cross.half()}
-        return Episodes(facts=recorded.facts, latents=latents.half(), **given)
+        return {**given, "latents": latents.half()}
 
     def encode(self, video: Tensor) -> Tensor:
         """Latents (n, v, c, t, h, w) of videos (n, v, 3, f, H, W) in [-1, 1]."""

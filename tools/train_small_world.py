@@ -33,6 +33,7 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
+from tools.small_world_causal import forcing_step, matching_step, regression_step
 from tools.small_world_data import FIRST_SEED, NAMES, SHORT, VIEWS, Recorded, plan_files, record_files
 from tools.small_world_measures import Facts, Measuring, Predictor, drift, judge_processes
 from tools.small_world_memory import Memory, recorded_files
@@ -46,7 +47,7 @@ from tools.small_world_runs import (
     TokenizerSettings,
     key_of,
 )
-from tools.small_world_steps import VIEW_SHARES, Start, Step, open_step
+from tools.small_world_steps import VIEW_SHARES, Start, Step, base_step, stage2_step
 from tools.small_world_table import COLUMNS, markdown, table
 from worldline_core.config import load_config
 from worldline_core.distillation.distill_config import CYCLE
@@ -69,6 +70,14 @@ from worldline_core.training.training_state import STATES
 from worldline_core.training.video_teacher import load_teacher
 
 MODELS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "models"
+MAKERS: dict[str, Callable[[Start, Any], Step]] = {
+    "base": base_step,
+    "stage2": stage2_step,
+    "teacher_forcing": forcing_step,
+    "trajectory_regression": regression_step,
+    "distribution_matching": matching_step,
+}
+"""What makes the steps of a run."""
 PACE_STEPS = 6 * CYCLE
 """Steps that tell what a step takes; the first third, in which much is done once, does not count."""
 
@@ -239,7 +248,7 @@ class Training:
             return folder
 
         result, counts, step = trained(
-            settings, start.seed, self.memory.device, name, folder, identity, partial(open_step, start, settings)
+            settings, start.seed, self.memory.device, name, folder, identity, partial(MAKERS[name], start, settings)
         )
         metadata: Facts = {
             **identity,

@@ -17,15 +17,16 @@ import yaml
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from tools import small_world_steps
+from tools import small_world_causal, small_world_steps
 from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, Recorded, plan_files, record_file
 from tools.small_world_measures import Measuring, Predictor, Shown, gradient_energy, judged
-from tools.small_world_memory import Episodes, KnownRelations, Memory, joined, videos
+from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownRelations, Memory, videos
 from tools.small_world_runs import ForcingSettings, Plan
-from tools.small_world_steps import Start, controls_of, object_weights, open_step
+from tools.small_world_steps import Start, controls_of, object_weights
 from tools.small_world_table import Spread, compared, markdown
 from tools.train_small_world import MODELS, Training
 from worldline_core.config import CONFIG_ROOT, load_config
+from worldline_core.distillation import causal_teacher_forcing
 from worldline_core.distillation.causal_objective import CausalObjective, maps_of
 from worldline_core.errors import ConfigError, DataError, StoppedError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
@@ -95,7 +96,10 @@ def test_short_recordings_are_not_cut() -> None:
 
 
 def test_what_comes_later_follows_what_is_there() -> None:
-    both = joined([episodes(1, 9, long=False), episodes(2, 9, long=False)])
+    gathered = Gathered(3)
+    for part in (episodes(1, 9, long=False), episodes(2, 9, long=False)):
+        gathered.add(part.facts, {name: getattr(part, name) for name in ("latents", *GIVEN)})
+    both = gathered.episodes()
     assert len(both) == 3
     assert both.singles is None
     assert both.latents[:, 0, 0, 0, 0, 0].tolist() == [0.0, 0.0, 100.0]
@@ -394,10 +398,10 @@ def test_a_block_sees_what_the_model_itself_makes_of_the_blocks_before(
         seen.update(given)
         return latents.sum()
 
-    monkeypatch.setattr(small_world_steps, "teacher_forcing_loss", loss)
+    monkeypatch.setattr(causal_teacher_forcing, "teacher_forcing_loss", loss)
     settings = ForcingSettings(steps=1, batch=3, sigmas=(1.0, 0.0), history="generated", long_every=1)
     start = Start(measuring.memory, 0, plan_of().model, MODELS / "causal", None)
-    step = open_step(start, settings)
+    step = small_world_causal.forcing_step(start, settings)
     batch = step.load(0)
     assert isinstance(batch, Batch)
     step.objective.loss(batch, torch.Generator().manual_seed(5), 0)
@@ -422,13 +426,15 @@ def test_a_teacher_says_in_part_what_blocks_of_short_clips_should_become(
         """What the blocks of the first batch should become."""
         targets: list[Tensor] = []
         monkeypatch.setattr(
-            small_world_steps,
+            causal_teacher_forcing,
             "teacher_forcing_loss",
             lambda model, latents, maps, **given: targets.append(latents) or latents.sum(),
         )
         teacher: dict[str, Any] = {} if share is None else {"teacher": MODELS / "stage2", "teacher_share": share}
         settings = ForcingSettings(steps=1, batch=3, history_noise=0.2, long_every=long_every, **teacher)
-        step = open_step(Start(measuring.memory, 0, plan_of().model, MODELS / "causal", None), settings)
+        step = small_world_causal.forcing_step(
+            Start(measuring.memory, 0, plan_of().model, MODELS / "causal", None), settings
+        )
         batch = step.load(0)
         assert isinstance(batch, Batch)
         step.objective.loss(batch, torch.Generator().manual_seed(5), 0)
@@ -484,7 +490,8 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(
             signal.raise_signal(signal.SIGTERM)
         return drawn(count, size, draws)
 
-    monkeypatch.setattr(small_world_steps, "drawn", stopping)
+    for module in (small_world_steps, small_world_causal):
+        monkeypatch.setattr(module, "drawn", stopping)
     # A signal outside the loop must not end this process.
     before = signal.signal(signal.SIGTERM, lambda number, frame: None)
     stops = 0

@@ -1,7 +1,8 @@
 """Stage III, step 1: causal teacher forcing (appendix, "Causal Teacher-Forcing Adaptation").
 
 The Stage II objective under block-causal attention: one observed latent frame, then blocks; each noisy block sees the
-recorded clean blocks of its window and its own action maps.
+clean blocks of its window and its own action maps. The paper's blocks are the recorded ones; a model of one step a block
+learns better from its own (docs/training.md, "One step a block, on CPUs").
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """
@@ -14,25 +15,42 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.distillation.causal_objective import CausalObjective, block_sigmas, frame_sigmas, maps_of
+from worldline_core.distillation.causal_objective import (
+    CausalObjective,
+    block_sigmas,
+    frame_sigmas,
+    maps_of,
+    with_observed_frame,
+)
+from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
+from worldline_core.training.clip_source import latent_frame_count
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
 class TeacherForcingObjective(CausalObjective[Batch]):
-    """Flow matching of every block given the clean blocks of its window."""
+    """Flow matching of every block given the blocks of its window: the recorded ones, or what the model makes of them.
+
+    Args:
+        teacher: Stage II model whose prediction of the whole clip is a part of the target (``teacher_share``).
+    """
+
+    def __init__(self, model: WorldModel, config: DistillConfig, teacher: WorldModel | None = None) -> None:
+        super().__init__(model, config)
+        self.settings = config.teacher_forcing
+        self.teacher = None if teacher is None else teacher.eval().requires_grad_(False)
 
     def loss(self, batch: Batch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Teacher-forcing loss of one batch; the history may be a slightly corrupted copy of the recorded latents."""
-        settings = self.config.teacher_forcing
-        latents, history = batch.latents, None
-        if settings.history_noise:
-            disturbance = torch.randn(latents.shape, generator=generator, device=latents.device)
-            disturbance[..., :1, :, :] = 0
-            history = latents + settings.history_noise * disturbance
+        """Teacher-forcing loss of one batch."""
+        settings, latents, history = self.settings, batch.latents, None
+        if settings.history_noise or settings.history == "generated" or self.teacher is not None:
+            noise = torch.randn(latents.shape, generator=generator, device=latents.device)
+            latents = self.target(batch, noise)
+            history = self.history(batch, noise, generator)
         loss = teacher_forcing_loss(
             self.model,
             latents,
@@ -47,6 +65,42 @@ class TeacherForcingObjective(CausalObjective[Batch]):
             generator=generator,
         )
         return loss, {}
+
+    def target(self, batch: Batch, noise: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b v c t h w"]:
+        """What the blocks should become: the recording, in part what the teacher predicts in one step from this noise."""
+        latents, settings = batch.latents, self.settings
+        longest = settings.teacher_frames
+        if self.teacher is None or (longest is not None and latents.shape[3] > latent_frame_count(longest)):
+            return latents
+        first = latents[..., :1, :, :]
+        state = with_observed_frame(first, noise[..., 1:, :, :])
+        with torch.no_grad():
+            velocity = self.teacher(
+                state, latents.new_ones(len(latents)), action_maps=maps_of(batch), views=batch.views, fps=batch.fps
+            ).velocity
+        mixed = torch.lerp(latents, euler_step(state, velocity, 1.0, 0.0), settings.teacher_share)
+        return with_observed_frame(first, mixed[..., 1:, :, :])
+
+    def history(
+        self, batch: Batch, noise: Float[Tensor, "b v c t h w"], generator: torch.Generator
+    ) -> Float[Tensor, "b v c t h w"]:
+        """The clean blocks that a block sees: recorded and slightly disturbed, or the model's own rollout from this noise."""
+        latents = batch.latents
+        if self.settings.history == "recorded":
+            return latents + self.disturbance(
+                with_observed_frame(torch.zeros_like(noise[..., :1, :, :]), noise[..., 1:, :, :]), generator
+            )
+        size = self.spec.block_size  # the last block is nobody's history
+        maps = maps_of(batch)[..., :-size, :, :]
+        generated = self.rollout(batch, maps, noise[..., :-size, :, :], self.spec.steps - 1, with_gradient=False)
+        return torch.cat((generated.to(latents), latents[..., -size:, :, :]), dim=3)
+
+    def disturbance(
+        self, noise: Float[Tensor, "b v c t h w"], generator: torch.Generator
+    ) -> Float[Tensor, "b v c t h w"]:
+        """What is added to recorded blocks, from noise that is 0 on the observed frame."""
+        del generator
+        return self.settings.history_noise * noise
 
 
 def teacher_forcing_loss(

@@ -169,7 +169,8 @@ class DistillationRun:
         clips = ClipSampling.model_validate(self.config.clips.model_dump() | views)
         plan = batch_plan(settings.trainer, self._work(STEPS[0]))
         sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
-        objective = TeacherForcingObjective(model.train(), self.config)
+        teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
+        objective = TeacherForcingObjective(model.train(), self.config, teacher)
         micro_steps = settings.trainer.steps * plan.accumulation
         with clip_batches(self.loader, sampler, self.config.input, self._work(STEPS[0]), micro_steps) as load:
             return self._train(STEPS[0], settings.trainer, objective, load, info)

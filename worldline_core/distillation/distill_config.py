@@ -55,7 +55,11 @@ class WindowConfig(StrictModel):
 class TeacherForcingConfig(StrictModel):
     """Step 1.
 
-    ``history_noise``: standard deviation of noise on the clean blocks a block sees (0 in the paper).
+    ``history``: what a block sees before it, the recorded blocks (the paper) or the model's own, as in a rollout.
+    ``history_noise``: standard deviation of noise on recorded blocks (0 in the paper).
+    ``teacher_share``: of what a block should become, the share that the Stage II model predicts of the whole clip in one
+    step; the rest is the recording (the paper: all). ``teacher_frames``: longest clip that it is asked about, the longest
+    it was trained on; None: all.
     ``view_weights``: None trains all views jointly; otherwise what a step trains on is drawn by these weights ("joint"
     or the name of a view), and a step on one view takes ``single_view_factor`` times the clips: cheap where compute is
     short. The later steps are always joint.
@@ -64,9 +68,19 @@ class TeacherForcingConfig(StrictModel):
     trainer: TrainerConfig = TrainerConfig(steps=2000, optimizer=OptimizerConfig(learning_rate=3e-4))
     sigma: SigmaSampling = SigmaSampling(shift=2.0)
     weighting: LossWeighting = LossWeighting()
+    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
+    history: Literal["recorded", "generated"] = Field(default="recorded", exclude_if=lambda value: value == "recorded")
     history_noise: float = Field(default=0.0, ge=0)
+    teacher_share: float = Field(default=0.0, ge=0, le=1, exclude_if=lambda value: value == 0)
+    teacher_frames: int | None = Field(default=None, ge=1 + TEMPORAL_FACTOR, exclude_if=lambda value: value is None)
     view_weights: dict[str, float] | None = None
     single_view_factor: int = Field(default=1, ge=1)
+
+    @model_validator(mode="after")
+    def _noise_on_recorded_blocks(self) -> Self:
+        if self.history == "generated" and self.history_noise:
+            raise ValueError("history_noise is of recorded blocks; with history: generated it is 0")
+        return self
 
 
 class TrajectoriesConfig(StrictModel):

@@ -75,7 +75,8 @@ class DistillEstimates:
         for name, estimate in self.steps().items():
             trainer: TrainerConfig = getattr(self.config, name).trainer
             shape = self._shape(trainer, Spread())
-            rough = rough_bytes(self.model, shape, models=3 if name == "distribution_matching" else 1)
+            taught = name == "teacher_forcing" and self.config.teacher_forcing.teacher_share > 0
+            rough = rough_bytes(self.model, shape, models=3 if name == "distribution_matching" else 1 + taught)
             if self.config.lpips_weights is not None:
                 # Decoding eight frames of a view keeps some hundreds of values for each of their pixels.
                 rough += 4000 * 8 * shape.clips * len(shape.views) * 256 * shape.grid[0] * shape.grid[1]
@@ -130,10 +131,13 @@ class DistillEstimates:
         settings = self.config.teacher_forcing
         views = {"view_weights": settings.view_weights, "single_view_factor": settings.single_view_factor}
         shape = self._shape(settings.trainer, spread, self.config.clips.model_copy(update=views))
-        return self._memory(
-            TEACHER_FORCING, settings.trainer, spread, shape,
-            lambda model: TeacherForcingObjective(model, self.config),
-        )  # fmt: skip
+
+        def objective(model: WorldModel) -> TeacherForcingObjective:
+            return TeacherForcingObjective(model, self.config, WorldModel(model.config) if taught else None)
+
+        taught = settings.teacher_share > 0
+        memory = self._memory(TEACHER_FORCING, settings.trainer, spread, shape, objective)
+        return replace(memory, frozen_parts=4 * memory.trained) if taught else memory
 
     def _trajectory_regression(self, spread: Spread) -> StageMemory:
         settings = self.config.trajectory_regression
