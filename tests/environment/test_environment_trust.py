@@ -69,8 +69,8 @@ def test_info_says_how_far_the_judge_is_to_be_trusted(project_root: Path, tmp_pa
 
     with pytest.raises(ConfigError, match=r"(?s)of the measured judge.*success None"):
         WorldLineEnv(trust=tmp_path, **options, success=None)
-    with pytest.raises(ConfigError, match=r"(?s)not of these simulations.*is of other videos than these.*1 steps"):
-        WorldLineEnv(trust=tmp_path, **options, steps=1)
+    with pytest.raises(ConfigError, match=r"(?s)not of these simulations.*is of other videos than these.*2 steps"):
+        WorldLineEnv(trust=tmp_path, **options, steps=2)
     options["embodiment"] = "viperx_pearl"
     with pytest.raises(ConfigError, match=r"(?s)not made with these robots.*viperx_pearl"):
         WorldLineEnv(trust=tmp_path, **options)
