@@ -1,6 +1,6 @@
 """Planning in closed loop against choosing once, at equal numbers of model calls, in the recorder's MuJoCo world.
 
-    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--arms ...] [--open 16] [--model FOLDER]
+    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--arms ...] [--open 16] [--margin 0.2] [--model FOLDER]
 
 A start is a task, a body, a test scene and things on the table; an episode has 49 frames (three chunks of the causal model), 16 more
 than the recordings that the models were trained on, so that a second attempt fits. Proposals are the scripted controllers of the
@@ -187,9 +187,16 @@ class Start:
     """One start, and what the arms make of it."""
 
     def __init__(
-        self, spec: BankSpec, candidates: int, model: WorldLine, selector: MeasuredSelector, encoder: VideoTeacher
+        self,
+        spec: BankSpec,
+        candidates: int,
+        margin: float,
+        model: WorldLine,
+        selector: MeasuredSelector,
+        encoder: VideoTeacher,
     ) -> None:
-        self.spec, self.candidates, self.model, self.selector, self.encoder = spec, candidates, model, selector, encoder
+        self.spec, self.candidates, self.margin = spec, candidates, margin
+        self.model, self.selector, self.encoder = model, selector, encoder
         self.kinematics = ArmKinematics(load_embodiment(spec.embodiment))
         self.remembered: dict[bool, dict[bytes, float]] = {False: {}, True: {}}  # by whether the goal picture scores
 
@@ -258,7 +265,7 @@ class Start:
             embodiment=self.kinematics, instruction=world.layout.instruction, propose=Attempts(world),
             score=self.goal(world) if by_goal else judged(self.selector),
             solver="best_of_n" if once or by_goal else arm.removeprefix("closed_"),
-            candidates=self.candidates if once else self.candidates // 2, seed=SEED,
+            candidates=self.candidates if once else self.candidates // 2, seed=SEED, margin=self.margin,
         )  # fmt: skip
         plans: list[Plan] = []
         while world.frame < CHUNK * CHUNKS:
@@ -318,6 +325,7 @@ def main() -> None:
     parser.add_argument(
         "--open", type=int, default=12, help="candidates of `open`; the planner has half at each decision"
     )
+    parser.add_argument("--margin", type=float, default=0.0, help="of the planner; another one, another FOLDER")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -340,7 +348,7 @@ def main() -> None:
         if not missing:
             continue
         recorder = open_recorder(spec.embodiment)
-        start = Start(spec, options.open, model, selector, encoder)
+        start = Start(spec, options.open, options.margin, model, selector, encoder)
         world = start.drawn(recorder)
         for arm in missing:
             success, plans = start.run(arm, world)

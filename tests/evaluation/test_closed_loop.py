@@ -90,6 +90,19 @@ def test_the_search_ends_when_it_is_certain() -> None:
     assert solved("best_of_n", certain=0.1).stopped == "candidates"
 
 
+def test_the_first_candidate_is_chosen_unless_another_is_better_by_the_margin() -> None:
+    kept = GOAL[None] + 0.5  # scores -0.25
+    nothing = solved("best_of_n", kept=kept)
+    best = float(nothing.scores[0])
+    assert best > -0.25
+    carried = solved("best_of_n", kept=kept, margin=best + 0.26)
+    assert np.array_equal(carried.sequences[0], np.clip(kept[0], -1, 1))
+    assert carried.scores[0] == pytest.approx(quadratic(carried.sequences[:1])[0])
+    assert np.array_equal(carried.sequences[1], nothing.sequences[0])
+    assert np.array_equal(carried.scores[1:], np.sort(carried.scores[1:])[::-1])
+    assert np.array_equal(solved("best_of_n", kept=kept, margin=0.01).sequences, nothing.sequences)
+
+
 def test_a_score_that_is_no_number_is_refused() -> None:
     with pytest.raises(DataError, match="not a finite number"):
         solved("cem", evaluate=lambda sequences: np.full(len(sequences), np.nan))
@@ -231,6 +244,25 @@ def test_a_planner_obeys_its_time_and_stops_when_certain(world: WorldLine, head:
     assert (plan.stopped, plan.score, len(plan.scores)) == ("certain", 0.9, 2)
 
 
+def test_a_planner_carries_on_what_it_chose_unless_something_is_better_by_the_margin(
+    world: WorldLine, head: Start
+) -> None:
+    for margin, score in ((0.2, 0.5), (0.05, 0.6)):
+        # The first choice looks for nothing that is kept: its third candidate wins by less than the margin. At the second
+        # the first of the three is what is left of it.
+        scores: Iterator[float] = iter([0.75, 0.7, 0.8, 0.5, 0.6, 0.1])
+
+        def scored(video: Trajectory, scores: Iterator[float] = scores) -> float:
+            return next(scores)
+
+        planner = head.planner(world, candidates=3, margin=margin, score=scored)
+        first = planner.plan(head.now(), head.controls[0], horizon=2)
+        assert first.score == 0.8
+        second = planner.plan(head.now(), first.controls[-1], horizon=1)
+        assert second.score == second.scores[0] == score
+        assert np.array_equal(second.sequence, first.sequence[16:]) == (score == 0.5)
+
+
 def test_what_a_planner_cannot_use_is_named(world: WorldLine, head: Start) -> None:
     def broken(video: Trajectory) -> float:
         raise KeyError("no cup")
@@ -252,6 +284,8 @@ def test_what_a_planner_cannot_use_is_named(world: WorldLine, head: Start) -> No
         head.planner(world, solver="adam")
     with pytest.raises(ConfigError, match="cannot be run so"):
         head.planner(world, horizon=0)
+    with pytest.raises(ConfigError, match="a margin of at least 0"):
+        head.planner(world, margin=float("nan"))
 
 
 def test_proposals_from_recordings_go_on_where_the_episode_is() -> None:

@@ -63,7 +63,7 @@ class Plan:
     Attributes:
         controls: ``(c, j)``, the next chunk, within the robot's limits.
         sequence: ``(n, j)``, the whole chosen sequence, of which ``controls`` is the beginning.
-        score: of its video. scores: of all candidates that were scored, the best first.
+        score: of its video. scores: of all candidates that were scored, the chosen one first, then the better before the worse.
         model_calls: steps that the model predicted for this choice, counted for each candidate.
         seconds: that the search took.
         stopped: by the number of candidates, by time, or because a score was ``certain``.
@@ -94,6 +94,7 @@ class Planner:
         batch: candidates that are simulated together; time and certainty are looked at between batches.
         seconds: for one call; see :func:`~worldline_core.evaluation.planning.solvers.search`.
         certain: a score from which on nothing better is looked for.
+        margin: what is left of the last choice is carried on unless another candidate scores better by more than this.
         seed: of the proposals, and of the model's noise, which all candidates share.
         limits, response: as of ``WorldLine.start``.
 
@@ -116,6 +117,7 @@ class Planner:
         batch: int = 8,
         seconds: float | None = None,
         certain: float | None = None,
+        margin: float = 0.0,
         seed: int = 42,
         limits: bool = True,
         response: Response | None = None,
@@ -124,14 +126,19 @@ class Planner:
         if isinstance(solver, str) and solver not in SOLVERS:
             raise ConfigError("There is no such solver", expected=" | ".join(SOLVERS), got=solver)
         numbers = {"candidates": candidates, "horizon": horizon, "batch": batch, "seconds": seconds or 1}
-        if min(numbers.values()) <= 0:
-            raise ConfigError("A planner cannot be run so", expected="positive numbers", got=numbers)
+        if min(numbers.values()) <= 0 or not margin >= 0:
+            raise ConfigError(
+                "A planner cannot be run so",
+                expected="positive numbers; a margin of at least 0",
+                got={**numbers, "margin": margin},
+            )
         known = isinstance(embodiment, ArmKinematics)
         self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
         self.world, self.cameras, self.instruction = world, dict(cameras), instruction
         self.propose, self.score, self.candidates, self.horizon = propose, score, candidates, horizon
         self._solver: Solver = SOLVERS[solver] if isinstance(solver, str) else solver
-        self._batch, self._seconds, self._certain, self._clock = batch, seconds, certain, clock
+        self._batch, self._seconds, self._clock = batch, seconds, clock
+        self._certain, self._margin = certain, margin
         self._seed, self._random, self._limits, self._response = seed, np.random.default_rng(seed), limits, response
         self._first_state: np.ndarray | None = None
         self._past: dict[str, list[np.ndarray]] = {}
@@ -172,6 +179,7 @@ class Planner:
             self._solver(space, self.candidates),
             lambda sequences: self._scores(simulation, sequences, past, first_points),
             batch=self._batch, seconds=self._seconds, certain=self._certain, clock=self._clock,
+            margin=0.0 if self._found is None else self._margin,
         )  # fmt: skip
         self._first_state = command if self._first_state is None else self._first_state
         self._past = {view: [*past[view], self._shrunk(video[-1:])] for view, video in seen.items()}

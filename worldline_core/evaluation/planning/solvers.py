@@ -53,7 +53,8 @@ Solver = Callable[[Space, int], Batches]
 
 @dataclass(frozen=True)
 class Found:
-    """Result of a search: sequences ``(k, n, j)`` and their scores ``(k,)``, the best first, and why it stopped."""
+    """Result of a search: sequences ``(k, n, j)`` and their scores ``(k,)``, the chosen one first, then the better before the
+    worse, and why it stopped."""
 
     sequences: Sequences
     scores: Float[np.ndarray, " k"]
@@ -140,6 +141,7 @@ def search(
     batch: int,
     seconds: float | None = None,
     certain: float | None = None,
+    margin: float = 0.0,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Found:
     """Score a solver's candidates, ``batch`` at a time, until they are used up or one of the limits is reached.
@@ -148,6 +150,7 @@ def search(
         seconds: no batch is begun that would, lasting as long as the longest one so far, end later than this. The first is
             always scored: without it there is nothing to choose.
         certain: a score from which on nothing better is looked for.
+        margin: the first candidate is chosen unless another scores better by more than this.
 
     Raises:
         DataError: a score is not finite.
@@ -158,7 +161,10 @@ def search(
 
     def found(stopped: Stopped) -> Found:
         batches.close()
-        order = np.argsort(-np.array(scores), kind="stable")
+        ranked = np.array(scores)
+        if ranked.max() <= ranked[0] + margin:
+            ranked[0] = np.inf
+        order = np.argsort(-ranked, kind="stable")
         return Found(np.concatenate(sequences)[order], np.array(scores)[order], stopped, clock() - began)
 
     candidates = next(batches)
