@@ -1,6 +1,6 @@
 """Planning in closed loop against choosing once, at equal numbers of model calls, in the recorder's MuJoCo world.
 
-    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--arms ...] [--open 16] [--margin 0.2] [--model FOLDER]
+    python benchmarks/closed_loop_planning.py --output FOLDER [--count 1] [--arms ...] [--open 12] [--margin 0.2] [--model FOLDER]
 
 A start is a task, a body, a test scene and things on the table; an episode has 49 frames (three chunks of the causal model), 16 more
 than the recordings that the models were trained on, so that a second attempt fits. Proposals are the scripted controllers of the

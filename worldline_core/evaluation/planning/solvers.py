@@ -2,7 +2,7 @@
 
 A solver is a generator: it yields candidates ``(k, n, j)``, is sent their scores ``(k,)`` (higher is better), and ends when its
 candidates are used up. :func:`search` scores them in batches, stops early where it may, and keeps the best-scored sequence of
-all: with a model that gives equal controls equal videos, no average of sequences is worth more than one that was scored.
+all (or the first one, within a margin): with a model that gives equal controls equal videos, no average of sequences is worth more than one that was scored.
 
 Axis legend: k candidates, n frames, j columns of the embodiment's state.
 """
@@ -48,7 +48,8 @@ class Space:
 
 
 Solver = Callable[[Space, int], Batches]
-"""Batches of the solver, of at most so many candidates together."""
+"""Batches of the solver, of at most so many candidates together; the very first is what is left of an earlier search, if anything is
+(:meth:`Space.first` puts it there): a margin is in its favour."""
 
 
 @dataclass(frozen=True)
