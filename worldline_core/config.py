@@ -305,7 +305,8 @@ def load_config[Model: BaseModel](
         values = values.get(section) or {}
         if not isinstance(values, Mapping):
             raise ConfigError("A section is a mapping", where=f"{source}: {section}", got=type(values).__name__)
-    return validate(model, values, where=source if section is None else f"{source}: {section}")
+    places = [str(source) if section is None else f"{source}: {section}", *(f"--set {text}" for text in overrides)]
+    return validate(model, values, where=", ".join(places))
 
 
 def _with_extended(source: Path) -> dict[str, Any]:

@@ -57,6 +57,9 @@ def test_unknown_key_suggests_the_nearest(tmp_path: Path) -> None:
 def test_unknown_override_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"inner\.rat: unknown key"):
         load_config(Outer, path=_write(tmp_path, "name: x"), overrides=["inner.rat=2"])
+    # The mistake may lie in the override: the place names it beside the file.
+    with pytest.raises(ConfigError, match=r"where: \S+\.yaml, --set inner\.rat=2\n"):
+        load_config(Outer, path=_write(tmp_path, "name: x"), overrides=["inner.rat=2"])
 
 
 def test_bad_value_names_its_path(tmp_path: Path) -> None:
