@@ -68,20 +68,27 @@ def is_long(number: int, every: int) -> bool:
 
 
 def recorded_batch(
-    memory: Memory, size: int, draws: torch.Generator, *, long: bool, things: tuple[float, float] = (0.0, 0.0)
+    memory: Memory,
+    size: int,
+    draws: torch.Generator,
+    *,
+    long: bool,
+    action_frames: int,
+    things: tuple[float, float] = (0.0, 0.0),
 ) -> TrajectoryBatch:
     """Clips and where the robot is; long ones are a third as many. The nodes are the recording itself.
 
     Args:
+        action_frames: control frames whose maps a latent frame takes.
         things: extra weight of what the task moves, and of other things.
     """
     episodes = memory.episodes(short=not long)
     rows = drawn(len(episodes), size // 3 if long else size, draws)
     if long:
         starts = drawn(episodes.latents.shape[3] - 4 * LONG_BLOCKS, len(rows), draws)
-        latents, maps, robot, shares = episodes.cuts(rows, starts, LONG_BLOCKS)
+        latents, maps, robot, shares = episodes.cuts(rows, starts, LONG_BLOCKS, action_frames)
     else:
-        latents, maps, robot, shares = episodes.clips(rows)
+        latents, maps, robot, shares = episodes.clips(rows, action_frames)
     return TrajectoryBatch(
         clips=named(episodes, rows),
         views=VIEWS,
@@ -136,7 +143,14 @@ def forcing_step(start: Start, settings: ForcingSettings) -> Step:
 
     def load(index: int) -> Batch:
         long = is_long(index, settings.long_every)
-        return recorded_batch(memory, settings.batch, start.draws(index), long=long, things=settings.things)
+        return recorded_batch(
+            memory,
+            settings.batch,
+            start.draws(index),
+            long=long,
+            action_frames=model.config.action_frames,
+            things=settings.things,
+        )
 
     def held_out(trainer: TrainerConfig) -> dict[str, float]:
         episodes, batches = memory.episodes("validation"), trainer.validation_batches
@@ -144,7 +158,7 @@ def forcing_step(start: Start, settings: ForcingSettings) -> Step:
 
         def batch(index: int) -> Batch:
             rows = torch.arange(index * size, (index + 1) * size) % len(episodes)
-            latents, maps, _, _ = episodes.clips(rows)
+            latents, maps, _, _ = episodes.clips(rows, model.config.action_frames)
             return Batch(named(episodes, rows), VIEWS, latents, maps)
 
         return held_out_losses(trainer, batch, objective.validation_losses, VALIDATION_SEED)
@@ -174,7 +188,13 @@ def trajectories(
     """The teacher's trajectories of some clips, in half precision: a function of seed and number."""
     # Negative numbers are no steps: these are other clips than the steps'.
     draws = start.draws(-1 - number)
-    batch = recorded_batch(start.memory, settings.clips, draws, long=is_long(number, settings.long_every))
+    batch = recorded_batch(
+        start.memory,
+        settings.clips,
+        draws,
+        long=is_long(number, settings.long_every),
+        action_frames=teacher.config.action_frames,
+    )
     device = batch.latents.device
     noise = torch.randn(
         batch.latents.shape, generator=step_generator(start.seed, -1 - number, str(device)), device=device
@@ -204,6 +224,7 @@ def matching_step(start: Start, settings: MatchingSettings) -> Step:
     ]
 
     def load(index: int) -> Batch:
-        return recorded_batch(start.memory, settings.batch, start.draws(index), long=False)
+        taken = model.config.action_frames
+        return recorded_batch(start.memory, settings.batch, start.draws(index), long=False, action_frames=taken)
 
     return Step(DistributionMatchingObjective(model, real, fake.train(), config, None), groups, load, saved)

@@ -30,6 +30,7 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import collate_tracks
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.distillation.auxiliary_losses import clip_robot_masks
+from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.world_model_config import VIEWS
@@ -192,9 +193,9 @@ def _arrays(recording: Recording, with_masks: bool) -> dict[str, np.ndarray]:
     """An episode's part of `Recorded`, by name."""
     episode, count = recording.episode, recording.episode.num_frames
     tracks, _ = compute_tracks(episode, _kinematics().get(episode.embodiment))
-    cut = tracks.clip(latent_frame_indices(count))
-    maps = render_action_maps(collate_tracks([cut], views=VIEWS), cut.image_size, GRID, sigma_px_ref=SIGMA_PX_REF)
-    robot = clip_robot_masks([tracks.clip(list(range(count)))], VIEWS, GRID)
+    cut, whole = tracks.clip(latent_frame_indices(count)), tracks.clip(list(range(count)))
+    maps = render_action_maps(collate_tracks([whole], views=VIEWS), whole.image_size, GRID, sigma_px_ref=SIGMA_PX_REF)
+    robot = clip_robot_masks([whole], VIEWS, GRID)
     frames = np.empty((len(VIEWS), count, *SIZE, 3), np.uint8)
     things = np.zeros((len(VIEWS), 2, count, *GRID), np.float32)
     masks = np.zeros((len(VIEWS), 2, count, *SIZE), np.uint8)
@@ -228,7 +229,7 @@ class Recorded:
 
     Attributes:
         frames: uint8 (n, v, f, 64, 96, 3).
-        maps: float16 (n, v, 9, t, 8, 12) action maps.
+        maps: float16 (n, v, 9, f, 8, 12) action maps of every frame.
         native: float32 (n, 32, t) control vectors, padded with zeros.
         robot: uint8 (n, v, t, 8, 12) where the robot is.
         things: float16 (n, v, 2, t, 8, 12) share of each cell that shows what the task moves, and other things.
@@ -245,10 +246,20 @@ class Recorded:
 
     @classmethod
     def read(cls, path: Path) -> Recorded:
+        """Everything. Raises: DataError for a file of before the maps of every frame were kept."""
         with safe_open(path, framework="numpy") as file:
             names = list(file.keys())
             facts = [Fact(**values) for values in json.loads(file.metadata()["facts"])]
-            return cls(facts, **{name: file.get_tensor(name) for name in names})
+            found = cls(facts, **{name: file.get_tensor(name) for name in names})
+        if found.maps.shape[3] != found.frames.shape[2]:
+            raise DataError(
+                "These recordings lack the action maps of frames between latent frames",
+                where=path,
+                expected=f"{found.frames.shape[2]} frames of maps",
+                got=found.maps.shape[3],
+                next_step="remove the folder and record it again",
+            )
+        return found
 
     @staticmethod
     def outline(path: Path) -> tuple[list[Fact], int]:

@@ -72,7 +72,7 @@ class Predictor:
 
     def controls(self, maps: Tensor, native: Tensor) -> Tensor:
         """What drives it, of recordings with these action maps and control vectors."""
-        return controls_of(maps, native, self.views, self.model.config.native_size)
+        return controls_of(maps, native, self.views, self.model.config)
 
     @torch.no_grad()
     def __call__(self, latents: Tensor, controls: Tensor) -> Tensor:

@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from einops import rearrange
 from torch import Tensor
+from tqdm import tqdm
 
 from tools.small_world_data import GRID, SHORT, VIEWS, Fact, Recorded
+from worldline_core.actions.action_maps import control_frames, stack_controls
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import DataError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
@@ -67,12 +69,19 @@ class Episodes:
             raise DataError("No recording ended so", expected=outcomes, got=sorted({f.outcome for f in self.facts}))
         return torch.tensor(rows)
 
-    def clips(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Latents, action maps, robot masks and shares of things of whole episodes, in single precision."""
-        return self.latents[rows].float(), self.maps[rows].float(), self.robot[rows].float(), self.things[rows].float()
+    def clips(self, rows: Tensor, per_latent_frame: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Latents, action maps, robot masks and shares of things of whole episodes, in single precision.
 
-    def cuts(self, rows: Tensor, starts: Tensor, blocks: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The same of parts of long episodes: `starts` alone as first frames, then blocks of four.
+        Args:
+            per_latent_frame: control frames whose maps a latent frame takes.
+        """
+        maps = maps_of_latent_frames(self.maps[rows], per_latent_frame)
+        return self.latents[rows].float(), maps.float(), self.robot[rows].float(), self.things[rows].float()
+
+    def cuts(
+        self, rows: Tensor, starts: Tensor, blocks: int, per_latent_frame: int = 1
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The same of parts of long episodes: latent frames `starts` alone as first frames, then blocks of four.
 
         Raises: DataError for short recordings, whose frames are not coded alone.
         """
@@ -81,10 +90,17 @@ class Episodes:
         frames = starts[:, None] + torch.arange(4 * blocks + 1, device=starts.device)
         later = rearrange(self.latents[rows[:, None], :, :, frames[:, 1:]], "n t v c h w -> n v c t h w")
         first = rearrange(self.singles[rows, :, :, starts], "n v c h w -> n v c 1 h w")
-        maps = rearrange(self.maps[rows[:, None], :, :, frames], "n t v c h w -> n v c t h w")
+        seen = torch.arange(4 * blocks * TEMPORAL_FACTOR + 1, device=starts.device)
+        every = self.maps[rows[:, None], :, :, TEMPORAL_FACTOR * starts[:, None] + seen]
+        maps = maps_of_latent_frames(rearrange(every, "n f v c h w -> n v c f h w"), per_latent_frame)
         robot = rearrange(self.robot[rows[:, None], :, frames], "n t v h w -> n v t h w")
         things = rearrange(self.things[rows[:, None], :, :, frames], "n t v c h w -> n v c t h w")
         return torch.cat((first, later), dim=3).float(), maps.float(), robot.float(), things.float()
+
+
+def maps_of_latent_frames(maps: Tensor, per_latent_frame: int) -> Tensor:
+    """What latent frames take (n v channels t h w) of the maps of every frame (n v 9 f h w)."""
+    return stack_controls(maps[:, :, :, control_frames(maps.shape[3], per_latent_frame)], per_latent_frame)
 
 
 class Gathered:
@@ -153,7 +169,7 @@ class Memory:
             facts, frames = Recorded.outline(folder / name)
             counts[frames == SHORT, facts[0].split] += len(facts)
         found = {kind: Gathered(count) for kind, count in counts.items()}
-        for name in names:
+        for name in tqdm(names, desc="read", unit="file", mininterval=10):
             recorded = Recorded.read(folder / name)
             found[recorded.short, recorded.split].add(recorded.facts, self._encoded(recorded))
             if recorded.short and recorded.split != "train":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.distillation.distill_config import CYCLE
+from worldline_core.errors import ConfigError
 from worldline_core.model.contracts import CAUSAL_SIGMAS
 from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
 from worldline_core.training.training_config import OptimizerConfig, SavingConfig, SigmaSampling, TrainerConfig
@@ -92,6 +93,7 @@ class Stage2Settings(Timed):
 
     ``things``: extra weight of what the task moves, and of other things.
     ``outcomes``: only recordings that ended so (``[success]``); None takes all.
+    ``action_frames``: control frames whose maps a latent frame takes: its own, or all four of its interval.
     ``native_size``: control vectors, padded to this size, by FiLM in every layer instead of maps (32 holds all bodies').
     ``relational``: the relational terms, with the shipped video teacher.
     """
@@ -106,13 +108,17 @@ class Stage2Settings(Timed):
     compile: bool = False
     views: tuple[str, ...] = VIEWS
     outcomes: tuple[str, ...] | None = Field(default=None, min_length=1)
+    # Left out of dumps at its default: what was trained before it existed keeps its name.
+    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
     native_size: int | None = Field(default=None, ge=16, le=32)
     relational: bool = False
 
     @model_validator(mode="after")
-    def _known_views(self) -> Self:
+    def _known_views_and_controls(self) -> Self:
         if not set(self.views) <= set(VIEWS) or "head" not in self.views:
             raise ValueError(f"views: some of {', '.join(VIEWS)}, the head view among them, not {self.views}")
+        if self.native_size is not None and self.action_frames != 1:
+            raise ValueError("action_frames: control vectors are those of one frame; leave it out with native_size")
         return self
 
 
@@ -223,6 +229,12 @@ class Plan(StrictModel):
         if self.reference is not None and self.reference not in self.runs:
             raise ValueError(f"reference: one of {', '.join(self.runs)}, not {self.reference}")
         return self
+
+    def of_seeds(self, chosen: Sequence[int] | None) -> Plan:
+        """The same with some of its seeds alone; None: all. Raises: ConfigError for a seed that it does not have."""
+        if unknown := sorted(set(chosen or ()) - set(self.seeds)):
+            raise ConfigError("The plan has no such seed", where="--seeds", expected=self.seeds, got=unknown)
+        return self if chosen is None else self.model_copy(update={"seeds": tuple(chosen)})
 
     @property
     def relational(self) -> bool:

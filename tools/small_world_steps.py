@@ -16,7 +16,7 @@ from einops import repeat
 from torch import Tensor
 
 from tools.small_world_data import GRID, SHORT, SIGMA_PX_REF, VIEWS
-from tools.small_world_memory import Episodes, KnownRelations, Memory
+from tools.small_world_memory import Episodes, KnownRelations, Memory, maps_of_latent_frames
 from tools.small_world_runs import (
     BaseSettings,
     Stage2Settings,
@@ -24,7 +24,7 @@ from tools.small_world_runs import (
 from worldline_core.errors import ConfigError
 from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
-from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, TrainedClips
+from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContract, TrainedClips
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
@@ -86,9 +86,12 @@ class Start:
         return model.to(self.memory.device)
 
     def loaded(
-        self, folder: Path | None, *kinds: Literal["base", "stage2", "causal"]
+        self,
+        folder: Path | None,
+        *kinds: Literal["base", "stage2", "causal"],
+        action_frames: Literal[1, 4] | None = None,
     ) -> tuple[WorldModel, CheckpointInfo]:
-        """The video tower of a checkpoint.
+        """The video tower of a checkpoint; ``action_frames`` as in `load_checkpoint`.
 
         Raises: ConfigError when there is none; CheckpointError for one of another kind.
         """
@@ -96,7 +99,7 @@ class Start:
             raise ConfigError(
                 "This step starts from a model", expected=f"a step before it, or start: a {kinds[-1]} model"
             )
-        model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation")
+        model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", action_frames=action_frames)
         return model.to(self.memory.device), info
 
 
@@ -160,11 +163,12 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
     """Controls and first frames to the views."""
     episodes, size = start.memory.episodes(), settings.native_size
     film = {} if size is None else {"action_conditioning": "native_film", "action_channels": size}
+    taken = settings.action_frames
     torch.manual_seed(start.seed)  # of a new action branch's first layer
     if start.parent is None:
-        model = start.new_model(towers="generation", **film)
+        model = start.new_model(towers="generation", action_frames=taken, **film)
     else:
-        model = start.loaded(start.parent, "base", "stage2")[0]
+        model = start.loaded(start.parent, "base", "stage2", action_frames=taken)[0]
         if size is not None and model.config.native_size != size:
             model.config = model.config.model_copy(update=film)
             model.action_encoder = new_action_branch(model.config).to(start.memory.device)
@@ -186,7 +190,7 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
             named(episodes, rows),
             settings.views,
             episodes.latents[rows][:, chosen].float(),
-            controls_of(episodes.maps[rows], episodes.native[rows], settings.views, size),
+            controls_of(episodes.maps[rows], episodes.native[rows], settings.views, model.config),
             weights=object_weights(episodes.things[rows][:, chosen].float(), *settings.things),
         )
 
@@ -197,6 +201,7 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
         fps=8.0,
         grid_size=GRID,
         tokenizer=start.memory.tokenizer.encoder_digest[:16],
+        temporal=TEMPORAL[taken],
         **({} if size is None else {"maps": NATIVE_VECTORS}),
     )
     trained = None if settings.views == VIEWS else TrainedClips(views=settings.views, strides=(1,))
@@ -206,8 +211,9 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
     return Step(objective, stage2_groups(model, settings.action_multiplier), load, saved)
 
 
-def controls_of(maps: Tensor, native: Tensor, views: Sequence[str], native_size: int | None) -> Tensor:
-    """Action maps of the views, or control vectors (b v size t 1 1) for a model that takes these, in single precision."""
-    if native_size is None:
-        return maps[:, [VIEWS.index(view) for view in views]].float()
-    return repeat(native[:, :native_size], "b c t -> b v c t 1 1", v=len(views)).float()
+def controls_of(maps: Tensor, native: Tensor, views: Sequence[str], config: WorldModelConfig) -> Tensor:
+    """What a model takes of the maps of every frame, or of control vectors (b v size t 1 1), in single precision."""
+    if config.native_size is None:
+        chosen = maps[:, [VIEWS.index(view) for view in views]]
+        return maps_of_latent_frames(chosen, config.action_frames).float()
+    return repeat(native[:, : config.native_size], "b c t -> b v c t 1 1", v=len(views)).float()

@@ -18,9 +18,11 @@ COLUMNS = {
     "error_head": ("squared latent error, head view", -1),
     "drift_last": ("error over copying, last block of 129 frames", -1),
     "sharpness": ("sharpness", 1),
+    "unseen_robot_iou": ("robot IoU, unseen body or camera", 1),
 }
 """Heading of each measured figure, and 1 where more is better, else -1."""
-PAPER = "held_out_robot_iou"
+PAPER = {"robot_iou": "held_out_robot_iou", "unseen_robot_iou": "ood_robot_iou"}
+"""Figures that the paper gives too, and their names there."""
 
 Figures = Mapping[str, float]
 Measured = Mapping[str, Mapping[int, Figures]]
@@ -87,7 +89,7 @@ def _verdict(difference: Spread) -> str:
 
 
 def table(measured: Measured, reference: str) -> dict[str, object]:
-    """All figures and comparisons as JSON values."""
+    """All figures, by run and seed and over the seeds, and comparisons as JSON values."""
     rows = {
         run: {
             figure: asdict(Spread.of(values))
@@ -98,7 +100,7 @@ def table(measured: Measured, reference: str) -> dict[str, object]:
     }
     return {
         "reference": reference,
-        "seeds": {run: sorted(seeds) for run, seeds in measured.items()},
+        "seeds": {run: dict(sorted(seeds.items())) for run, seeds in measured.items()},
         "runs": rows,
         "compared": [asdict(one) for one in compared(measured, reference)],
     }
@@ -119,7 +121,9 @@ def markdown(measured: Measured, reference: str) -> str:
         return "\n".join([*lines, ""])
     title = f"How much better `{reference}` is, by seeds (95 % interval of Student's t), and whether that holds:"
     lines += ["", title, ""]
-    lines += [f"| than | {heads} | the paper: robot IoU |", "|---" * (2 + len(shown)) + "|"]
+    paper = {figure: name for figure, name in PAPER.items() if figure in shown}
+    beside = " | ".join(f"the paper: {COLUMNS[figure][0]}" for figure in paper)
+    lines += [f"| than | {heads} | {beside} |", "|---" * (1 + len(shown) + len(paper)) + "|"]
     variants = load_variants()
     differences = compared(measured, reference)
     for run in measured:
@@ -127,9 +131,9 @@ def markdown(measured: Measured, reference: str) -> str:
         for figure in shown:
             one = next((d for d in differences if (d.run, d.figure) == (run, figure)), None)
             cells.append("" if one is None else f"{one.difference.text(signed=True)}: {one.verdict}")
-        paper = ""
-        if run in variants and PAPER in variants[run].paper:
-            paper = f"{variants[FULL].paper[PAPER] - variants[run].paper[PAPER]:+.3f}"
+        for name in paper.values():
+            known = run in variants and name in variants[run].paper
+            cells.append(f"{variants[FULL].paper[name] - variants[run].paper[name]:+.3f}" if known else "")
         if run != reference:
-            lines.append(f"| {run} | " + " | ".join(cells) + f" | {paper} |")
+            lines.append(f"| {run} | " + " | ".join(cells) + " |")
     return "\n".join([*lines, ""])

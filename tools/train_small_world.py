@@ -1,6 +1,6 @@
 """Record the small world, train models on it and compare them, on one GPU, with everything in memory.
 
-    python -m tools.train_small_world record FOLDER --workers 15
+    python -m tools.train_small_world record FOLDER
     python -m tools.train_small_world tokenizer FOLDER TOKENIZER --plan configs/shipped/small_world.yaml
     python -m tools.train_small_world train FOLDER OUTPUT --plan configs/shipped/small_world.yaml
 
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import signal
 import sys
@@ -287,10 +288,13 @@ class Training:
         return found
 
     def figures(self, folder: Path) -> dict[str, float]:
-        """The figures of the table: of the first sampler and the first split."""
+        """The figures of the table: of the first sampler and the first split, and of what was unseen besides scenes."""
         found: Any = self.measured(folder)
-        first = next(iter(next(iter(found.values())).values()))
+        splits = next(iter(found.values()))
+        first = next(iter(splits.values()))
         figures = {name: first[name] for name in COLUMNS if first.get(name) is not None}
+        if unseen := splits.get("ood_test"):
+            figures["unseen_robot_iou"] = unseen["robot_iou"]
         return figures | ({"drift_last": found["drift"][-1]} if found.get("drift") else {})
 
 
@@ -315,7 +319,8 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     recording = commands.add_parser("record", help="record files that training reads")
     recording.add_argument("folder", type=Path)
-    recording.add_argument("--workers", type=int, default=15, help="processes (%(default)s)")
+    cores = min(15, os.cpu_count() or 1)
+    recording.add_argument("--workers", type=int, default=cores, help="processes (here %(default)s)")
     recording.add_argument(
         "--last-seed", type=int, default=3019, help="chunks of training recordings end with this one"
     )
@@ -332,6 +337,7 @@ def main() -> None:
         command.add_argument("--plan", type=Path, required=True, help="YAML, such as configs/shipped/small_world.yaml")
         if name == "train":
             command.add_argument("--tokenizer", type=Path, default=MODELS / "tokenizer", help="(the shipped one)")
+            command.add_argument("--seeds", type=int, nargs="+", help="some of the plan's seeds alone")
     arguments = parser.parse_args()
     # `timeout` ends a call so: what runs beside this process is ended with it, and a training saves its state first.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
@@ -344,6 +350,7 @@ def main() -> None:
     plan = load_config(Plan, path=arguments.plan)
     try:
         if arguments.command == "train":
+            plan = plan.of_seeds(arguments.seeds)
             train_plan(arguments.folder, arguments.output, arguments.tokenizer, plan, device)
         elif plan.tokenizer is None:
             raise ConfigError("The plan has no tokenizer", where=arguments.plan, expected="a section tokenizer")

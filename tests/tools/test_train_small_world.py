@@ -23,7 +23,7 @@ from tools.small_world_measures import Measuring, Predictor, Shown, gradient_ene
 from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownRelations, Memory, videos
 from tools.small_world_runs import ForcingSettings, Plan
 from tools.small_world_steps import Start, controls_of, object_weights
-from tools.small_world_table import Spread, compared, markdown
+from tools.small_world_table import Spread, compared, markdown, table
 from tools.train_small_world import MODELS, Training
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.distillation import causal_teacher_forcing
@@ -45,16 +45,16 @@ FACT = Fact("ur5e_slate-train-s1-00000", "ur5e_slate", "train", "success", "lift
 
 
 def episodes(count: int, frames: int, *, long: bool) -> Episodes:
-    """Episodes whose latents, maps and singly coded frames say where they come from: 100 n + t, + 0.25, + 0.5."""
-    value = 100.0 * torch.arange(count)[:, None] + torch.arange(frames)
+    """Episodes that say where they come from: latents 100 n + t, singly coded frames + 0.5; maps 100 n + f / 4 + 0.25."""
 
-    def filled(channels: int, offset: float) -> Tensor:
+    def filled(channels: int, offset: float, step: float = 1.0) -> Tensor:
+        value = 100.0 * torch.arange(count)[:, None] + torch.arange(0, frames - 1 + step, step)
         return (value + offset)[:, None, None, :, None, None].expand(-1, 3, channels, -1, 2, 2).half()
 
     return Episodes(
         facts=[FACT] * count,
         latents=filled(4, 0.0),
-        maps=filled(9, 0.25),
+        maps=filled(9, 0.25, step=0.25),
         things=filled(2, 0.0),
         robot=filled(1, 0.75)[:, :, 0],
         native=torch.zeros(count, 32, frames),
@@ -88,6 +88,21 @@ def test_cuts_begin_with_the_frame_that_was_coded_alone_and_hold_its_maps() -> N
         assert maps[row, 1, 8, :, 0, 1].tolist() == [start + step + 0.25 for step in range(17)]
         assert things[row, 1, 1, :, 0, 1].tolist() == [start + step for step in range(17)]
         assert robot[row, 1, :, 0, 1].tolist() == [start + step + 0.75 for step in range(17)]
+
+
+def test_a_latent_frame_takes_the_maps_of_its_own_frame_or_of_its_whole_interval() -> None:
+    short, rows = episodes(2, 9, long=False), torch.tensor([1])
+    own = [100.25 + step for step in range(9)]
+    assert short.clips(rows)[1][0, 2, 8, :, 0, 1].tolist() == own
+    every = short.clips(rows, 4)[1]
+    assert every.shape == (1, 3, 36, 9, 2, 2)
+    for back in range(4):
+        # Before the first frame nothing happened: its maps again.
+        before = [max(100.25, value - back / 4) for value in own]
+        assert every[0, 1, 9 * back, :, 1, 0].tolist() == before
+    cut = episodes(2, 33, long=True).cuts(rows, torch.tensor([3]), blocks=1, per_latent_frame=4)[1]
+    assert cut.shape == (1, 3, 36, 5, 2, 2)
+    assert cut[0, 0, 27, :, 0, 0].tolist() == [103.25, 103.5, 104.5, 105.5, 106.5]
 
 
 def test_short_recordings_are_not_cut() -> None:
@@ -150,6 +165,7 @@ def test_the_shipped_model_predicts_what_the_tool_records(tmp_path: Path) -> Non
             r"runs\.one\.teacher_forcing: .*with history: generated it is 0",
         ),
         ({"stage2": {"steps": 1, "views": ["left_wrist"]}}, r"runs\.one\.stage2: .*the head view among them"),
+        ({"stage2": {"steps": 1, "native_size": 32, "action_frames": 4}}, r"runs\.one\.stage2: .*leave it out"),
     ],
 )
 def test_a_wrong_key_of_the_plan_is_refused_by_its_name(
@@ -161,18 +177,9 @@ def test_a_wrong_key_of_the_plan_is_refused_by_its_name(
         load_config(Plan, path=path)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "small_world",
-        "small_world_directions",
-        "small_world_distillation",
-        "small_world_continued",
-        "small_world_one_step",
-    ],
-)
-def test_the_plans_are_ones_that_the_tool_reads(name: str) -> None:
-    plan = load_config(Plan, path=SHIPPED / f"{name}.yaml")
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("small_world*.yaml")), ids=lambda path: path.stem)
+def test_the_plans_are_ones_that_the_tool_reads(path: Path) -> None:
+    plan = load_config(Plan, path=path)
     assert plan.runs
     assert all(run.steps() for run in plan.runs.values())
 
@@ -198,6 +205,69 @@ def test_the_directions_change_one_thing_each_and_last_equally_long() -> None:
         "no_action_free": {"seconds"},
     }
     assert plan.runs["no_action_free"].base is None
+
+
+def test_some_seeds_of_a_plan_are_made_alone() -> None:
+    plan = Plan(seeds=(0, 1, 2))
+    assert plan.of_seeds(None) == plan
+    assert plan.of_seeds([2, 0]).seeds == (2, 0)
+    with pytest.raises(ConfigError, match=r"(?s)no such seed.*\(0, 1, 2\).*\[7\]"):
+        plan.of_seeds([1, 7])
+
+
+def differences(plan: Plan, name: str) -> set[str]:
+    """What a run changes in its reference: settings of Stage II, fields of the model."""
+    run, full = plan.runs[name], plan.runs[plan.reference or ""]
+    assert run.stage2 is not None
+    assert full.stage2 is not None
+    found = {key for key, value in run.stage2.model_dump().items() if value != full.stage2.model_dump().get(key)}
+    own, shared = (run.model or plan.model).model_dump(), plan.model.model_dump()
+    return found | {key for key in own if own[key] != shared[key]}
+
+
+def test_the_directions_on_cpus_change_one_thing_each_and_take_equal_minutes() -> None:
+    plan = load_config(Plan, path=SHIPPED / "small_world_directions_cpu.yaml")
+    changed = {name: differences(plan, name) for name in plan.runs}
+    assert changed == {
+        "full": set(),
+        "success_only": {"outcomes"},
+        "native_film": {"native_size", "steps"},
+        "head_only": {"views", "steps"},
+        "head_only_as_many_clips": {"views"},
+        "no_regularization": {"relational", "steps"},
+        "no_action_free": {"steps"},
+    }
+    # Processor time of a clip, as the plan states it.
+    costs = {"native_film": 0.98, "head_only": 0.296, "no_regularization": 0.918}
+    minutes = {}
+    for name, run in plan.runs.items():
+        assert run.stage2 is not None
+        base = 0 if run.base is None else 0.335 * (run.base.steps or 0) * run.base.batch
+        minutes[name] = base + costs.get(name, 1.0) * (run.stage2.steps or 0) * run.stage2.batch
+    del minutes["head_only_as_many_clips"]
+    assert list(minutes.values()) == pytest.approx([minutes["full"]] * 6, rel=0.01)
+
+
+def test_the_choices_are_undone_one_at_a_time_in_equal_minutes() -> None:
+    plan = load_config(Plan, path=SHIPPED / "small_world_choices_cpu.yaml")
+    changed = {name: differences(plan, name) for name in plan.runs}
+    assert changed == {
+        "shipped": set(),
+        "even_things": {"things"},
+        "even_motion": {"motion"},
+        "even_noise": {"sigma"},
+        "most_noise": {"sigma"},
+        "velocity": {"prediction", "first_frame_std"},
+        "clean_latents": {"prediction", "first_frame_std"},
+        "every_control": {"action_frames"},
+        "smaller": {"steps", "hidden_size", "num_heads", "intermediate_size"},
+        "larger": {"steps", "hidden_size", "num_layers", "intermediate_size"},
+    }
+    costs = {"smaller": 0.531, "larger": 2.277}
+    for name, run in plan.runs.items():
+        assert run.stage2 is not None
+        assert (run.stage2.steps or 0) * costs.get(name, 1.0) == pytest.approx(1500, rel=0.01)
+    assert set(plan.measure.splits) == {"validation"}
 
 
 def test_the_moved_thing_is_found_and_the_judge_scores_both_kinds_of_views() -> None:
@@ -239,8 +309,9 @@ def test_a_comparison_is_made_seed_by_seed_and_its_sign_is_that_of_better() -> N
         "other": {
             seed: {"robot_iou": 0.7 + 0.1 * seed + 0.001 * seed, "error_head": 0.1 + 0.001 * seed} for seed in range(3)
         },
-        "native_film": {0: {"robot_iou": 0.5}},
+        "native_film": {0: {"robot_iou": 0.5, "unseen_robot_iou": 0.4}},
     }
+    measured["full"][0]["unseen_robot_iou"] = 0.6
     found = {(one.run, one.figure): one for one in compared(measured, "full")}
     assert found["other", "robot_iou"].verdict == "holds"
     assert found["other", "robot_iou"].difference.mean == pytest.approx(0.099)
@@ -249,7 +320,8 @@ def test_a_comparison_is_made_seed_by_seed_and_its_sign_is_that_of_better() -> N
     assert ("other", "area") not in found
     text = markdown(measured, "full")
     assert "| native_film | +0.300: open |" in text
-    assert "| +0.198 |" in text
+    assert "| +0.200: open | +0.198 | +0.157 |" in text
+    assert json.loads(json.dumps(table(measured, "full")))["seeds"]["native_film"] == {"0": measured["native_film"][0]}
 
 
 def recording(
@@ -269,7 +341,7 @@ def recording(
     arrays = {
         "frames": pixels,
         "masks": masks,
-        "maps": random.standard_normal((count, 3, 9, latent, 8, 12)).astype(np.float16),
+        "maps": random.standard_normal((count, 3, 9, frames, 8, 12)).astype(np.float16),
         "native": random.standard_normal((count, NATIVE_SIZE, latent)).astype(np.float32),
         "robot": np.ones((count, 3, latent, 8, 12), np.uint8),
         "things": random.random((count, 3, 2, latent, 8, 12)).astype(np.float16),
@@ -330,15 +402,17 @@ def test_runs_share_what_they_have_in_common_and_are_measured(measuring: Measuri
         native_film={"base": BASE, "stage2": {**STAGE2, "native_size": 32}},
         head_only={"base": BASE, "stage2": {**STAGE2, "views": ["head"]}},
         no_action_free={"stage2": STAGE2},
+        every_control={"base": BASE, "stage2": {**STAGE2, "action_frames": 4}},
     )
     plan = plan.model_copy(update={"seeds": (0, 1)})
     Training(measuring.memory, plan, tmp_path, measuring).all()
     runs = json.loads((tmp_path / "runs.json").read_text())
-    assert len(runs) == 12
+    assert len(runs) == 14
     assert len({folders["base"] for name, folders in runs.items() if "base" in folders}) == 2
-    assert len({folders["stage2"] for folders in runs.values()}) == 12
-    for name, kept in (("native_film", {"native_size": 32}), ("head_only", {}), ("full", {})):
+    assert len({folders["stage2"] for folders in runs.values()}) == 14
+    for name, kept in (("native_film", {"native_size": 32}), ("head_only", {}), ("full", {}), ("every_control", {})):
         info = read_checkpoint_info(tmp_path / runs[f"{name}, seed 1"]["stage2"])
+        assert info.config.action_frames == (4 if name == "every_control" else 1)
         assert info.config.native_size == kept.get("native_size")
         assert info.views == (("head",) if name == "head_only" else VIEWS)
     table = json.loads((tmp_path / "table.json").read_text())
@@ -360,9 +434,11 @@ def test_successes_alone_are_drawn_where_a_run_asks_for_them(measuring: Measurin
 
 def test_controls_are_maps_of_the_views_or_vectors(measuring: Measuring) -> None:
     train = measuring.memory.episodes()
-    maps = controls_of(train.maps, train.native, ("head", "right_wrist"), None)
-    torch.testing.assert_close(maps, train.maps[:, [0, 2]].float())
-    vectors = controls_of(train.maps, train.native, ("head", "right_wrist"), 16)
+    config = plan_of().model
+    maps = controls_of(train.maps, train.native, ("head", "right_wrist"), config)
+    torch.testing.assert_close(maps, train.maps[:, [0, 2], :, ::4].float())
+    film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 16})
+    vectors = controls_of(train.maps, train.native, ("head", "right_wrist"), film)
     assert vectors.shape == (4, 2, 16, 9, 1, 1)
     torch.testing.assert_close(vectors[:, 1, :, :, 0, 0], train.native[:, :16])
 
@@ -479,7 +555,7 @@ def test_rollouts_of_validation_recordings_are_measured_while_a_model_trains(
 def test_a_run_that_was_stopped_ends_with_the_same_bits(
     measuring: Measuring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = plan_of(all={"stage2": {**STAGE2, "relational": True}, **CAUSAL})
+    plan = plan_of(all={"stage2": {**STAGE2, "relational": True, "action_frames": 4}, **CAUSAL})
     Training(measuring.memory, plan, tmp_path / "whole", measuring).all()
     drawn, calls = small_world_steps.drawn, 0
 
@@ -524,6 +600,13 @@ def test_seconds_become_the_same_number_of_steps_for_every_seed(measuring: Measu
     (pace,) = json.loads((tmp_path / "pace.json").read_text()).values()
     taken = [read_checkpoint_info(path.parent).metadata["run"] for path in tmp_path.glob("stage2-*/checkpoint.json")]
     assert [run["steps"] for run in taken] == [max(1, round(0.2 / pace))] * 2
+
+
+def test_recordings_without_the_maps_of_every_frame_are_refused(tmp_path: Path) -> None:
+    arrays, header = recording("train", ["success"], 0)
+    save_file(arrays | {"maps": arrays["maps"][:, :, :, ::4].copy()}, tmp_path / "old.safetensors", metadata=header)
+    with pytest.raises(DataError, match=r"(?s)maps of frames between.*old\.safetensors.*expected: 33 frames.*got: 9"):
+        Recorded.read(tmp_path / "old.safetensors")
 
 
 def test_missing_recordings_are_told_by_name(recordings: Path) -> None:
