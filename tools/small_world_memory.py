@@ -43,7 +43,8 @@ class Episodes:
         maps, things, robot, native: as in `Recorded`.
         singles: half (n, v, c, t, h, w): the last video frame of every latent frame coded alone, as first frames of
             clips are; of long recordings only.
-        intra, cross: half: what the video teacher says of the relations within and between views, where one is given.
+        intra, cross: half: what the video teacher says of the relations within and between views of short recordings to
+            train with, where one is given.
     """
 
     facts: list[Fact]
@@ -210,7 +211,7 @@ class Memory:
             frames = rearrange(video[:, :, :, ::TEMPORAL_FACTOR], "n v c t h w -> (n v t) c 1 h w")
             codes = self.tokenizer.encode(frames).half()
             given["singles"] = rearrange(codes, "(n v t) c 1 h w -> n v c t h w", n=len(video), v=len(VIEWS))
-        elif self.teacher is not None:
+        elif self.teacher is not None and recorded.split == "train":
             features = self.teacher.features((video.flatten(0, 1) + 1) / 2).unflatten(0, (-1, len(VIEWS)))
             grid = (latents.shape[3], GRID[0] // PATCH, GRID[1] // PATCH)
             found = relations(features, common_shape(RelationalConfig(), grid, features.shape[2:5]))
