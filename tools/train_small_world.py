@@ -182,6 +182,11 @@ def train_tokenizer(folder: Path, output: Path, settings: TokenizerSettings, dev
     print("tokenizer", json.dumps(facts), flush=True)
 
 
+def sampler_name(kind: str, sampler: tuple[int, float]) -> str:
+    """What a sampler's figures are stored under: files have their names in the order of the alphabet."""
+    return f"{sampler[0]} steps, shift {sampler[1]:g}" if kind == "stage2" else "causal"
+
+
 @dataclass
 class Training:
     """The runs of a plan on recordings in memory; finished steps and figures are read from ``output``."""
@@ -276,8 +281,7 @@ class Training:
         found = {}
         for sampler in wanted.samplers if info.kind == "stage2" else wanted.samplers[:1]:
             predictor = Predictor.open(folder, self.memory.device, sampler)
-            name = f"{sampler[0]} steps, shift {sampler[1]:g}" if info.kind == "stage2" else "causal"
-            found[name] = {
+            found[sampler_name(info.kind, sampler)] = {
                 split: self.measuring.measure(predictor, split, limit, folder / f"{split}-{len(found)}.png")
                 for split, limit in wanted.splits.items()
             }
@@ -288,10 +292,11 @@ class Training:
         return found
 
     def figures(self, folder: Path) -> dict[str, float]:
-        """The figures of the table: of the first sampler and the first split, and of what was unseen besides scenes."""
+        """The figures of the table: of the plan's first sampler and split, and of what was unseen besides scenes."""
         found: Any = self.measured(folder)
-        splits = next(iter(found.values()))
-        first = next(iter(splits.values()))
+        wanted = self.plan.measure
+        splits = found[sampler_name(read_checkpoint_info(folder).kind, wanted.samplers[0])]
+        first = splits[next(iter(wanted.splits))]
         figures = {name: first[name] for name in COLUMNS if first.get(name) is not None}
         if unseen := splits.get("ood_test"):
             figures["unseen_robot_iou"] = unseen["robot_iou"]

@@ -21,7 +21,7 @@ from tools import small_world_causal, small_world_steps
 from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, Recorded, plan_files, record_file
 from tools.small_world_measures import Measuring, Predictor, Shown, gradient_energy, judged
 from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownRelations, Memory, videos
-from tools.small_world_runs import ForcingSettings, Plan
+from tools.small_world_runs import ForcingSettings, MeasureSettings, Plan
 from tools.small_world_steps import Start, controls_of, object_weights
 from tools.small_world_table import Spread, compared, markdown, table
 from tools.train_small_world import MODELS, Training
@@ -422,6 +422,24 @@ def test_runs_share_what_they_have_in_common_and_are_measured(measuring: Measuri
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")}
     Training(measuring.memory, plan, tmp_path, measuring).all()
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*")} == before
+
+
+def test_the_table_shows_the_plans_first_split_and_sampler_whatever_the_order_of_the_file(
+    measuring: Measuring, tmp_path: Path
+) -> None:
+    wanted = {"splits": {"test": 4, "ood_test": 2}, "samplers": [[4, 5.0], [1, 1.0]]}
+    plan = plan_of(one={"stage2": STAGE2}).model_copy(update={"measure": MeasureSettings.model_validate(wanted)})
+    training = Training(measuring.memory, plan, tmp_path, measuring)
+    figures = {
+        f"{steps} steps, shift {shift}": {"test": steps, "ood_test": 10 * steps} for steps, shift in ((1, 1), (4, 5))
+    }
+    stored = {
+        sampler: {split: {"robot_iou": value, "episodes": 1} for split, value in splits.items()}
+        for sampler, splits in figures.items()
+    }
+    folder = MODELS / "stage2"
+    training.measured = lambda _: dict(sorted((k, dict(sorted(v.items()))) for k, v in stored.items()))  # type: ignore
+    assert training.figures(folder) == {"robot_iou": 4, "unseen_robot_iou": 40}
 
 
 def test_successes_alone_are_drawn_where_a_run_asks_for_them(measuring: Measuring) -> None:
