@@ -89,7 +89,7 @@ def _verdict(difference: Spread) -> str:
 
 
 def table(measured: Measured, reference: str) -> dict[str, object]:
-    """All figures, by run and seed and over the seeds, and comparisons as JSON values."""
+    """All figures, by run and seed and over the seeds, and comparisons, as JSON values."""
     rows = {
         run: {
             figure: asdict(Spread.of(values))
