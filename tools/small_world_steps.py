@@ -1,4 +1,5 @@
-"""What Stage I and Stage II of a run train: the library's objectives, on batches out of memory that depend on the step alone.
+"""What Stage I and Stage II of a run train (the library's objectives, on batches out of memory that depend on the step alone)
+and how each step is trained.
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """
@@ -7,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MethodType
 from typing import Any, Literal
 
@@ -17,10 +20,8 @@ from torch import Tensor
 
 from tools.small_world_data import GRID, SHORT, SIGMA_PX_REF, VIEWS
 from tools.small_world_memory import Episodes, KnownRelations, Memory, maps_of_latent_frames
-from tools.small_world_runs import (
-    BaseSettings,
-    Stage2Settings,
-)
+from tools.small_world_runs import BaseSettings, MatchingSettings, Stage2Settings, Timed, TokenizerSettings, key_of
+from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.errors import ConfigError
 from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
@@ -28,6 +29,8 @@ from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContr
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
+from worldline_core.store.artifact_files import read_json, read_json_lines
+from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
 from worldline_core.training.flow_matching import FlowMatchingObjective
@@ -38,12 +41,16 @@ from worldline_core.training.trainer import (
     NamedBatch,
     Objective,
     ParameterGroup,
+    TrainingResult,
     step_generator,
+    train,
 )
 from worldline_core.training.training_config import LossWeighting, RelationalConfig, SigmaSampling, TrainerConfig
 
 VIEW_SHARES = (0.5, 0.25, 0.25)
 """Of steps or clips on single views: the head view counts as much as both wrist views."""
+PACE_STEPS = 6 * CYCLE
+"""Steps that tell what a step takes; the first third, in which much is done once, does not count."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +108,52 @@ class Start:
             )
         model, info = load_checkpoint(folder, expect_kind=kinds, towers="generation", action_frames=action_frames)
         return model.to(self.memory.device), info
+
+
+def trained(
+    settings: Timed,
+    seed: int,
+    device: str,
+    title: str,
+    output: Path,
+    identity: dict[str, Any],
+    make: Callable[[], Step],
+) -> tuple[TrainingResult, dict[str, int], Step]:
+    """Train, or go on: averaged weights, counts of steps and clips, and what ``make`` made.
+
+    A length in seconds becomes a number of steps once, in ``pace.json`` beside ``output``, for all seeds alike.
+    """
+
+    def run(step: Step, folder: Path, steps: int, log_every: int) -> TrainingResult:
+        config = settings.trainer(steps, seed, device, log_every)
+        return train(
+            config,
+            groups=step.groups,
+            objective=step.objective,
+            load=step.load,
+            validate=None if step.held_out is None else partial(step.held_out, config),
+            output=folder,
+            identity={**identity, "steps": steps},
+            title=title,
+            schedule=partial(settings.factor, steps=steps) if isinstance(settings, TokenizerSettings) else None,
+        )
+
+    steps = settings.steps
+    if steps is None:
+        path, key = output.parent / "pace.json", key_of({"step": title, "settings": settings.model_dump(mode="json")})
+        pace = read_json(path)
+        if key not in pace:
+            with TemporaryDirectory() as folder:
+                run(make(), Path(folder), PACE_STEPS, CYCLE)
+                seconds = [row["seconds"] for row in read_json_lines(Path(folder) / "run" / "timings.jsonl")]
+            first = len(seconds) // 3
+            pace[key] = (seconds[-1] - seconds[first - 1]) / (CYCLE * (len(seconds) - first))
+            write_json_atomic(path, pace)
+        steps = max(1, round((settings.seconds or 0.0) / pace[key]))
+    if isinstance(settings, MatchingSettings):
+        steps = CYCLE * -(-steps // CYCLE)
+    step = make()
+    return run(step, output, steps, 5 * CYCLE), {"steps": steps, "clips": steps * settings.batch}, step
 
 
 def named(episodes: Episodes, rows: Tensor) -> tuple[Clip, ...]:

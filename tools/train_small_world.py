@@ -26,16 +26,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
-from einops import rearrange
-from torch import Tensor
 
 from tools.small_world_causal import forcing_step, matching_step, regression_step
-from tools.small_world_data import FIRST_SEED, NAMES, SHORT, VIEWS, Recorded, plan_files, record_files
+from tools.small_world_data import FIRST_SEED, NAMES, plan_files, record_files
 from tools.small_world_measures import Facts, Measuring, Predictor, drift, judge_processes
 from tools.small_world_memory import Memory, recorded_files
 from tools.small_world_runs import (
@@ -45,28 +41,19 @@ from tools.small_world_runs import (
     Plan,
     RunPlan,
     Timed,
-    TokenizerSettings,
     key_of,
 )
-from tools.small_world_steps import VIEW_SHARES, Start, Step, base_step, stage2_step
+from tools.small_world_steps import Start, Step, base_step, stage2_step, trained
 from tools.small_world_table import COLUMNS, markdown, table
+from tools.small_world_tokenizer import train_tokenizer
 from worldline_core.config import load_config
-from worldline_core.distillation.distill_config import CYCLE
-from worldline_core.errors import ConfigError, StoppedError
+from worldline_core.errors import ConfigError, StoppedError, WorldLineError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import read_checkpoint_info, save_checkpoint
-from worldline_core.model.patch_tokenizer import PatchTokenizer, Refinement, fit_patch_tokenizer
+from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.world_model_config import TextConfig
-from worldline_core.store.artifact_files import read_json, read_json_lines
+from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.train_tokenizer import (
-    DecoderBatch,
-    DecoderObjective,
-    disturb,
-    reconstruction_metrics,
-    to_video,
-)
-from worldline_core.training.trainer import ParameterGroup, TrainingResult, step_generator, train
 from worldline_core.training.training_state import STATES
 from worldline_core.training.video_teacher import load_teacher
 
@@ -79,107 +66,6 @@ MAKERS: dict[str, Callable[[Start, Any], Step]] = {
     "distribution_matching": matching_step,
 }
 """What makes the steps of a run."""
-PACE_STEPS = 6 * CYCLE
-"""Steps that tell what a step takes; the first third, in which much is done once, does not count."""
-
-
-def trained(
-    settings: Timed, seed: int, device: str, title: str, output: Path, identity: Facts, make: Callable[[], Step]
-) -> tuple[TrainingResult, dict[str, int], Step]:
-    """Train, or go on: averaged weights, counts of steps and clips, and what ``make`` made.
-
-    A length in seconds becomes a number of steps once, in ``pace.json`` beside ``output``, for all seeds alike.
-    """
-
-    def run(step: Step, folder: Path, steps: int, log_every: int) -> TrainingResult:
-        config = settings.trainer(steps, seed, device, log_every)
-        return train(
-            config,
-            groups=step.groups,
-            objective=step.objective,
-            load=step.load,
-            validate=None if step.held_out is None else partial(step.held_out, config),
-            output=folder,
-            identity={**identity, "steps": steps},
-            title=title,
-            schedule=partial(settings.factor, steps=steps) if isinstance(settings, TokenizerSettings) else None,
-        )
-
-    steps = settings.steps
-    if steps is None:
-        path, key = output.parent / "pace.json", key_of({"step": title, "settings": settings.model_dump(mode="json")})
-        pace = read_json(path)
-        if key not in pace:
-            with TemporaryDirectory() as folder:
-                run(make(), Path(folder), PACE_STEPS, CYCLE)
-                seconds = [row["seconds"] for row in read_json_lines(Path(folder) / "run" / "timings.jsonl")]
-            first = len(seconds) // 3
-            pace[key] = (seconds[-1] - seconds[first - 1]) / (CYCLE * (len(seconds) - first))
-            write_json_atomic(path, pace)
-        steps = max(1, round((settings.seconds or 0.0) / pace[key]))
-    if isinstance(settings, MatchingSettings):
-        steps = CYCLE * -(-steps // CYCLE)
-    step = make()
-    return run(step, output, steps, 5 * CYCLE), {"steps": steps, "clips": steps * settings.batch}, step
-
-
-def train_tokenizer(folder: Path, output: Path, settings: TokenizerSettings, device: str) -> None:
-    """Fit the bases, train the decoder, save both with what they measure on validation recordings."""
-    files: list[Recorded] = []
-    for name in recorded_files(folder):
-        if sum(len(file.facts) for file in files) < settings.episodes and (file := Recorded.read(folder / name)).short:
-            files.append(file)
-    stack = torch.from_numpy(np.concatenate([file.frames for file in files if file.split == "train"])).to(device)
-    shares = torch.tensor(VIEW_SHARES)
-    chosen = np.random.default_rng(0)
-
-    def fitted() -> Tensor:
-        clip = stack[int(chosen.integers(len(stack))), int(chosen.choice(len(VIEWS), p=VIEW_SHARES))]
-        return to_video(rearrange(clip.cpu(), "f h w c -> 1 c f h w"))
-
-    tokenizer = fit_patch_tokenizer(
-        (fitted() for _ in range(600)),
-        channels=settings.channels,
-        refinement_width=settings.width,
-        refinement_depth=settings.depth,
-    )
-
-    def load(index: int) -> DecoderBatch:
-        draws = step_generator(50, index, "cpu")
-        rows = torch.randint(len(stack), (settings.batch,), generator=draws)
-        views = torch.multinomial(shares, settings.batch, replacement=True, generator=draws)
-        # The first frame and three of the eight groups of four frames after it.
-        groups = torch.randint(8, (settings.batch, 3), generator=draws).sort(dim=1).values
-        frames = 1 + (groups[:, :, None] * 4 + torch.arange(4)).flatten(1)
-        frames = torch.cat((torch.zeros_like(frames[:, :1]), frames), dim=1)
-        video = to_video(rearrange(stack[rows[:, None], views[:, None], frames], "b f h w c -> b c f h w"))
-        with torch.no_grad():
-            codes = disturb(tokenizer.encode(video), 0.3, step_generator(51, index, device))
-            coarse = tokenizer.decode_linear(codes)
-        dropped = float(torch.rand((), generator=draws)) < 0.1
-        return DecoderBatch(("",) * settings.batch, video, coarse, None if dropped else video[:, :, 0])
-
-    def make() -> Step:
-        torch.manual_seed(0)
-        tokenizer.refinement = Refinement(tokenizer.temporal_compression, settings.width, settings.depth)
-        decoder = tokenizer.to(device).refinement.train().requires_grad_(True)
-        groups = [ParameterGroup("decoder", dict(decoder.named_parameters()))]
-        return Step(DecoderObjective(tokenizer.refine), groups, load)
-
-    identity: Facts = {"settings": settings.model_dump(mode="json"), "encoder": tokenizer.encoder_digest}
-    result, counts, _ = trained(settings, 0, device, "tokenizer", output, identity, make)
-    tokenizer.refinement.load_state_dict(result.average)
-    tokenizer.refinement.eval().requires_grad_(False)
-    facts: Facts = {**counts, "training_episodes": len(stack), "width": settings.width, "depth": settings.depth}
-    tokenizer.save(output, facts)
-    held = [file.frames[:5] for file in files if file.split == "validation"][:4]
-    if held:
-        shown = [
-            torch.from_numpy(view).permute(3, 0, 1, 2) for part in held for view in part.reshape(-1, *part.shape[2:])
-        ]
-        facts["held_out"] = reconstruction_metrics(PatchTokenizer.load(output), shown[:30], SHORT)
-    write_json_atomic(output / "figures.json", facts)
-    print("tokenizer", json.dumps(facts), flush=True)
 
 
 def sampler_name(kind: str, sampler: tuple[int, float]) -> str:
@@ -346,6 +232,14 @@ def main() -> None:
     arguments = parser.parse_args()
     # `timeout` ends a call so: what runs beside this process is ended with it, and a training saves its state first.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        _called(arguments)
+    except WorldLineError as error:
+        print(error, file=sys.stderr)
+        sys.exit(143 if isinstance(error, StoppedError) else 1)
+
+
+def _called(arguments: argparse.Namespace) -> None:
     if arguments.command == "record":
         tasks = plan_files(arguments.folder, arguments.last_seed, arguments.only, arguments.first_seed)
         record_files(tasks[arguments.start :][: arguments.files], arguments.workers)
@@ -353,17 +247,12 @@ def main() -> None:
     torch.set_float32_matmul_precision("high")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     plan = load_config(Plan, path=arguments.plan)
-    try:
-        if arguments.command == "train":
-            plan = plan.of_seeds(arguments.seeds)
-            train_plan(arguments.folder, arguments.output, arguments.tokenizer, plan, device)
-        elif plan.tokenizer is None:
-            raise ConfigError("The plan has no tokenizer", where=arguments.plan, expected="a section tokenizer")
-        else:
-            train_tokenizer(arguments.folder, arguments.output, plan.tokenizer, device)
-    except StoppedError as stopped:
-        print(stopped, file=sys.stderr)
-        sys.exit(143)
+    if arguments.command == "train":
+        train_plan(arguments.folder, arguments.output, arguments.tokenizer, plan.of_seeds(arguments.seeds), device)
+    elif plan.tokenizer is None:
+        raise ConfigError("The plan has no tokenizer", where=arguments.plan, expected="a section tokenizer")
+    else:
+        train_tokenizer(arguments.folder, arguments.output, plan.tokenizer, device)
 
 
 if __name__ == "__main__":

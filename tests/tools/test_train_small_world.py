@@ -24,7 +24,7 @@ from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownRelations, 
 from tools.small_world_runs import ForcingSettings, MeasureSettings, Plan
 from tools.small_world_steps import Start, controls_of, object_weights
 from tools.small_world_table import Spread, compared, markdown, table
-from tools.train_small_world import MODELS, Training
+from tools.train_small_world import MODELS, Training, main
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.distillation import causal_teacher_forcing
 from worldline_core.distillation.causal_objective import CausalObjective, maps_of
@@ -205,6 +205,20 @@ def test_the_directions_change_one_thing_each_and_last_equally_long() -> None:
         "no_action_free": {"seconds"},
     }
     assert plan.runs["no_action_free"].base is None
+
+
+def test_what_cannot_be_done_is_said_without_a_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = SHIPPED / "small_world_directions_cpu.yaml"
+    given = ["tool", "train", str(tmp_path), str(tmp_path / "out"), "--plan", str(plan), "--seeds", "7"]
+    monkeypatch.setattr("sys.argv", given)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    assert "seeds" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_some_seeds_of_a_plan_are_made_alone() -> None:
