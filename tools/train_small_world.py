@@ -193,8 +193,8 @@ def train_plan(folder: Path, output: Path, tokenizer: Path, plan: Plan, device: 
     """All runs of a plan, on the recordings that were there when ``output`` was begun."""
     if not plan.runs:
         raise ConfigError("The plan has nothing to train", where="runs", expected="name: steps of a run")
-    output.mkdir(parents=True, exist_ok=True)
     begun = read_json(output / "recordings.json") or {"files": recorded_files(folder)}
+    output.mkdir(parents=True, exist_ok=True)
     write_json_atomic(output / "recordings.json", begun)
     teacher = load_teacher(MODELS / "teacher", device=device) if plan.relational else None
     memory = Memory(folder, begun["files"], PatchTokenizer.load(tokenizer).to(device), teacher)

@@ -207,17 +207,18 @@ def test_the_directions_change_one_thing_each_and_last_equally_long() -> None:
     assert plan.runs["no_action_free"].base is None
 
 
+@pytest.mark.parametrize(("seed", "message"), [("7", "no such seed"), ("0", "No recordings")])
 def test_what_cannot_be_done_is_said_without_a_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    seed: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan = SHIPPED / "small_world_directions_cpu.yaml"
-    given = ["tool", "train", str(tmp_path), str(tmp_path / "out"), "--plan", str(plan), "--seeds", "7"]
+    given = ["tool", "train", str(tmp_path), str(tmp_path / "out"), "--plan", str(plan), "--seeds", seed]
     monkeypatch.setattr("sys.argv", given)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 1
-    assert "seeds" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
