@@ -281,7 +281,7 @@ def test_the_choices_are_undone_one_at_a_time_in_equal_minutes() -> None:
     costs = {"smaller": 0.531, "larger": 2.277}
     for name, run in plan.runs.items():
         assert run.stage2 is not None
-        assert (run.stage2.steps or 0) * costs.get(name, 1.0) == pytest.approx(1500, rel=0.01)
+        assert (run.stage2.steps or 0) * costs.get(name, 1.0) == pytest.approx(1000, rel=0.01)
     assert set(plan.measure.splits) == {"validation"}
 
 
