@@ -19,7 +19,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.pipeline.steps import get_step
 from worldline_core.store import verification
-from worldline_core.store.artifact_files import digest_folder, digest_value
+from worldline_core.store.artifact_files import digest_folder, digest_value, folder_files
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import ArtifactStore, alone_in
 
@@ -253,6 +253,17 @@ def test_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     (folder / "link").symlink_to(tmp_path / "secret")
     with pytest.raises(ArtifactError, match="leads out of the folder"):
         digest_folder(folder)
+
+
+def test_a_file_that_is_gone_when_its_folder_is_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a recording is still being written, whose parts move to their place."""
+    for name in ("a.txt", "part.tmp"):
+        (tmp_path / name).write_text(name)
+    listed = folder_files(tmp_path)
+    (tmp_path / "part.tmp").unlink()
+    monkeypatch.setattr("worldline_core.store.artifact_files.folder_files", lambda *_, **__: listed)
+    with pytest.raises(ArtifactError, match=r"was gone when its folder was read[\s\S]*part\.tmp[\s\S]*wait until"):
+        digest_folder(tmp_path)
 
 
 def test_arrays_come_back_as_they_were_however_their_memory_lies(tmp_path: Path) -> None:

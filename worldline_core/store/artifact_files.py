@@ -181,11 +181,23 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
 
 
 def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
-    """Relative name -> `size` [bytes] and `sha256` of every file of a folder's content, as a manifest states them."""
-    return {
-        path.relative_to(folder).as_posix(): {"size": path.stat().st_size, "sha256": digest_file(path)}
-        for path in folder_files(folder, everything=everything)
-    }
+    """Relative name -> `size` [bytes] and `sha256` of every file of a folder's content, as a manifest states them.
+
+    Raises:
+        ArtifactError: a file that the folder lists is gone when it is read, as where somebody still writes to it.
+    """
+    try:
+        return {
+            path.relative_to(folder).as_posix(): {"size": path.stat().st_size, "sha256": digest_file(path)}
+            for path in folder_files(folder, everything=everything)
+        }
+    except FileNotFoundError as error:
+        raise ArtifactError(
+            "A file was gone when its folder was read",
+            where=error.filename or folder,
+            expected="a folder that nothing writes to, without links to nothing",
+            next_step="wait until what writes it is done (a recording, a copy), then run the command again",
+        ) from error
 
 
 def digest_listed(files: Mapping[str, JsonObject]) -> str:
