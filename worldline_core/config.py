@@ -117,7 +117,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         # The documents name the project's own files so; an installed package has them elsewhere.
         path = CONFIG_ROOT.joinpath(*path.parts[1:])
     if not path.is_file():
-        raise ConfigError("No such configuration file", where=path, next_step="check the path, or use --preset NAME")
+        raise ConfigError("No such configuration file", where=path, next_step="check the path")
     try:
         content = _read(path.read_text(encoding="utf-8"), str(path))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
