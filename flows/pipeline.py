@@ -29,7 +29,7 @@ def pipeline(
     """
     settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
     nodes = plan(settings, Path.cwd())
-    with RunPage(artifacts.resolve(), [node.name for node in nodes], settings.runner.nodes_at_once) as page:
+    with RunPage(artifacts.resolve(), [node.name for node in nodes]) as page:
         done = run_nodes(nodes, artifacts.resolve(), settings.runner, page)
     show_in_prefect(page.folder, done, report_pictures(Path(str(done["report"].path))))
     return done["report"]

@@ -3,7 +3,6 @@ page that says how far the run is, kept true while they run."""
 
 from __future__ import annotations
 
-import functools
 import os
 import threading
 import time
@@ -23,7 +22,7 @@ from prefect.task_runners import ProcessPoolTaskRunner
 from tasks.artifact_task import ArtifactReference, FindArtifact, artifact_task
 from tasks.shard_mapper import limited_threads, process_runner
 from worldline_core.pipeline.plan import Node
-from worldline_core.report.progress import DoneNode, estimate_left, share, write_finished_page, write_progress_page
+from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
 from worldline_core.scale.mapping import RunnerConfig, WorkerDiedError
 
 POLL_SECONDS = 0.1
@@ -36,13 +35,12 @@ class RunPage:
     A context: when it is left, the page leads to the finished report, or shows the error that ended the run.
     """
 
-    def __init__(self, artifacts: Path, nodes: Sequence[str], at_once: int = 1) -> None:
+    def __init__(self, artifacts: Path, nodes: Sequence[str]) -> None:
         self.artifacts = artifacts
         self.folder = artifacts / "report" / "latest"
-        self._at_once = at_once
         self._to_come = list(nodes)
         self._running: dict[str, float] = {}
-        self._done: list[DoneNode] = []
+        self._done: list[FinishedStep] = []
         self._report: Path | None = None
         self._began = time.monotonic()
         self._change = threading.RLock()
@@ -74,7 +72,7 @@ class RunPage:
         with self._change:
             began = self._running.pop(node)
             folder = Path(str(artifact.path))
-            self._done.append(DoneNode(node, folder, 0.0 if cached else time.monotonic() - began, cached))
+            self._done.append(FinishedStep(node, folder, 0.0 if cached else time.monotonic() - began, cached))
             if artifact.step == "report":
                 self._report = folder
         self._write()
@@ -87,13 +85,7 @@ class RunPage:
     def _write(self, failed: str = "") -> None:
         with self._change:
             now = time.monotonic()
-            left = estimate_left(
-                self.artifacts, self._done, list(self._running), self._to_come,
-                sum(now - began for began in self._running.values()), self._at_once,
-            )  # fmt: skip
-            write_progress_page(
-                self.folder, self._done, list(self._running), self._to_come, now - self._began, left, failed
-            )
+            write_progress_page(self.folder, self._done, list(self._running), self._to_come, now - self._began, failed)
 
 
 def run_nodes(
@@ -102,12 +94,12 @@ def run_nodes(
     """Run every node, or find its artifact; returns the artifacts by the nodes' names.
 
     With ``runner.nodes_at_once`` of 1 everything happens in this process. Otherwise nodes that wait for nothing run
-    side by side in processes that share the cores, first those that the longest work waits for. When a node fails,
+    side by side in processes that share the cores, in the order of the plan. When a node fails,
     nothing more is started, what runs is let finish, and its error is raised.
     """
     with ExitStack() as stack:
         run = _Run(store_root, runner, watcher, _pool(runner, stack))
-        waiting = list(nodes) if runner.nodes_at_once == 1 else by_urgency(nodes)
+        waiting = list(nodes)
         while waiting or run.running:
             for node in [node for node in waiting if run.has_inputs(node)]:
                 if len(run.running) < runner.nodes_at_once:
@@ -115,17 +107,6 @@ def run_nodes(
                     run.start(node)
             run.take_finished()
         return run.done
-
-
-def by_urgency(nodes: Sequence[Node]) -> list[Node]:
-    """The nodes in the order of the time, in shares of the demo, from their start to the end of all that needs them."""
-
-    @functools.cache
-    def left(name: str) -> float:
-        after = (left(other.name) for other in nodes if name in other.inputs.values())
-        return share(name) + max(after, default=0.0)
-
-    return sorted(nodes, key=lambda node: -left(node.name))
 
 
 class _Run:

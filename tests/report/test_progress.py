@@ -1,21 +1,12 @@
-"""The page of a run that is not finished: what it says, where it leads, and how honest its estimate is."""
+"""The page of a run that is not finished: its content, and the finished report that replaces it."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-import pytest
-
 from worldline_core.pages.page import duration
-from worldline_core.report.progress import (
-    SHARES,
-    DoneNode,
-    Estimate,
-    estimate_left,
-    write_finished_page,
-    write_progress_page,
-)
+from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
 
 
 def artifact(store: Path, step: str, key: str, seconds: float, finished: str = "2026-01-01", **metrics: object) -> Path:
@@ -31,13 +22,12 @@ def test_the_page_says_what_is_done_running_and_coming(tmp_path: Path, hostile_t
     tracks = artifact(tmp_path, "render_actions", "k2", 7.0)
     (tracks / "previews").mkdir()
     (tracks / "previews" / "a b.png").write_bytes(b"png")
-    done = [DoneNode("curate", curate, 21.6), DoneNode("render_actions", tracks, 0.0, cached=True)]
+    done = [FinishedStep("curate", curate, 21.6), FinishedStep("render_actions", tracks, 0.0, cached=True)]
     latest = tmp_path / "report" / "latest"
-    page = write_progress_page(latest, done, ["train_stage1"], ["distill", hostile_text], 30.0, Estimate(95.0, "rough"))
+    page = write_progress_page(latest, done, ["train_stage1"], ["distill", hostile_text], 30.0)
     text = page.read_text()
     assert page == latest / "index.html"
     assert "2 of 5 steps are done after 30 s" in text
-    assert "About 95 s left (rough)" in text
     assert "found 145 · kept 142" in text
     assert "found in the store" in text
     assert 'http-equiv="refresh"' in text
@@ -64,39 +54,6 @@ def test_the_finished_report_takes_the_place_of_the_page(tmp_path: Path) -> None
     assert 'content="0; url=../0123/index.html"' in text
     assert 'href="../0123/index.html"' in text
     assert (latest / "../0123/index.html").resolve().read_text() == "the report"
-
-
-def test_the_estimate_is_what_the_steps_took_before(tmp_path: Path) -> None:
-    artifact(tmp_path, "distill", "old", 500.0, "2026-01-01")
-    artifact(tmp_path, "distill", "new", 100.0, "2026-01-02")
-    artifact(tmp_path, "rollout", "a", 10.0)
-    found = estimate_left(tmp_path, [], ["distill"], ["rollout.stage2", "rollout.causal"], seconds_of_running=30.0)
-    assert found.seconds == 90.0
-    assert found.basis == "from the time that the same steps took before in this store"
-
-
-def test_without_a_record_the_estimate_is_the_steps_share_at_this_machines_pace(tmp_path: Path) -> None:
-    first = estimate_left(tmp_path, [], ["curate"], ["filter"])
-    assert first.seconds == SHARES["curate"] + SHARES["filter"]
-    assert first.basis.startswith("rough: 2 of 2 steps")
-    done = [DoneNode("curate", tmp_path, 2 * SHARES["curate"]), DoneNode("filter", tmp_path, 0.0, cached=True)]
-    later = estimate_left(tmp_path, done, ["distill"], [])
-    assert later.seconds == pytest.approx(2 * SHARES["distill"])
-    assert "this machine's pace" in later.basis
-
-
-def test_nodes_side_by_side_need_less_time_and_each_has_its_own_share(tmp_path: Path) -> None:
-    names = ["rollout.stage2", "rollout.banks_shipped_causal"]
-    alone = estimate_left(tmp_path, [], names, [])
-    assert alone.seconds == SHARES["rollout"] + SHARES["rollout.banks_shipped_causal"]
-    assert estimate_left(tmp_path, [], names, [], at_once=2).seconds == alone.seconds / 2
-
-
-def test_another_node_of_the_step_does_not_stand_for_the_rest_of_a_run(tmp_path: Path) -> None:
-    artifact(tmp_path, "rollout", "short", SHARES["rollout"])
-    done = [DoneNode("rollout.stage2", tmp_path, SHARES["rollout"])]
-    found = estimate_left(tmp_path, done, ["rollout.banks_shipped_stage2", "rollout.banks_shipped_causal"], [])
-    assert found.seconds == SHARES["rollout.banks_shipped_stage2"] + SHARES["rollout.banks_shipped_causal"]
 
 
 def test_durations_are_words() -> None:

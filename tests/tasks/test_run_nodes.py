@@ -23,7 +23,7 @@ from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, tempor
 
 from tasks.artifact_task import ArtifactReference
 from tasks.prefect_artifacts import is_worth_saying, show_in_prefect
-from tasks.run_nodes import RunPage, by_urgency, run_nodes
+from tasks.run_nodes import RunPage, run_nodes
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import DataError
 from worldline_core.pipeline import steps
@@ -78,15 +78,6 @@ def nodes(second: str = "b") -> list[Node]:
         Node("write_next.second", "write_next", WriteConfig(text=second), {"before": "write_first"}),
         Node("write_first", "write_first", WriteConfig(text="a"), {}),
     ]
-
-
-def test_what_the_longest_work_waits_for_starts_first(project_root: Path) -> None:
-    planned = plan(load_config(PipelineConfig, preset="demo"), project_root)
-    order = [node.name for node in by_urgency(planned[::-1])]
-    assert sorted(order) == sorted(node.name for node in planned)
-    assert order.index("rollout.banks_shipped_causal") < order.index("rollout.shipped_stage2")
-    assert order.index("distill") < order.index("rollout.copy_first_frame")
-    assert order[-1] == "report"
 
 
 def run(store: Path, second: str = "b", watcher: Any = None) -> dict[str, ArtifactReference]:
