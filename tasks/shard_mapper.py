@@ -29,7 +29,7 @@ from worldline_core.scale.mapping import (
 )
 from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.remote import is_transient, process_cache
-from worldline_core.store.store import writing_for_another
+from worldline_core.store.store import helper_lock
 
 _DEATHS = frozenset(
     {"BrokenProcessPool", "KilledWorker", "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "OwnerDiedError"}
@@ -158,7 +158,7 @@ def _work(payload: bytes, remote_cache_bytes: int) -> None:
     shard: Shard[Any] = pickle.loads(payload)  # noqa: S301 - made by `PrefectMapper` in this same run
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
-    with writing_for_another(shard.work.output):
+    with helper_lock(shard.work.output):
         end_with_pool()  # with the lock held: who takes this work over waits until this process has ended
         do_shard(shard)
 

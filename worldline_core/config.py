@@ -344,10 +344,10 @@ class StrictModel(BaseModel):
         return {}
 
 
-def what_is_made(config: Any) -> Any:
-    """JSON values of a configuration without its sections ``sharding`` and ``saving``: how work is shared out among
-    processes and kept while it goes on names neither a training nor its artifact.
-    """
+def cache_relevant_config(config: Any) -> Any:
+    """The part of a JSON config that enters cache keys and a training's identity: all but ``sharding`` and ``saving``."""
     if isinstance(config, Mapping):
-        return {name: what_is_made(part) for name, part in config.items() if name not in ("sharding", "saving")}
-    return [what_is_made(part) for part in config] if isinstance(config, list | tuple) else config
+        return {
+            name: cache_relevant_config(part) for name, part in config.items() if name not in ("sharding", "saving")
+        }
+    return [cache_relevant_config(part) for part in config] if isinstance(config, list | tuple) else config

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from worldline_core.config import StrictModel
-from worldline_core.store.store import ArtifactStore, writing_for_another
+from worldline_core.store.store import ArtifactStore, helper_lock
 
 CONTEXT = multiprocessing.get_context("fork")
 
@@ -101,7 +101,7 @@ def test_a_helper_does_not_join_work_of_another_launch(tmp_path: Path) -> None:
 
 def straggle(folder: Path, begun: Any) -> None:
     """A worker of a command that was killed: it does not know yet."""
-    with writing_for_another(folder):
+    with helper_lock(folder):
         begun.set()
         time.sleep(1.0)
         (folder / "late").write_text("by a worker whose command is gone")

@@ -117,12 +117,12 @@ def interval(measured: dict[str, float] | None, digits: int = 2, *, signed: bool
     if measured is None:
         return None
     low, high = (number(float(measured[key]), digits) for key in ("low", "high"))
-    return noted(number(float(measured["mean"]), digits, signed=signed), f"[{low}, {high}]")
+    return with_note(number(float(measured["mean"]), digits, signed=signed), f"[{low}, {high}]")
 
 
-def noted(value: str, note: str) -> Markup:
+def with_note(value: str, note: str) -> Markup:
     """A value of a table with a note in smaller type."""
-    return render_macro("pages/parts.html", "noted", value=value, note=note)
+    return render_macro("pages/parts.html", "with_note", value=value, note=note)
 
 
 def code(text: object) -> Markup:

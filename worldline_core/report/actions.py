@@ -12,7 +12,7 @@ from worldline_core.actions.episode_tracks import ActionTracks, collate_tracks
 from worldline_core.actions.overlays import heat_picture
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.pages.page import Table, noted, number, percent, words
+from worldline_core.pages.page import Table, number, percent, with_note, words
 from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.episode_sheet import episode_overlay
@@ -65,7 +65,7 @@ def sample_table(folder: Path) -> Table | None:
     for name, numbers in sorted(counts.items()):
         total = sum(numbers.get(cause, 0) for cause in causes) or 1
         found = [numbers.get(cause, 0) for cause in causes]
-        shares = [noted(number(count), percent(count / total)) for count in found]
+        shares = [with_note(number(count), percent(count / total)) for count in found]
         rows.append([name, numbers.get("episodes"), *shares])
     headings = ["Embodiment", "Episodes", *[words(cause).capitalize() for cause in causes]]
     caption = (

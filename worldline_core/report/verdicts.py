@@ -12,7 +12,7 @@ from worldline_core.evaluation.policy.agreement import STATISTICS
 from worldline_core.evaluation.policy.evidence import failure_kind
 from worldline_core.evaluation.policy.trust import SIGNALS
 from worldline_core.pages.charts import Series, line_chart
-from worldline_core.pages.page import Table, noted, number, percent, words
+from worldline_core.pages.page import Table, number, percent, with_note, words
 from worldline_core.report.video_scores import TRUE_METHOD, Method, in_order, predicting
 from worldline_core.store.artifact_files import JsonObject
 
@@ -130,7 +130,7 @@ def _told(found: JsonObject, bounds: tuple[str, str] = ("low", "high")) -> objec
     if found["value"] is None:
         return None
     low, high = (found[key] for key in bounds)
-    return noted(number(found["value"]), "" if low is None else f"[{number(low)}, {number(high)}]")
+    return with_note(number(found["value"]), "" if low is None else f"[{number(low)}, {number(high)}]")
 
 
 def _detection(methods: JsonObject, known: Sequence[Method]) -> Table | None:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldline_core.config import StrictModel, what_is_made
+from worldline_core.config import StrictModel, cache_relevant_config
 from worldline_core.errors import ArtifactError
 from worldline_core.store.artifact_files import (
     KEY_LENGTH,
@@ -70,7 +70,7 @@ def exclusive_lock(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def writing_for_another(folder: Path) -> Iterator[None]:
+def helper_lock(folder: Path) -> Iterator[None]:
     """Held by a process that writes into a step's folder on behalf of the one that holds its lock: if that one is killed,
     who takes the work over waits for this one to end."""
     path = folder / VOLATILE_FOLDER / _WRITERS
@@ -174,7 +174,7 @@ class ArtifactStore:
 
     def key(self, step: str, version: int, config: StrictModel, inputs: Mapping[str, str]) -> str:
         """Content key of a step. ``inputs`` maps an input's name to the digest of its content."""
-        made = what_is_made(config.model_dump(mode="json"))
+        made = cache_relevant_config(config.model_dump(mode="json"))
         identity = {"step": step, "version": version, "config": made, "inputs": dict(inputs)}
         if weights := weights_digests(config.weights_read(), self.root / ".weights.json"):
             identity |= {"weights": weights}
@@ -247,7 +247,7 @@ class ArtifactStore:
         if is_helper():
             wait_until(lambda: self.find(step, key) or is_announced(announcement) or None)
             if distributed and self.find(step, key) is None:
-                with writing_for_another(partial):
+                with helper_lock(partial):
                     function(config, sources, partial)
             return wait_until(lambda: self.find(step, key))
         with exclusive_lock(self.root / step / f".{key}.lock"):

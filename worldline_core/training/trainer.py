@@ -29,9 +29,9 @@ from worldline_core.training.training_state import (
     MetricsLog,
     TrainingStates,
     identity_digests,
-    json_numbers,
+    nan_to_null,
     newest_state,
-    numbers_of,
+    null_to_nan,
 )
 
 
@@ -195,7 +195,7 @@ def train[BatchT: NamedBatch](
     digests = identity_digests(identity)
     first, sums, count, last, best = 0, dict[str, float](), 0, dict[str, float](), math.inf
     if (facts := states.load(digests)) is not None:
-        first, sums, count, last = facts["step"], numbers_of(facts["sums"]), facts["count"], numbers_of(facts["last"])
+        first, sums, count, last = facts["step"], null_to_nan(facts["sums"]), facts["count"], null_to_nan(facts["last"])
         best = math.inf if facts["best"] is None else facts["best"]
         objective.load_state(facts["objective"])
     rank, world_size = processes()
@@ -253,9 +253,9 @@ def train[BatchT: NamedBatch](
                         "drawn_together": plan.together,
                         "count": count,
                         "objective": objective.state(),
-                        **json_numbers({"score": score, "best": best}),
-                        "sums": json_numbers(sums),
-                        "last": json_numbers(last),
+                        **nan_to_null({"score": score, "best": best}),
+                        "sums": nan_to_null(sums),
+                        "last": nan_to_null(last),
                     }
                 )
             if asked["stop"] and done < config.steps:

@@ -24,7 +24,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from worldline_core.config import what_is_made
+from worldline_core.config import cache_relevant_config
 from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -41,13 +41,13 @@ _FILE_BYTES = 2**31
 """Tensors are put together into files of about this size: a file is held in memory a second time while it is written."""
 
 
-def json_numbers(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Numbers as JSON knows them: null for those that are not finite."""
+def nan_to_null(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Metrics for JSON, with null for values that are not finite."""
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def numbers_of(values: Mapping[str, float | None]) -> dict[str, float]:
-    """The numbers that `json_numbers` has written: what is null was not finite."""
+def null_to_nan(values: Mapping[str, float | None]) -> dict[str, float]:
+    """Metrics read from JSON, with NaN for null."""
     return {name: math.nan if value is None else value for name, value in values.items()}
 
 
@@ -62,13 +62,15 @@ class MetricsLog:
     def add(self, row: Mapping[str, float]) -> None:
         """Append one row."""
         with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(json_numbers(row), allow_nan=False) + "\n")
+            stream.write(json.dumps(nan_to_null(row), allow_nan=False) + "\n")
 
 
 def identity_digests(identity: Mapping[str, Any]) -> dict[str, str]:
     """Short digests of the JSON values that name a run, by name. How it is shared out and saved is no part of it."""
     return {
-        name: hashlib.sha256(json.dumps(what_is_made(value), sort_keys=True, default=str).encode()).hexdigest()[:16]
+        name: hashlib.sha256(
+            json.dumps(cache_relevant_config(value), sort_keys=True, default=str).encode()
+        ).hexdigest()[:16]
         for name, value in identity.items()
     }
 

@@ -62,7 +62,7 @@ def curate(
         # Shards of one source each: a worker then opens few sources.
         pieces = [piece for episodes in listed for piece in batched(episodes, mapper.episodes_per_shard)]
         map_episodes(mapper, work, pieces)
-        _take_out(work, listed)
+        _quarantine_duplicates_and_leaks(work, listed)
         write_account(output, [work.row(identity) for identity in identities])
         work.writer.close()
     rows, rejected = read_index(output), read_quarantine(output)
@@ -80,8 +80,8 @@ def curate(
     }
 
 
-def _take_out(work: CurateWork, listed: Sequence[Sequence[ListedEpisode]]) -> None:
-    """Quarantine what the rules over the whole set refuse: duplicates, leaking scenes.
+def _quarantine_duplicates_and_leaks(work: CurateWork, listed: Sequence[Sequence[ListedEpisode]]) -> None:
+    """Quarantine what the rules over the whole set reject.
 
     Raises: DataError when a scene is both learnt from and tested on.
     """

@@ -10,7 +10,7 @@ from worldline_core.data.curation.curate_config import AVAILABLE, CurateConfig
 from worldline_core.data.episodes.episode import UNDESCRIBED, CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite, check_length, noted
+from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite, check_length, collect_faults
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import Embodiment, check_embodiment_name, load_embodiment
 
@@ -32,7 +32,7 @@ def check_episode(config: CurateConfig, loaded: LoadedEpisode) -> None:
         *(partial(check_camera, episode, camera) for camera in episode.cameras.values()),
         partial(check_views, config, loaded),
     ):
-        with noted(faults):
+        with collect_faults(faults):
             check()
     if config.views != AVAILABLE or not loaded.views:
         faults += loaded.absent.values()

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
 from worldline_core.data.episodes.episode_parts import Part
-from worldline_core.data.guards.plain_files import read_json, read_table, well_formed
+from worldline_core.data.guards.plain_files import expect_layout, read_json, read_table
 from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
@@ -177,7 +177,7 @@ class Sidecar:
         row = next((row for row in rows if row["view"] == view), None)
         if row is None:
             return None
-        with well_formed(where, PACKED):
+        with expect_layout(where, PACKED):
             count, height, width = (int(size) for size in row["shape"])
             check_image_size(width, height, where)
             if not 0 < count <= MAX_FRAMES:
@@ -194,7 +194,7 @@ class Sidecar:
         if not rows:
             return {}
         row = rows[0]
-        with well_formed(f"{self.root}, episode {episode_index}, trajectory", "numbers of N frames and A arms"):
+        with expect_layout(f"{self.root}, episode {episode_index}, trajectory", "numbers of N frames and A arms"):
             sizes = {"N": row["num_frames"], "A": row["num_arms"], "J": -1}
             return {
                 name: stored.array(row[name], sizes)

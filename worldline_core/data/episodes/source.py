@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import TRAINING_SPLITS, UNDESCRIBED, Episode, Outcome, Split, TaskFamily
-from worldline_core.data.guards.rejection import RejectedInputError, noted
+from worldline_core.data.guards.rejection import RejectedInputError, collect_faults
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
@@ -81,7 +81,7 @@ def sorted_views[T](
     absent: dict[str, RejectedInputError] = {}
     for view in views:
         refused: list[RejectedInputError] = []
-        with noted(refused):
+        with collect_faults(refused):
             found[view] = read(view)
         for fault in refused:
             if fault.reason in ("missing_file", "missing_view"):

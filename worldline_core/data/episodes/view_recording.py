@@ -22,7 +22,7 @@ from av.container import InputContainer
 from av.packet import Packet
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.plain_files import well_formed
+from worldline_core.data.guards.plain_files import expect_layout
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.lerobot.metadata import ImageSampler
 from worldline_core.data.lerobot.v3_writer import EpisodeVideo
@@ -86,7 +86,7 @@ def recorded_size(conventions: Mapping[str, object], view: str) -> tuple[int, in
     noted = conventions.get(f"{RECORDED_SIZE}{view}")
     if noted is None:
         return None
-    with well_formed(f"conventions, {RECORDED_SIZE}{view}", "HEIGHTxWIDTH in pixels"):
+    with expect_layout(f"conventions, {RECORDED_SIZE}{view}", "HEIGHTxWIDTH in pixels"):
         height, width = (int(side) for side in str(noted).split("x"))
         if min(height, width) < 1:
             raise ValueError(noted)

@@ -80,8 +80,8 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 @contextmanager
-def well_formed(where: object, layout: str) -> Iterator[None]:
-    """Around the reading of parsed content: what has another shape than its layout says is a fault of the file.
+def expect_layout(where: object, layout: str) -> Iterator[None]:
+    """Reject the file when parsed content read inside of the context has another shape than `layout` says.
 
     Raises: RejectedInputError (unreadable) for a missing key, another type, another length, a number out of range.
     """

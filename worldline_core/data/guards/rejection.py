@@ -98,10 +98,10 @@ class RejectedInputError(DataError):
 
 
 @contextmanager
-def noted(faults: list[RejectedInputError]) -> Iterator[None]:
-    """Around one of several checks: its rejection is added to `faults`, so that all are said at once (`all_of`).
+def collect_faults(faults: list[RejectedInputError]) -> Iterator[None]:
+    """Append a rejection raised inside of the context to `faults`, to report several at once (`all_of`).
 
-    Raises: a rejection that comes from a network or a busy store, which asking again may mend.
+    Raises: a rejection with a transient cause (a network, a busy store).
     """
     try:
         yield

@@ -156,7 +156,7 @@ class LeRobotV3Dataset(LeRobotDataset):
         first = table["index"][0].as_py() if len(table) else begin
         offset = begin - int(first) if isinstance(first, int) else -1
         rows = table[name].slice(offset, length) if offset >= 0 and length >= 0 else table[name].slice(0, 0)
-        return _numbers_of(rows, length, f"{path}, episode {episode_index}, column {name}")
+        return _numeric_column(rows, length, f"{path}, episode {episode_index}, column {name}")
 
     def clip(self, episode_index: int, key: str) -> VideoClip:
         row = self.row(episode_index)
@@ -224,7 +224,7 @@ class LeRobotV21Dataset(LeRobotDataset):
 
     def column(self, episode_index: int, name: str) -> np.ndarray:
         path = self._episode_path(self.info.data_path, episode_index)
-        return _numbers_of(
+        return _numeric_column(
             read_table(path, [name])[name], self._number(self.row(episode_index), "length"), f"{path}, column {name}"
         )
 
@@ -233,7 +233,7 @@ class LeRobotV21Dataset(LeRobotDataset):
         return VideoClip.whole_file(path, self._number(self.row(episode_index), "length"), self.fps)
 
 
-def _numbers_of(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
+def _numeric_column(column: pa.ChunkedArray, length: int, where: str) -> np.ndarray:
     """(N,) or, for lists of equal length, (N, D).
 
     Raises: RejectedInputError (length_mismatch, nan_state, unreadable) for another number of rows than listed, empty rows,

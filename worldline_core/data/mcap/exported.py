@@ -24,7 +24,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode, EpisodeDescription
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, rejected_as
 from worldline_core.data.episodes.source import LoadedEpisode
-from worldline_core.data.guards.plain_files import parse_json, well_formed
+from worldline_core.data.guards.plain_files import expect_layout, parse_json
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.mcap.cameras import add_camera
 from worldline_core.data.mcap.encodings import Encoding, FoxgloveSchema, MessageFile, message_file
@@ -206,7 +206,7 @@ def exported_episode_id(file: McapFile) -> str:
 
     Raises: RejectedInputError (unreadable) when the file is damaged or holds no episode of this project.
     """
-    with well_formed(file.path, f"metadata {EPISODE_METADATA}"):
+    with expect_layout(file.path, f"metadata {EPISODE_METADATA}"):
         return str(_stated(file)["episode_id"])
 
 
@@ -217,7 +217,7 @@ def read_exported_episode(file: McapFile) -> LoadedEpisode:
     """
     file.check_sums()
     about = _stated(file)
-    with well_formed(file.path, "an episode as this project writes it"):
+    with expect_layout(file.path, "an episode as this project writes it"):
         return _assembled(file, about)
 
 

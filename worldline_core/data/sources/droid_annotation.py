@@ -23,7 +23,7 @@ from worldline_core.data.episodes.source import (
     joint_names,
     sorted_views,
 )
-from worldline_core.data.guards.plain_files import read_json, well_formed
+from worldline_core.data.guards.plain_files import expect_layout, read_json
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_length, check_rate, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
 from worldline_core.data.sources.ids import by_number, file_ids
@@ -64,7 +64,7 @@ class DroidAnnotationSource:
     def load(self, episode_id: str) -> LoadedEpisode:
         file = inside(self._root, str(self._files[episode_id]))
         record = read_json(file)
-        with well_formed(file, "an annotation: a mapping with states, joints, videos and texts"):
+        with expect_layout(file, "an annotation: a mapping with states, joints, videos and texts"):
             return self._read(episode_id, file.parents[2], file, record)
 
     def _read(self, episode_id: str, subset: AnyPath, file: AnyPath, record: dict[str, Any]) -> LoadedEpisode:

@@ -14,7 +14,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import REPEATS_STATE, TRAINING_SPLITS, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras
 from worldline_core.data.episodes.source import EVALUATION_ONLY, EpisodeSource, LoadedEpisode, says_droid, sorted_views
-from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, all_of, check_rate, noted
+from worldline_core.data.guards.rejection import RATE_TOLERANCE, RejectedInputError, all_of, check_rate, collect_faults
 from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, relative_name
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset, LeRobotV21Dataset
 from worldline_core.data.lerobot.metadata import DatasetInfo
@@ -81,7 +81,7 @@ class LeRobotSource:
 
         faults: list[RejectedInputError] = []
         clips, absent = sorted_views(key_of, clip_of, faults)
-        with noted(faults):
+        with collect_faults(faults):
             times = dataset.column(index, "timestamp").reshape(-1).astype(np.float64)
             cameras = self._cameras(index, {view: key_of[view] for view in clips}, len(times))
             episode = self._episode(episode_id, index, times, cameras)

@@ -34,7 +34,7 @@ from worldline_core.data.episodes.source import (
     joint_names,
 )
 from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, raw_images, require_h5py
-from worldline_core.data.guards.plain_files import read_text, well_formed
+from worldline_core.data.guards.plain_files import expect_layout, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.sources.ids import by_number, file_ids
@@ -186,7 +186,7 @@ class UnitreeH5Source:
         if not is_file(path):
             return None
         text = io.StringIO(read_text(path, encoding="utf-8-sig"), newline="")
-        with unreadable("Table is no CSV", path, (csv.Error,)), well_formed(path, "columns videoid, instruction"):
+        with unreadable("Table is no CSV", path, (csv.Error,)), expect_layout(path, "columns videoid, instruction"):
             return {row["videoid"]: row["instruction"].strip() for row in csv.DictReader(text, strict=True)}
 
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from worldline_core.data.guards.plain_files import well_formed
+from worldline_core.data.guards.plain_files import expect_layout
 from worldline_core.data.video.clip import VideoClip, read_clip, video_size
 from worldline_core.data.video.frame_decoder import decode_frames
 
@@ -128,7 +128,7 @@ def unpacked_images(packed: bytes, shape: tuple[int, int, int], dtype: type, whe
     for begin in range(0, count, 8):
         size = min(8, count - begin) * height * width
         length = -(-size // 8) if dtype is bool else size
-        with well_formed(where, PACKED):
+        with expect_layout(where, PACKED):
             try:
                 content = read(length) + (read(1) if begin + 8 >= count else b"")
             except zlib.error as error:
