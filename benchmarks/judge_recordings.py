@@ -5,10 +5,10 @@
 
 RECORDINGS is an EpisodeSet of `worldline record` (episodes, or banks with their sealed outcomes). By default the robot masks
 that the judge needs are the exact ones of the recording, so that nothing but the judge (and the tokenizer, or the
-prediction) is measured; with a segmenter, they are its masks of what is shown. These are the upper rungs of the ladder of
-benchmarks/outcome_ladder.py: (d) true latents are `--tokenizer`; (e) true latents, noised to a level and denoised by a
-Stage II model under the recording's own controls, are `--model` with `--level` (and `--steps`); (f) samples are level 1, or
-`--rollouts`. Per task the area under the curve of the
+prediction) is measured; with a segmenter, they are its masks of what is shown. These are the upper rungs of the ladder in
+docs/recorded_worlds.md: (d) true latents, `--tokenizer`; (e) true latents noised to a level and denoised by a Stage II
+model under the recording's own controls, `--model` with `--level` (and `--steps`); (f) samples, level 1 or `--rollouts`.
+Per task the area under the curve of the
 judge's score, the same within banks with its 95 % interval over banks, and the share of outcomes that its rules tell rightly.
 """
 
@@ -26,7 +26,6 @@ import pyarrow.parquet as pq
 import torch
 from tqdm import tqdm
 
-from benchmarks.outcome_ladder import IMAGE, area
 from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.data.episodes.episode import Episode
@@ -45,6 +44,16 @@ from worldline_core.recorder.banks import SEALED_FILE
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.rollout.samplers import Noise, integrate, shifted_sigmas
 from worldline_core.rollout.worldline import WorldLine
+
+IMAGE = (64, 96)
+
+
+def area(scores: np.ndarray, success: np.ndarray) -> float:
+    """Share of pairs (success, failure) in which the success has the higher score; ties count half."""
+    wins, losses = scores[success], scores[~success]
+    if not len(wins) or not len(losses):
+        return float("nan")
+    return float((wins[:, None] > losses).mean() + 0.5 * (wins[:, None] == losses).mean())
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from benchmarks.judge_recordings import KnownMasks, task_of
-from benchmarks.outcome_ladder import area
+from benchmarks.judge_recordings import KnownMasks, area, task_of
 from tools.small_world_data import SHORT, VIEWS, Recorded
 from tools.small_world_memory import Memory, videos
 from tools.small_world_steps import controls_of

@@ -1,9 +1,7 @@
-"""No two modules need each other, and no two folders import each other; docs/architecture.md names every room."""
+"""No two modules need each other, and no two folders import each other."""
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections import defaultdict
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -51,14 +49,3 @@ def test_the_core_needs_neither_prefect_nor_what_is_above_it(imports: dict[str, 
     assert any("prefect" in libraries for libraries in imports.values())
     found = {module: {name for name in imported if name.split(".")[0] in above} for module, imported in imports.items()}
     assert {module: names for module, names in found.items() if names and module.startswith("worldline_core")} == {}
-
-
-def test_the_architecture_shows_the_layers_in_their_order(project_root: Path) -> None:
-    contracts = tomllib.loads((project_root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
-    (layers,) = (c["layers"] for c in contracts["contracts"] if c.get("containers") == ["worldline_core"])
-    level = {room: n for n, layer in enumerate(layers) for room in layer.split(" | ")}
-    text = (project_root / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rows = [row.split("|")[1] for row in text.split("\n## ")[1].splitlines() if row.startswith("| `")]
-    shown = [room for row in rows for room in re.findall(r"`(\w+)(?:/|\.py)`", row)]
-    assert sorted(shown) == sorted(level)
-    assert [level[room] for room in shown] == sorted(level[room] for room in shown)

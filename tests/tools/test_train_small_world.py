@@ -184,29 +184,6 @@ def test_the_plans_are_ones_that_the_tool_reads(path: Path) -> None:
     assert all(run.steps() for run in plan.runs.values())
 
 
-def test_the_directions_change_one_thing_each_and_last_equally_long() -> None:
-    plan = load_config(Plan, path=SHIPPED / "small_world_directions.yaml")
-    assert plan.reference == "full"
-    assert len(plan.seeds) == 3
-    full = plan.runs["full"]
-    assert full.stage2 is not None
-    changed = {}
-    for name, run in plan.runs.items():
-        assert run.stage2 is not None
-        own, reference = run.stage2.model_dump(), full.stage2.model_dump()
-        changed[name] = {key for key in own if own[key] != reference[key]}
-        assert sum(step.seconds or 0 for step in run.steps().values()) == 50
-    assert changed == {
-        "full": set(),
-        "success_only": {"outcomes"},
-        "native_film": {"native_size"},
-        "head_only": {"views"},
-        "no_regularization": {"relational"},
-        "no_action_free": {"seconds"},
-    }
-    assert plan.runs["no_action_free"].base is None
-
-
 @pytest.mark.parametrize(("seed", "message"), [("7", "no such seed"), ("0", "No recordings")])
 def test_what_cannot_be_done_is_said_without_a_traceback(
     seed: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -228,61 +205,6 @@ def test_some_seeds_of_a_plan_are_made_alone() -> None:
     assert plan.of_seeds([2, 0]).seeds == (2, 0)
     with pytest.raises(ConfigError, match=r"(?s)no such seed.*\(0, 1, 2\).*\[7\]"):
         plan.of_seeds([1, 7])
-
-
-def differences(plan: Plan, name: str) -> set[str]:
-    """What a run changes in its reference: settings of Stage II, fields of the model."""
-    run, full = plan.runs[name], plan.runs[plan.reference or ""]
-    assert run.stage2 is not None
-    assert full.stage2 is not None
-    found = {key for key, value in run.stage2.model_dump().items() if value != full.stage2.model_dump().get(key)}
-    own, shared = (run.model or plan.model).model_dump(), plan.model.model_dump()
-    return found | {key for key in own if own[key] != shared[key]}
-
-
-def test_the_directions_on_cpus_change_one_thing_each_and_take_equal_minutes() -> None:
-    plan = load_config(Plan, path=SHIPPED / "small_world_directions_cpu.yaml")
-    changed = {name: differences(plan, name) for name in plan.runs}
-    assert changed == {
-        "full": set(),
-        "success_only": {"outcomes"},
-        "native_film": {"native_size", "steps"},
-        "head_only": {"views", "steps"},
-        "head_only_as_many_clips": {"views"},
-        "no_regularization": {"relational", "steps"},
-        "no_action_free": {"steps"},
-    }
-    # Processor time of a clip, as the plan states it.
-    costs = {"native_film": 0.98, "head_only": 0.296, "no_regularization": 0.918}
-    minutes = {}
-    for name, run in plan.runs.items():
-        assert run.stage2 is not None
-        base = 0 if run.base is None else 0.335 * (run.base.steps or 0) * run.base.batch
-        minutes[name] = base + costs.get(name, 1.0) * (run.stage2.steps or 0) * run.stage2.batch
-    del minutes["head_only_as_many_clips"]
-    assert list(minutes.values()) == pytest.approx([minutes["full"]] * 6, rel=0.01)
-
-
-def test_the_choices_are_undone_one_at_a_time_in_equal_minutes() -> None:
-    plan = load_config(Plan, path=SHIPPED / "small_world_choices_cpu.yaml")
-    changed = {name: differences(plan, name) for name in plan.runs}
-    assert changed == {
-        "shipped": set(),
-        "even_things": {"things"},
-        "even_motion": {"motion"},
-        "even_noise": {"sigma"},
-        "most_noise": {"sigma"},
-        "velocity": {"prediction", "first_frame_std"},
-        "clean_latents": {"prediction", "first_frame_std"},
-        "every_control": {"action_frames"},
-        "smaller": {"steps", "hidden_size", "num_heads", "intermediate_size"},
-        "larger": {"steps", "hidden_size", "num_layers", "intermediate_size"},
-    }
-    costs = {"smaller": 0.531, "larger": 2.277}
-    for name, run in plan.runs.items():
-        assert run.stage2 is not None
-        assert (run.stage2.steps or 0) * costs.get(name, 1.0) == pytest.approx(1000, rel=0.01)
-    assert set(plan.measure.splits) == {"validation"}
 
 
 def test_the_moved_thing_is_found_and_the_judge_scores_both_kinds_of_views() -> None:

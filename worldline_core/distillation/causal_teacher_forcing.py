@@ -2,7 +2,7 @@
 
 The Stage II objective under block-causal attention: one observed latent frame, then blocks; each noisy block sees the
 clean blocks of its window and its own action maps. The paper's blocks are the recorded ones; a model of one step a block
-learns better from its own (docs/training.md, "One step a block, on CPUs").
+learns better from its own (docs/experiments.md, "One step per block").
 
 Axes: b clips, v views, c latent channels, t latent frames, h and w rows and columns.
 """

@@ -5,7 +5,7 @@ Functions and configs are named, not imported: listing the steps costs nothing, 
 Freed memory stays with the process.
 
 glibc gives large freed blocks back to the kernel at once; the next tensor of that size has every page mapped and zeroed
-anew. Models on a CPU make such tensors all the time: benchmarks/freed_memory.py measures what that costs.
+anew, which slows models on a CPU.
 """
 
 from __future__ import annotations
