@@ -23,7 +23,7 @@ from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import DataError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.relational import Relations, common_shape, relations
+from worldline_core.training.relational import SimilarityMatrices, common_shape, similarity_matrices
 from worldline_core.training.train_tokenizer import to_video
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import VideoTeacher
@@ -43,7 +43,7 @@ class Episodes:
         maps, things, robot, native: as in `Recorded`.
         singles: half (n, v, c, t, h, w): the last video frame of every latent frame coded alone, as first frames of
             clips are; of long recordings only.
-        intra, cross: half: what the video teacher says of the relations within and between views of short recordings to
+        intra, cross: half: the video teacher's similarity matrices within and between views of short recordings to
             train with, where one is given.
     """
 
@@ -214,7 +214,7 @@ class Memory:
         elif self.teacher is not None and recorded.split == "train":
             features = self.teacher.features((video.flatten(0, 1) + 1) / 2).unflatten(0, (-1, len(VIEWS)))
             grid = (latents.shape[3], GRID[0] // PATCH, GRID[1] // PATCH)
-            found = relations(features, common_shape(RelationalConfig(), grid, features.shape[2:5]))
+            found = similarity_matrices(features, common_shape(RelationalConfig(), grid, features.shape[2:5]))
             given |= {"intra": found.intra.half(), "cross": found.cross.half()}
         return {**given, "latents": latents.half()}
 
@@ -223,8 +223,8 @@ class Memory:
         return self.tokenizer.encode(video.flatten(0, 1)).unflatten(0, (-1, len(VIEWS)))
 
 
-class KnownRelations:
-    """What a video teacher has said of episodes in memory: the place of `TeacherRelations`.
+class KnownSimilarities:
+    """What a video teacher has said of episodes in memory: the place of `TeacherSimilarities`.
 
     Raises: DataError where it was not asked.
     """
@@ -235,17 +235,17 @@ class KnownRelations:
         self.intra, self.cross = episodes.intra, episodes.cross
         self.rows = {fact.id: row for row, fact in enumerate(episodes.facts)}
 
-    def relations(
+    def similarities(
         self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
-    ) -> Relations:
-        """Relations of every clip; see `TeacherRelations.relations`."""
+    ) -> SimilarityMatrices:
+        """SimilarityMatrices of every clip; see `TeacherSimilarities.similarities`."""
         del frames
         rows = torch.tensor([self.rows[clip.episode_id] for clip in clips])
         chosen = [VIEWS.index(view) for view in views]
         intra = self.intra[rows][:, chosen].float()
         cross = self.cross[rows][:, [view - 1 for view in chosen if view > 0]].float()
         shape = common_shape(RelationalConfig(), grid, (intra.shape[2] + 1, *grid[1:]))
-        return Relations(shape, intra, cross)
+        return SimilarityMatrices(shape, intra, cross)
 
 
 def videos(frames: np.ndarray, device: str) -> Tensor:

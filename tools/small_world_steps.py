@@ -19,7 +19,7 @@ from einops import repeat
 from torch import Tensor
 
 from tools.small_world_data import GRID, SHORT, SIGMA_PX_REF, VIEWS
-from tools.small_world_memory import Episodes, KnownRelations, Memory, maps_of_latent_frames
+from tools.small_world_memory import Episodes, KnownSimilarities, Memory, maps_of_latent_frames
 from tools.small_world_runs import BaseSettings, MatchingSettings, Stage2Settings, Timed, TokenizerSettings, key_of
 from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.errors import ConfigError
@@ -227,7 +227,7 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
             model.action_encoder = new_action_branch(model.config).to(start.memory.device)
     term = None
     if settings.relational:
-        term = RelationalTerm(RelationalConfig(), KnownRelations(episodes), model.config.num_layers)
+        term = RelationalTerm(RelationalConfig(), KnownSimilarities(episodes), model.config.num_layers)
     objective = FlowMatchingObjective(
         model,
         sigma=settings.sigma,

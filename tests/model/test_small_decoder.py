@@ -17,7 +17,7 @@ from worldline_core.model.tokenizers import WanTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training import train_tokenizer
-from worldline_core.training.frame_source import RecordedView
+from worldline_core.training.frame_source import LoadedView
 from worldline_core.training.train_tokenizer import train_small_decoder
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -38,9 +38,9 @@ def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
     return video * 2 - 1
 
 
-def views(seeds: int, count: int = 6) -> list[RecordedView]:
+def views(seeds: int, count: int = 6) -> list[LoadedView]:
     videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(seeds) for v in scenes(count, seed=s)]
-    return [RecordedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
+    return [LoadedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
 
 
 def of(tokenizer: VideoTokenizer, width: int = 4, *, trained: bool = True) -> SmallDecoder:

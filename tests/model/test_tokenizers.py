@@ -16,7 +16,7 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_token
 from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
-from worldline_core.training.frame_source import RecordedView
+from worldline_core.training.frame_source import LoadedView
 from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -37,10 +37,10 @@ def scenes(count: int = 6, frames: int = 9, seed: int = 0) -> torch.Tensor:
     return video * 2 - 1
 
 
-def views(seeds: int, count: int = 6) -> list[RecordedView]:
+def views(seeds: int, count: int = 6) -> list[LoadedView]:
     """Scenes of several seeds as they are held in memory for training."""
     videos = [((v + 1) * 127.5).round().to(torch.uint8) for s in range(seeds) for v in scenes(count, seed=s)]
-    return [RecordedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
+    return [LoadedView(f"scene-{number}/head", video) for number, video in enumerate(videos)]
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_interrupted_training_ends_with_the_same_weights(tmp_path: Path, monkeyp
     whole = fresh()
     train_decoder(whole, videos, config, tmp_path / "whole")
 
-    def failing(tokenizer: PatchTokenizer, views: list[RecordedView], config: TokenizerConfig, step: int) -> Any:
+    def failing(tokenizer: PatchTokenizer, views: list[LoadedView], config: TokenizerConfig, step: int) -> Any:
         if step == 3:
             raise KeyboardInterrupt("stopped at step 3")
         return decoder_batch(tokenizer, views, config, step)

@@ -20,7 +20,7 @@ from torch import Tensor
 from tools import small_world_causal, small_world_steps
 from tools.small_world_data import NATIVE_SIZE, VIEWS, Fact, Recorded, plan_files, record_file
 from tools.small_world_measures import Measuring, Predictor, Shown, gradient_energy, judged
-from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownRelations, Memory, videos
+from tools.small_world_memory import GIVEN, Episodes, Gathered, KnownSimilarities, Memory, videos
 from tools.small_world_runs import ForcingSettings, MeasureSettings, Plan
 from tools.small_world_steps import Start, controls_of, object_weights
 from tools.small_world_table import Spread, compared, markdown, table
@@ -36,7 +36,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_source import Clip
-from worldline_core.training.relational import TeacherRelations
+from worldline_core.training.relational import TeacherSimilarities
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import load_teacher
 
@@ -401,13 +401,13 @@ def test_controls_are_maps_of_the_views_or_vectors(measuring: Measuring) -> None
 def test_relations_in_memory_are_the_teachers(measuring: Measuring, recordings: Path) -> None:
     memory = measuring.memory
     assert memory.teacher is not None
-    taught = TeacherRelations.__new__(TeacherRelations)
+    taught = TeacherSimilarities.__new__(TeacherSimilarities)
     taught.teacher, taught.config, taught._cache = memory.teacher, RelationalConfig(cached_clips=0), {}  # type: ignore
     clips = tuple(Clip(fact.id, 0, 33, 1) for fact in memory.episodes().facts[2:4])
     frames = torch.from_numpy(recording("train", ["success", "failure"] * 2, 0)[0]["frames"][2:4])
     for views in (VIEWS, ("head", "right_wrist"), ("head",)):
-        found = KnownRelations(memory.episodes()).relations(clips, views, (9, 4, 6))
-        expected = taught.relations(clips, views, (9, 4, 6), frames[:, [VIEWS.index(view) for view in views]])
+        found = KnownSimilarities(memory.episodes()).similarities(clips, views, (9, 4, 6))
+        expected = taught.similarities(clips, views, (9, 4, 6), frames[:, [VIEWS.index(view) for view in views]])
         assert found.shape == expected.shape
         torch.testing.assert_close(found.intra, expected.intra, atol=2e-3, rtol=0)
         torch.testing.assert_close(found.cross, expected.cross, atol=2e-3, rtol=0)

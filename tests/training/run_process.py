@@ -20,7 +20,7 @@ import torch
 from safetensors.torch import save_file
 
 from worldline_core.training import trainer
-from worldline_core.training.sharding import gathered
+from worldline_core.training.processes import gathered
 from worldline_core.training.stage import Stage
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2

@@ -20,8 +20,8 @@ from safetensors.torch import load_file
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.artifact_files import digest_folder, read_json_lines
-from worldline_core.training.train_teacher import train_teacher
 from worldline_core.training.training_config import TeacherConfig
+from worldline_core.training.video_teacher import train_teacher
 
 
 def free_port() -> int:

@@ -5,11 +5,11 @@ import torch
 
 from worldline_core.training.relational import (
     RelationalScales,
-    Relations,
+    SimilarityMatrices,
     common_shape,
     pool_features,
     relational_losses,
-    relations,
+    similarity_matrices,
 )
 from worldline_core.training.training_config import RelationalConfig
 
@@ -18,24 +18,24 @@ def features(seed: int, size: int = 6, requires_grad: bool = False) -> torch.Ten
     return torch.randn(2, 3, 4, 5, size, generator=torch.Generator().manual_seed(seed), requires_grad=requires_grad)
 
 
-def taught(pooled: torch.Tensor) -> Relations:
-    """Relations of pooled features: four bins of five cells."""
-    return relations(pooled[:, :, :, :, None], (4, 5, 1))
+def matrices(pooled: torch.Tensor) -> SimilarityMatrices:
+    """SimilarityMatrices of pooled features: four bins of five cells."""
+    return similarity_matrices(pooled[:, :, :, :, None], (4, 5, 1))
 
 
 def test_equal_features_have_no_loss_and_rotated_ones_neither() -> None:
     student = features(0)
     rotation = torch.linalg.qr(torch.randn(6, 6, generator=torch.Generator().manual_seed(9)))[0]
     for teacher in (student, 3.0 * student, student @ rotation):
-        intra, cross = relational_losses(student, taught(teacher), 1)
+        intra, cross = relational_losses(student, matrices(teacher), 1)
         assert intra.item() == pytest.approx(0.0, abs=1e-6)
         assert cross.item() == pytest.approx(0.0, abs=1e-6)
-    assert relational_losses(student, taught(features(1)), 1)[0].item() > 0.1
+    assert relational_losses(student, matrices(features(1)), 1)[0].item() > 0.1
 
 
 def test_gradients_reach_the_student_only() -> None:
     student, teacher = features(0, requires_grad=True), features(1, size=9, requires_grad=True)
-    intra, cross = relational_losses(student, taught(teacher), 0)
+    intra, cross = relational_losses(student, matrices(teacher), 0)
     (intra + cross).backward()
     assert student.grad is not None
     assert student.grad.abs().sum() > 0
@@ -46,19 +46,19 @@ def test_views_go_round_robin_and_the_wrist_alternates() -> None:
     teacher = features(1)
     for step in range(6):
         student = features(0, requires_grad=True)
-        relational_losses(student, taught(teacher), step)[0].backward()
+        relational_losses(student, matrices(teacher), step)[0].backward()
         assert student.grad is not None
         touched = [view for view in range(3) if student.grad[:, view].abs().sum() > 0]
         assert touched == [step % 3]
         student = features(0, requires_grad=True)
-        relational_losses(student, taught(teacher), step)[1].backward()
+        relational_losses(student, matrices(teacher), step)[1].backward()
         assert student.grad is not None
         assert [view for view in range(3) if student.grad[:, view].abs().sum() > 0] == [0, 1 + step % 2]
 
 
 def test_one_view_has_no_cross_term() -> None:
     student, teacher = features(0)[:, :1], features(1)[:, :1]
-    assert relational_losses(student, taught(teacher), 5)[1].item() == 0.0
+    assert relational_losses(student, matrices(teacher), 5)[1].item() == 0.0
 
 
 def test_both_sides_are_pooled_to_the_coarser_grid_and_at_most_eight_bins() -> None:

@@ -13,9 +13,9 @@ from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.errors import ConfigError
 from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.sharding import own_part, place_model
+from worldline_core.training.processes import own_part, place_model
 from worldline_core.training.training_config import ShardingConfig
+from worldline_core.training.training_state import ExponentialAverage
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 SPEC = CausalSpec(block_size=2, sink_blocks=1, recent_blocks=1, sigmas=(1.0, 0.5, 0.0))

@@ -22,8 +22,8 @@ from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2
-from worldline_core.training.train_teacher import train_teacher
 from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
+from worldline_core.training.video_teacher import train_teacher
 
 TRAINER = {
     "steps": 4,

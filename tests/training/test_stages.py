@@ -23,8 +23,8 @@ from worldline_core.training.clip_source import training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage1 import stage1_groups, train_stage1
 from worldline_core.training.stage2 import stage2_groups, train_stage2
-from worldline_core.training.train_teacher import train_teacher
 from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
+from worldline_core.training.video_teacher import train_teacher
 
 MakeConfig = Callable[..., WorldModelConfig]
 
@@ -316,24 +316,24 @@ def test_latents_and_losses_that_are_not_finite_stop_the_run(
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:
     from worldline_core.training.clip_source import Clip
-    from worldline_core.training.relational import TeacherRelations, relations
+    from worldline_core.training.relational import TeacherSimilarities, similarity_matrices
     from worldline_core.training.training_config import RelationalConfig
     from worldline_core.training.video_teacher import load_teacher
 
     description = json.loads((teacher / "teacher.json").read_text())
     assert description["metrics"]["validation/loss"] > 0
     loaded = load_teacher(teacher)
-    taught = TeacherRelations(loaded, world.episodes, RelationalConfig(cached_clips=1))
+    source = TeacherSimilarities(loaded, world.episodes, RelationalConfig(cached_clips=1))
     clip, views = Clip("episode-003", 0, 9, 1), ("head", "left_wrist")
-    first = taught.relations((clip,), views, (3, 2, 2))
+    first = source.similarities((clip,), views, (3, 2, 2))
     assert (first.shape, first.intra.shape, first.cross.shape) == ((3, 2, 2), (1, 2, 2, 4, 4), (1, 1, 3, 4, 4))
-    assert taught.relations((clip,), views, (3, 2, 2)).intra is not first.intra
-    assert torch.equal(taught.relations((clip,), views, (3, 2, 2)).intra, first.intra)
-    later = taught.relations((replace(clip, start=8),), views, (3, 2, 2))
+    assert source.similarities((clip,), views, (3, 2, 2)).intra is not first.intra
+    assert torch.equal(source.similarities((clip,), views, (3, 2, 2)).intra, first.intra)
+    later = source.similarities((replace(clip, start=8),), views, (3, 2, 2))
     assert not torch.equal(later.intra, first.intra)
     # What is kept is what the unpooled features, in half precision, give.
-    position = taught.episodes.position("episode-003")
-    frames = torch.from_numpy(np.stack([taught.episodes.frames(position, view, list(clip.frames)) for view in views]))
+    position = source.episodes.position("episode-003")
+    frames = torch.from_numpy(np.stack([source.episodes.frames(position, view, list(clip.frames)) for view in views]))
     features = loaded.features((frames.float() / 255).permute(0, 4, 1, 2, 3)).half().float()
-    assert torch.equal(relations(features[None], (3, 2, 2)).cross, first.cross)
+    assert torch.equal(similarity_matrices(features[None], (3, 2, 2)).cross, first.cross)
     assert not any(parameter.requires_grad for parameter in loaded.parameters())  # type: ignore[attr-defined]

@@ -23,11 +23,10 @@ from torch import Tensor, nn
 from worldline_core.errors import ArtifactError, ConfigError, StoppedError, TrainingError
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training import processes
-from worldline_core.training.exponential_average import ExponentialAverage
 from worldline_core.training.processes import BatchPlan
 from worldline_core.training.trainer import Objective, ParameterGroup, TrainingResult, train
 from worldline_core.training.training_config import SavingConfig, TrainerConfig
-from worldline_core.training.training_state import TrainingStates, identity_digests, newest_state
+from worldline_core.training.training_state import ExponentialAverage, TrainingStates, identity_digests, newest_state
 
 STATES = Path("run") / "training_state"
 

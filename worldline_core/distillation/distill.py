@@ -51,8 +51,15 @@ from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
 from worldline_core.training.clip_sampler import ClipSampler
 from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows, training_rows
-from worldline_core.training.processes import ALONE, BatchPlan, join_processes, processes, wait_for_all
-from worldline_core.training.sharding import gathered, place_model
+from worldline_core.training.processes import (
+    ALONE,
+    BatchPlan,
+    gathered,
+    join_processes,
+    place_model,
+    processes,
+    wait_for_all,
+)
 from worldline_core.training.stage import clip_batches, input_facts, open_source, validation_function
 from worldline_core.training.stage_cost import latent_grid
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train

@@ -190,7 +190,7 @@ _STEPS = (
     Step(
         "train_teacher",
         1,
-        "worldline_core.training.train_teacher",
+        "worldline_core.training.video_teacher",
         "train_teacher",
         "training.training_config.TeacherConfig",
         ("episodes",),

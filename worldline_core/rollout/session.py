@@ -33,7 +33,7 @@ Frames = list[dict[str, np.ndarray]]
 """Of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
 
 
-class UnitSampler(Protocol):
+class LatentSampler(Protocol):
     """Samples latents unit by unit. ``chained``: every unit is a clip of its own that begins at the last picture of the
     one before."""
 
@@ -82,7 +82,7 @@ class BlockSampler:
         return other
 
 
-class ClipSampler:
+class FullClipSampler:
     """Samples one clip per step with a Stage II model."""
 
     chained = True
@@ -112,7 +112,7 @@ class ClipSampler:
     def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
         return self._sample(self._first, maps)[:, :, :, 1:]
 
-    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> ClipSampler:
+    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> FullClipSampler:
         other = copy(self)
         noise: Noise = self._sample.keywords["noise"]
         other._sample = partial(self._sample, noise=noise.select(clips) if seeds is None else Noise(seeds))
@@ -132,7 +132,7 @@ class Session:
 
     def __init__(
         self,
-        sampler: UnitSampler,
+        sampler: LatentSampler,
         tokenizer: VideoTokenizer,
         images: Float[Tensor, "b v 3 h w"],
         *,

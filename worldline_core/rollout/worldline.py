@@ -27,7 +27,7 @@ from worldline_core.rollout.captured import Run, run_now
 from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
 from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
-from worldline_core.rollout.session import BlockSampler, ClipSampler, Frames, Session
+from worldline_core.rollout.session import BlockSampler, Frames, FullClipSampler, Session
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Simulation, Starts, Stepping
 
 
@@ -293,7 +293,7 @@ class WorldLine:
             sampler = BlockSampler(self.simulator(seeds, chosen, stride), self.device)
             self.block_seconds = sampler.seconds
         else:
-            sampler = ClipSampler(
+            sampler = FullClipSampler(
                 self.model, Noise(seeds), steps=self.steps, shift=self.shift, views=chosen,
                 fps=self.contract.fps / stride, bfloat16=self.bfloat16, run=self.run,
             )  # fmt: skip

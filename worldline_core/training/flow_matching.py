@@ -139,12 +139,11 @@ class FlowMatchingObjective:
         if maps is not None and self.action_dropout > 0:
             maps = maps * rearrange(draws >= self.action_dropout, "b -> b 1 1 1 1 1")
         with_text = batch.text_ids is not None and draws[0].item() >= self.text_dropout
-        taught = None
+        targets = None
         if self.relational is not None:
             patch = self.model.config.patch_size
-            taught = self.relational.taught(
-                batch, (latents.shape[3], latents.shape[-2] // patch, latents.shape[-1] // patch)
-            )
+            grid = (latents.shape[3], latents.shape[-2] // patch, latents.shape[-1] // patch)
+            targets = self.relational.targets(batch, grid)
         # Where another process reads its text, this one takes part in gathering that tower's weights.
         text = self._text(batch) if batch.text_ids is not None and any_process(with_text) else None
         output = self.model(
@@ -157,11 +156,9 @@ class FlowMatchingObjective:
             features_at=None if self.relational is None else self.relational.layer,
         )
         flow = flow_matching_loss(output.velocity, latents, noise, sigma, self.weighting, weights=batch.weights)
-        if self.relational is None or taught is None:
+        if self.relational is None or targets is None or output.features is None:
             return flow, {}
-        if output.features is None:
-            raise ConfigError("The model returned no features for the relational terms.", where="features_at")
-        total, values = self.relational.add(flow, output.features, taught, step)
+        total, values = self.relational.add(flow, output.features, targets, step)
         return total, {"flow_matching": flow.item(), **values}
 
     def _text(self, batch: Batch) -> TextContext | None:

@@ -188,7 +188,7 @@ def frame_rows(episodes: EpisodeSet, views: Sequence[str], *, primary_alone: boo
 
 
 @dataclass(frozen=True)
-class RecordedView:
+class LoadedView:
     """One view of one episode at the training size; ``name`` is episode/view."""
 
     name: str
@@ -197,19 +197,19 @@ class RecordedView:
 
 def load_views(
     episodes: EpisodeSet, positions: Sequence[int], image_size: tuple[int, int], minimum: int
-) -> list[RecordedView]:
+) -> list[LoadedView]:
     """All views of the episodes at ``positions`` that have ``minimum`` frames or more, in memory.
 
     Raises:
         DataError: there is none.
     """
-    views: list[RecordedView] = []
+    views: list[LoadedView] = []
     for position in with_progress(positions, "reading episodes", "episode"):
         row = episodes.rows[position]
         for view in row.views:
             frames = VideoFrames(episodes.clip(position, view))
             if len(frames) >= minimum:
-                views.append(RecordedView(f"{row.episode_id}/{view}", resized_video(frames, image_size)))
+                views.append(LoadedView(f"{row.episode_id}/{view}", resized_video(frames, image_size)))
     if not views:
         raise DataError("No episode is long enough to train on", where=episodes.root, expected=f">= {minimum} frames")
     return views

@@ -41,19 +41,21 @@ def pool_features(features: Float[Tensor, "b v t h w d"], shape: tuple[int, int,
     return rearrange(pooled, "(b v) d t h w -> b v t (h w) d", v=views)
 
 
-def relation(first: Float[Tensor, "*batch n d"], second: Float[Tensor, "*batch m d"]) -> Float[Tensor, "*batch n m"]:
-    """Cosine similarities of all pairs of tokens: R(F, G) = normalised F times normalised G transposed."""
+def similarity_matrix(
+    first: Float[Tensor, "*batch n d"], second: Float[Tensor, "*batch m d"]
+) -> Float[Tensor, "*batch n m"]:
+    """Cosine similarities of all pairs of tokens: normalised F times normalised G transposed."""
     return functional.normalize(first, dim=-1) @ functional.normalize(second, dim=-1).transpose(-1, -2)
 
 
 @dataclass(frozen=True)
-class Relations:
-    """What the terms need from the teacher for a clip: half a megabyte at full size, against a gigabyte of features.
+class SimilarityMatrices:
+    """Similarities of the teacher's tokens: half a megabyte a clip at full size, against a gigabyte of features.
 
     Attributes:
         shape: (bins, rows, columns) that features are pooled to.
-        intra: relations between adjacent bins of each view.
-        cross: relations between the head and each wrist view in the same bin (no wrists: an empty axis).
+        intra: between adjacent bins of each view.
+        cross: between the head and each wrist view in the same bin (no wrists: an empty axis).
     """
 
     shape: tuple[int, int, int]
@@ -61,18 +63,18 @@ class Relations:
     cross: Float[Tensor, "b w t n n"]
 
 
-def relations(features: Float[Tensor, "b v t h w d"], shape: tuple[int, int, int]) -> Relations:
-    """Of every view and wrist, after pooling."""
+def similarity_matrices(features: Float[Tensor, "b v t h w d"], shape: tuple[int, int, int]) -> SimilarityMatrices:
+    """Similarities within every view and between the head and every wrist, after pooling."""
     pooled = pool_features(features, shape)
-    return Relations(
+    return SimilarityMatrices(
         shape,
-        relation(pooled[:, :, :-1], pooled[:, :, 1:]),
-        relation(pooled[:, :1].expand_as(pooled[:, 1:]), pooled[:, 1:]),
+        similarity_matrix(pooled[:, :, :-1], pooled[:, :, 1:]),
+        similarity_matrix(pooled[:, :1].expand_as(pooled[:, 1:]), pooled[:, 1:]),
     )
 
 
 def relational_losses(
-    student: Float[Tensor, "b v t n d"], teacher: Relations, step: int
+    student: Float[Tensor, "b v t n d"], teacher: SimilarityMatrices, step: int
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """(intra, cross) L1 distances. The view goes round robin with the step; the wrist alternates left and right.
 
@@ -80,12 +82,12 @@ def relational_losses(
     """
     views = student.shape[1]
     view = step % views
-    intra = relation(student[:, view, :-1], student[:, view, 1:]) - teacher.intra[:, view].detach()
+    intra = similarity_matrix(student[:, view, :-1], student[:, view, 1:]) - teacher.intra[:, view].detach()
     intra = intra.abs().mean()
     if views == 1:
         return intra, intra.new_zeros(())
     wrist = step % (views - 1)
-    cross = relation(student[:, 0], student[:, 1 + wrist]) - teacher.cross[:, wrist].detach()
+    cross = similarity_matrix(student[:, 0], student[:, 1 + wrist]) - teacher.cross[:, wrist].detach()
     return intra, cross.abs().mean()
 
 
@@ -122,47 +124,47 @@ class RelationalScales:
             self.ratios[name] = self.config.ema_decay * before + (1 - self.config.ema_decay) * ratio
 
 
-class ClipRelations(Protocol):
-    """Gives the teacher's relations of clips; see `TeacherRelations`."""
+class ClipSimilarities(Protocol):
+    """Source of the teacher's similarity matrices of clips."""
 
-    def relations(
+    def similarities(
         self,
         clips: Sequence[Clip],
         views: Sequence[str],
         grid: tuple[int, int, int],
         frames: UInt8[Tensor, "b v n height width 3"] | None = None,
-    ) -> Relations: ...
+    ) -> SimilarityMatrices:
+        """Similarity matrices of every clip.
+
+        Args:
+            grid: the student's (t, h, w) of these clips.
+            frames: frames of these clips where they are at hand.
+        """
+        ...
 
 
-class TeacherRelations:
-    """The teacher's relations of clips, from the recordings' frames, kept in memory as they were computed."""
+class TeacherSimilarities(ClipSimilarities):
+    """The teacher's similarity matrices, computed from the recordings' frames and kept in memory."""
 
     def __init__(self, teacher: VideoTeacher, episodes: Path, config: RelationalConfig) -> None:
         self.teacher = teacher
         self.episodes = EpisodeSet.open(episodes)
         self.config = config
-        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], Relations] = OrderedDict()
+        self._cache: OrderedDict[tuple[Clip, tuple[str, ...]], SimilarityMatrices] = OrderedDict()
 
-    def relations(
+    def similarities(
         self,
         clips: Sequence[Clip],
         views: Sequence[str],
         grid: tuple[int, int, int],
         frames: UInt8[Tensor, "b v n height width 3"] | None = None,
-    ) -> Relations:
-        """Relations of every clip.
-
-        Args:
-            grid: the student's (t, h, w) of these clips.
-            frames: of these clips, where they are read already; else they are decoded here, at the size of the recording.
-        """
+    ) -> SimilarityMatrices:
         given = [None] * len(clips) if frames is None else list(frames)
         each = [self._clip(clip, tuple(views), grid, read) for clip, read in zip(clips, given, strict=True)]
         # Half precision does not survive a concatenation under CPU autocast.
         with torch.autocast(each[0].intra.device.type, enabled=False):
-            return Relations(
-                each[0].shape, torch.cat([one.intra for one in each]), torch.cat([one.cross for one in each])
-            )
+            intra, cross = torch.cat([one.intra for one in each]), torch.cat([one.cross for one in each])
+        return SimilarityMatrices(each[0].shape, intra, cross)
 
     def _clip(
         self,
@@ -170,7 +172,7 @@ class TeacherRelations:
         views: tuple[str, ...],
         grid: tuple[int, int, int],
         frames: UInt8[Tensor, "v n height width 3"] | None,
-    ) -> Relations:
+    ) -> SimilarityMatrices:
         key = (clip, views)
         if key in self._cache:
             self._cache.move_to_end(key)
@@ -180,45 +182,39 @@ class TeacherRelations:
             decoded = [self.episodes.frames(position, view, list(clip.frames)) for view in views]
             frames = torch.from_numpy(np.stack(decoded))
         video = rearrange(frames.float() / 255.0, "v t h w c -> v c t h w")
-        # Rounded to half precision, as they always were; pooled where they are computed.
         features = self.teacher.features(video).to(torch.float16)
-        found = relations(features[None], common_shape(self.config, grid, features.shape[1:4]))
+        matrices = similarity_matrices(features[None], common_shape(self.config, grid, features.shape[1:4]))
         if self.config.cached_clips:
-            self._cache[key] = found
+            self._cache[key] = matrices
             if len(self._cache) > self.config.cached_clips:
                 self._cache.popitem(last=False)
-        return found
+        return matrices
 
 
 class RelationalTerm:
-    """The teacher's relations, student layer and running scales of the relational terms."""
+    """Weighted relational losses of a student's middle block, with running scales."""
 
-    def __init__(self, config: RelationalConfig, teacher: ClipRelations, num_layers: int) -> None:
+    def __init__(self, config: RelationalConfig, teacher: ClipSimilarities, num_layers: int) -> None:
         self.config = config
         self.teacher = teacher
         self.layer = config.student_layer or max(1, num_layers // 2)
         self.scales = RelationalScales(config)
 
-    def taught(self, batch: Batch, grid: tuple[int, int, int]) -> Relations:
-        """The teacher's relations of a batch, on its device; computed before the student's activations fill the memory.
+    def targets(self, batch: Batch, grid: tuple[int, int, int]) -> SimilarityMatrices:
+        """The teacher's matrices on the batch's device; ask for them before the student's activations fill the memory.
 
         Args:
             grid: the student's (t, h, w).
         """
-        found = self.teacher.relations(batch.clips, batch.views, grid, batch.frames)
+        found = self.teacher.similarities(batch.clips, batch.views, grid, batch.frames)
         device = batch.latents.device
         return replace(found, intra=found.intra.to(device), cross=found.cross.to(device))
 
     def add(
-        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], taught: Relations, step: int
+        self, flow: Float[Tensor, ""], features: Float[Tensor, "b v t h w d"], targets: SimilarityMatrices, step: int
     ) -> tuple[Tensor, dict[str, float]]:
-        """The flow-matching loss plus the weighted relational terms.
-
-        Args:
-            features: of the student's middle block.
-            taught: the teacher's relations of the same clips.
-        """
-        intra, cross = relational_losses(pool_features(features, taught.shape), taught, step)
+        """The flow-matching loss plus the weighted terms, and values to log."""
+        intra, cross = relational_losses(pool_features(features, targets.shape), targets, step)
         scale_intra, scale_cross = self.scales.at(step)
         values = {
             "relational_intra": intra.item(),

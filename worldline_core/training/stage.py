@@ -27,8 +27,7 @@ from worldline_core.training.clip_source import PRIMARY, ClipRow, ClipSource, na
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.frame_source import FrameSource
 from worldline_core.training.latent_store import LatentStore
-from worldline_core.training.processes import BatchPlan, join_processes, processes
-from worldline_core.training.sharding import gathered, place_model
+from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import StageConfig, TrainerConfig
 

@@ -18,7 +18,7 @@ from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContr
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
-from worldline_core.training.relational import RelationalTerm, TeacherRelations
+from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
 from worldline_core.training.stage import Stage
 from worldline_core.training.stage_cost import require_stage_fits
 from worldline_core.training.trainer import ParameterGroup
@@ -42,7 +42,7 @@ def _film(config: Stage2Config) -> dict[str, Any]:
 
 
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for relations.
+    """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for the relational terms.
 
     Clips are cached ``latents``, or frames that ``tokenizer`` encodes on the way.
 
@@ -118,5 +118,5 @@ def _relational(config: Stage2Config, inputs: Mapping[str, Path], model: WorldMo
             next_step="give the teacher's folder, or set relational to null",
         )
     teacher = load_teacher(Path(inputs["teacher"]), device=config.trainer.device)
-    taught = TeacherRelations(teacher, Path(inputs["episodes"]), config.relational)
-    return RelationalTerm(config.relational, taught, model.config.num_layers)
+    similarities = TeacherSimilarities(teacher, Path(inputs["episodes"]), config.relational)
+    return RelationalTerm(config.relational, similarities, model.config.num_layers)

@@ -19,7 +19,7 @@ from worldline_core.training.clip_config import ClipInput, FrameInput
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.latent_store import LatentStore
-from worldline_core.training.relational import RelationalScales, RelationalTerm, Relations, common_shape
+from worldline_core.training.relational import RelationalScales, RelationalTerm, SimilarityMatrices, common_shape
 from worldline_core.training.stage_memory import (
     ClipShape,
     Estimate,
@@ -208,10 +208,10 @@ class _OutlinedRelations(RelationalTerm):
         self.scales = RelationalScales(config)
         self.shape = shape
 
-    def taught(self, batch: Batch, grid: tuple[int, int, int]) -> Relations:
+    def targets(self, batch: Batch, grid: tuple[int, int, int]) -> SimilarityMatrices:
         bins, rows, columns = common_shape(self.config, grid)
         cells, clips, views = rows * columns, self.shape.clips, len(self.shape.views)
-        return Relations(
+        return SimilarityMatrices(
             (bins, rows, columns),
             torch.empty(clips, views, bins - 1, cells, cells),
             torch.empty(clips, views - 1, bins, cells, cells),

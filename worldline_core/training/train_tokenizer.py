@@ -26,7 +26,7 @@ from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig,
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.store.atomic import write_json_atomic
-from worldline_core.training.frame_source import RecordedView, load_views
+from worldline_core.training.frame_source import LoadedView, load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 from worldline_core.training.training_config import TokenizerConfig
 
@@ -59,7 +59,7 @@ class DrawnClip:
 
 
 def drawn_clips(
-    views: Sequence[RecordedView], config: TokenizerConfig, step: int, temporal: int = 4
+    views: Sequence[LoadedView], config: TokenizerConfig, step: int, temporal: int = 4
 ) -> Iterator[DrawnClip]:
     """Clips of one step, a function of the step."""
     generator = np.random.default_rng((config.seed, 1, step))
@@ -108,7 +108,7 @@ class DecoderBatch:
 
 @torch.no_grad()
 def decoder_batch(
-    tokenizer: VideoTokenizer, views: Sequence[RecordedView], config: TokenizerConfig, step: int, *, small: bool = False
+    tokenizer: VideoTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, step: int, *, small: bool = False
 ) -> DecoderBatch:
     """Clips of one step, coded and disturbed, for a patch tokenizer's own decoder or a small one; a function of the step."""
     clips = list(drawn_clips(views, config, step, tokenizer.temporal_compression))
@@ -161,7 +161,7 @@ class DecoderObjective(Objective[DecoderBatch]):
 
 
 def train_decoder(
-    tokenizer: PatchTokenizer, views: Sequence[RecordedView], config: TokenizerConfig, output: Path, start: str = ""
+    tokenizer: PatchTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, output: Path, start: str = ""
 ) -> None:
     """Train the decoder in place (its average is kept); continues from ``output/run`` if training was cut short.
 
@@ -180,7 +180,7 @@ def train_decoder(
 def train_small_decoder(
     decoder: SmallDecoder,
     tokenizer: VideoTokenizer,
-    views: Sequence[RecordedView],
+    views: Sequence[LoadedView],
     config: TokenizerConfig,
     output: Path,
 ) -> None:
@@ -215,7 +215,7 @@ def _train(
     decoder.eval().requires_grad_(False)
 
 
-def fitted_clips(config: TokenizerConfig, views: Sequence[RecordedView]) -> Iterator[Float[Tensor, "1 3 t h w"]]:
+def fitted_clips(config: TokenizerConfig, views: Sequence[LoadedView]) -> Iterator[Float[Tensor, "1 3 t h w"]]:
     """Clips that linear parts are fitted to."""
     generator = np.random.default_rng(config.seed)
     for _ in range(config.fit_clips):
@@ -225,7 +225,7 @@ def fitted_clips(config: TokenizerConfig, views: Sequence[RecordedView]) -> Iter
         yield to_video(frames[None, :, start : start + length])
 
 
-def _fitted(config: TokenizerConfig, views: Sequence[RecordedView], folder: Path) -> PatchTokenizer:
+def _fitted(config: TokenizerConfig, views: Sequence[LoadedView], folder: Path) -> PatchTokenizer:
     """Bases fitted now, or by the call that was interrupted (eigenvectors are not the same bits on another machine)."""
     if not (folder / DESCRIPTION).is_file():
         fit_patch_tokenizer(

@@ -1,31 +1,41 @@
 """The training loop of every model that is trained here: optimiser, averages, metrics, and a state to continue from.
 
 A model states its parameters, its objective and its batches; see `train`. With torchrun, several processes share every
-step and every weight (`sharding.py`).
+step and every weight (`processes.py`).
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from worldline_core.errors import ConfigError, StoppedError, TrainingError
 from worldline_core.progress import Progress
-from worldline_core.training.early_end import keep_batch, require_finite, stop_requests
-from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.processes import BatchPlan, average_values, processes, reporting_lost_processes
-from worldline_core.training.sharding import reduce_gradients, whole
+from worldline_core.store.atomic import write_bytes_atomic
+from worldline_core.training.processes import (
+    BatchPlan,
+    average_values,
+    processes,
+    reduce_gradients,
+    reporting_lost_processes,
+    whole,
+)
 from worldline_core.training.training_config import OptimizerConfig, TrainerConfig
 from worldline_core.training.training_state import (
+    ExponentialAverage,
     MetricsLog,
     TrainingStates,
     identity_digests,
@@ -130,6 +140,50 @@ def batch_plan(config: TrainerConfig, output: Path) -> BatchPlan:
     # Drawn as one, whatever the number of processes: all have clips of one length at a time, and the same clips.
     per_step = config.global_batch // config.batch_size
     return BatchPlan.of(per_step, per_step)
+
+
+@contextmanager
+def stop_requests() -> Iterator[Callable[[], bool]]:
+    """Whether a scheduler has asked to stop (SIGTERM), within the context; only the main thread can be told."""
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _frame: received.append(number))
+    try:
+        yield lambda: bool(received)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def keep_batch(output: Path, batch: object, **facts: int) -> Path:
+    """Keep a batch whose loss is not finite, so that it can be looked at and tried again.
+
+    Args:
+        facts: step, number of the micro-batch and seed: they decide its noise (`step_generator`).
+    """
+    path = output / "run" / "replay" / f"step-{facts['step']:09d}-micro-batch-{facts['micro_batch']}.safetensors"
+    tensors = {name: value.cpu().contiguous() for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    others = {name: str(value) for name, value in vars(batch).items() if name not in tensors}
+    write_bytes_atomic(path, save(tensors, metadata={"facts": json.dumps({**facts, **others})}))
+    return path
+
+
+def require_finite(scores: Mapping[str, float], states: TrainingStates, where: str) -> None:
+    """Refuse held-out losses that are not finite.
+
+    Raises:
+        TrainingError: one is not.
+    """
+    bad = {name: value for name, value in scores.items() if not math.isfinite(value)}
+    if bad:
+        raise TrainingError(
+            "A held-out loss is not finite.",
+            where=f"{where}, {', '.join(bad)}",
+            expected="finite numbers of the averaged weights",
+            got=bad,
+            next_step=f"look at the held-out clips, or lower the learning rate; {states.last_good()}",
+        )
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ class RelationalConfig(StrictModel):
     bins: int = Field(default=8, ge=2)
     grid: tuple[int, int] = (8, 8)
     student_layer: int | None = Field(default=None, ge=1, description="None: the middle block")
-    cached_clips: int = Field(default=20000, ge=0, description="clips whose teacher's relations stay in memory")
+    cached_clips: int = Field(default=20000, ge=0, description="clips whose similarity matrices stay in memory")
 
 
 class StageConfig(StrictModel):

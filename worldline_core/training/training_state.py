@@ -14,8 +14,9 @@ import math
 import shutil
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
@@ -28,9 +29,7 @@ from worldline_core.config import cache_relevant_config
 from worldline_core.errors import ArtifactError, TrainingError
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.exponential_average import ExponentialAverage
-from worldline_core.training.processes import another_process_ended, processes, wait_for_all
-from worldline_core.training.sharding import own_part
+from worldline_core.training.processes import another_process_ended, own_part, processes, wait_for_all
 from worldline_core.training.training_config import SavingConfig
 
 logger = logging.getLogger(__name__)
@@ -106,6 +105,43 @@ def _damaged(where: Path, got: object) -> ArtifactError:
         got=got,
         next_step="delete its folder: the run goes on from an earlier state, or starts again where there is none",
     )
+
+
+class ExponentialAverage:
+    """Exponential moving average of named parameters; shipped checkpoints hold it. Sharded where they are.
+
+    The decay rises with the number of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
+    forgotten also in short runs.
+    """
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
+        self.parameters = dict(parameters)
+        self.decay = decay
+        self.average = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
+
+    @torch.no_grad()
+    def update(self, updates: int) -> None:
+        """Take in the current weights; ``updates`` counts earlier updates."""
+        decay = min(self.decay, (1 + updates) / (10 + updates))
+        for name, parameter in self.parameters.items():
+            own_part(self.average[name]).lerp_(own_part(parameter), 1 - decay)
+
+    @contextmanager
+    def swapped(self) -> Iterator[None]:
+        """Within the context the model holds the average."""
+        self._exchange()
+        try:
+            yield
+        finally:
+            self._exchange()
+
+    @torch.no_grad()
+    def _exchange(self) -> None:
+        for name, parameter in self.parameters.items():
+            weights, average = own_part(parameter), own_part(self.average[name])
+            current = weights.detach().clone()
+            weights.copy_(average)
+            average.copy_(current)
 
 
 class TrainingStates:
