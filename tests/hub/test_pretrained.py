@@ -11,7 +11,7 @@ import torch
 
 from flows.command_line import main
 from tests.hub.conftest import Hub, Repository
-from worldline_core import WorldLine, WorldModel
+from worldline_core import PretrainedWorldModel, WorldLine
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
@@ -33,19 +33,19 @@ def publish(hub: Hub, folder: Path, name: str = "ORG/NAME") -> Repository:
 
 
 def test_a_model_is_saved_as_it_was_opened(folder: Path, tmp_path: Path) -> None:
-    model = WorldModel.from_pretrained(folder)
+    model = PretrainedWorldModel.from_pretrained(folder)
     assert (model.info.kind, model.training) == ("stage2", False)
     model.save_pretrained(tmp_path / "one")
     for name in ("model.safetensors", "checkpoint.json"):
         assert (tmp_path / "one" / name).read_bytes() == (folder / name).read_bytes()
     model.save_pretrained(tmp_path / "many", max_shard_bytes=8_000)
     assert len(list((tmp_path / "many").glob("model-*.safetensors"))) > 2
-    again = WorldModel.from_pretrained(tmp_path / "many", expect_kind="stage2")
+    again = PretrainedWorldModel.from_pretrained(tmp_path / "many", expect_kind="stage2")
     assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
     with pytest.raises(CheckpointError, match="wrong kind"):
-        WorldModel.from_pretrained(folder, expect_kind="causal")
+        PretrainedWorldModel.from_pretrained(folder, expect_kind="causal")
     with pytest.raises(CheckpointError, match="no description to save"):
-        WorldModel(model.config).save_pretrained(tmp_path / "none")
+        PretrainedWorldModel(model.config).save_pretrained(tmp_path / "none")
     main(["card", str(folder), "--license", "apache-2.0"])
     card = (folder / "run" / "card" / "README.md").read_text()
     assert "license: apache-2.0" in card
@@ -67,7 +67,7 @@ def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path,
     environment = {"packages": {"torch": "2.11"}}
     inputs = {"episodes": {"path": "filter/0", "digest": "2"}}
     write_manifest(trained, {"step": "train_stage2", "version": 1, "inputs": inputs, "environment": environment})
-    WorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
+    PretrainedWorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
     card = (tmp_path / "out" / "README.md").read_text()
     assert card.startswith("---\nlibrary_name: worldline\n")
     for said in (
@@ -89,7 +89,7 @@ def test_the_card_reads_nothing_outside_of_the_store(tmp_path: Path, folder: Pat
     folder.rename(trained)
     place = str(outside) if absolute else "../outside"
     write_manifest(trained, {"step": "train_stage2", "inputs": {"episodes": {"path": place, "digest": "1"}}})
-    WorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
+    PretrainedWorldModel.from_pretrained(trained).save_pretrained(tmp_path / "out")
     assert "private" not in (tmp_path / "out" / "README.md").read_text()
 
 
@@ -99,8 +99,8 @@ def test_the_hub_gives_the_same_model_and_nothing_that_could_run(hub: Hub, folde
     publish(hub, folder)
     found = pretrained_folder("ORG/NAME")
     assert sorted(path.name for path in found.iterdir()) == ["checkpoint.json", "model.safetensors"]
-    model = WorldModel.from_pretrained("ORG/NAME", revision="main")
-    here = WorldModel.from_pretrained(folder)
+    model = PretrainedWorldModel.from_pretrained("ORG/NAME", revision="main")
+    here = PretrainedWorldModel.from_pretrained(folder)
     assert all(torch.equal(value, here.state_dict()[name]) for name, value in model.state_dict().items())
     assert hub.tokens == {"hf_test"}
     assert not any(path.endswith((".bin", ".py")) for _, path in hub.requests if "resolve" in path)
@@ -130,18 +130,18 @@ def test_without_the_hub_it_is_said_what_to_do(
     with pytest.raises(
         UnavailableError, match=r"(?s)hub does not give this model.*ORG/OTHER.*next step: check the name"
     ):
-        WorldModel.from_pretrained("ORG/OTHER")
-    WorldModel.from_pretrained("ORG/NAME")
+        PretrainedWorldModel.from_pretrained("ORG/OTHER")
+    PretrainedWorldModel.from_pretrained("ORG/NAME")
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
-    WorldModel.from_pretrained("ORG/NAME")  # of the local cache
+    PretrainedWorldModel.from_pretrained("ORG/NAME")  # of the local cache
     with pytest.raises(UnavailableError, match=r"(?s)hub does not give this model.*ORG/UNSEEN.*offline"):
-        WorldModel.from_pretrained("ORG/UNSEEN")
+        PretrainedWorldModel.from_pretrained("ORG/UNSEEN")
     with pytest.raises(CheckpointError, match="No model here"):
-        WorldModel.from_pretrained(tmp_path / "nothing")
+        PretrainedWorldModel.from_pretrained(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match="No model here"):
-        WorldModel.from_pretrained("three/part/name")
+        PretrainedWorldModel.from_pretrained("three/part/name")
     with pytest.raises(ConfigError, match="no revisions"):
-        WorldModel.from_pretrained(folder, revision="main")
+        PretrainedWorldModel.from_pretrained(folder, revision="main")
 
 
 def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
@@ -149,4 +149,4 @@ def test_a_damaged_repository_is_refused(hub: Hub, folder: Path) -> None:
     content, large = repository.files["model.safetensors"]
     repository.files["model.safetensors"] = (content[:-1], large)
     with pytest.raises(CheckpointError, match="not those that are described"):
-        WorldModel.from_pretrained("ORG/NAME")
+        PretrainedWorldModel.from_pretrained("ORG/NAME")

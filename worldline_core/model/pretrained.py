@@ -14,9 +14,9 @@ import yaml
 
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model import world_model
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint, save_checkpoint
 from worldline_core.model.weight_files import MAX_SHARD_BYTES
+from worldline_core.model.world_model import WorldModel
 from worldline_core.store.artifact_files import read_manifest
 from worldline_core.store.atomic import write_bytes_atomic
 
@@ -70,7 +70,7 @@ def pretrained_folder(source: Path | str, revision: str | None = None) -> Path:
     return Path(found)
 
 
-class WorldModel(world_model.WorldModel):
+class PretrainedWorldModel(WorldModel):
     """The network with the description of its checkpoint.
 
     Attributes:
@@ -120,7 +120,7 @@ class WorldModel(world_model.WorldModel):
         if info is None:
             raise CheckpointError(
                 "The model has no description to save",
-                expected="a model of WorldModel.from_pretrained",
+                expected="a model of PretrainedWorldModel.from_pretrained",
                 got="one that was built from a configuration",
                 next_step="write it with save_checkpoint, which is told its kind and contract",
             )
@@ -194,7 +194,7 @@ def manifest_with_sources(folder: Path) -> dict[str, Any]:
 
 
 def _usage(info: CheckpointInfo) -> str:
-    name = "WorldLine" if info.kind in ("stage2", "causal") else "WorldModel"
+    name = "WorldLine" if info.kind in ("stage2", "causal") else "PretrainedWorldModel"
     return f'```python\nfrom worldline_core import {name}\n\nmodel = {name}.from_pretrained("FOLDER or ORG/NAME")\n```'
 
 
