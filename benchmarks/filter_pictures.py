@@ -25,8 +25,7 @@ from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import Finding
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.pictures.contact_sheet import ClipStrip, clip_strip, evenly_spaced
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import ClipStrip, clip_strip, evenly_spaced, jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic
 
 ROOT = Path(__file__).resolve().parents[1]

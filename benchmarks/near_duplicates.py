@@ -30,8 +30,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.store.atomic import write_bytes_atomic
 
 Frames = Mapping[str, np.ndarray]

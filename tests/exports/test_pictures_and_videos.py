@@ -10,17 +10,22 @@ import pytest
 
 from worldline_core.actions.overlays import heat_picture
 from worldline_core.data.video.frame_decoder import decode_video
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import (
+from worldline_core.pictures import (
+    COLUMN_GAP_PX,
+    LABEL_HEIGHT_PX,
+    SheetRow,
+    contact_sheet,
+    evenly_spaced,
     fit_text,
     jpeg_bytes,
     png_bytes,
     scale_frames,
     scaled_size,
+    side_by_side,
     text_strip,
     text_width_px,
+    write_side_by_side,
 )
-from worldline_core.pictures.side_by_side import GAP_PX, LABEL_HEIGHT_PX, side_by_side, write_side_by_side
 
 
 def clip(count: int, value: int, size: tuple[int, int] = (64, 96)) -> np.ndarray:
@@ -74,9 +79,9 @@ def test_contact_sheet_holds_every_picture() -> None:
 def test_columns_stay_in_step_and_end_with_the_shortest() -> None:
     columns = {"true": clip(9, 10), "Stage II": clip(5, 20), "causal": clip(7, 30, (32, 48))}
     frames = np.stack(list(side_by_side(columns, tile_height=64)))
-    assert frames.shape == (5, 64 + LABEL_HEIGHT_PX, 3 * 96 + 2 * GAP_PX, 3)
+    assert frames.shape == (5, 64 + LABEL_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
     body = frames[:, LABEL_HEIGHT_PX:]
-    starts = (0, 96 + GAP_PX, 2 * (96 + GAP_PX))
+    starts = (0, 96 + COLUMN_GAP_PX, 2 * (96 + COLUMN_GAP_PX))
     assert [int(body[:, :, start : start + 96].mean()) for start in starts] == [10, 20, 30]
     with pytest.raises(ValueError, match="at least one column"):
         side_by_side({})

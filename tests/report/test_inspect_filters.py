@@ -17,7 +17,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.pictures.contact_sheet import KEPT_COLOUR, reason_colour
+from worldline_core.pictures import KEPT_COLOUR, reason_colour
 from worldline_core.report.filters import CUT, QUARANTINED, episode_of, filter_refusals, read_outcomes
 from worldline_core.report.inspect import inspect
 from worldline_core.report.inspect_filters import FilteredSet

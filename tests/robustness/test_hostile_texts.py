@@ -21,7 +21,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.pages.page import Table, environment, markdown, render
-from worldline_core.pictures.labels import fit_text, text_width_px
+from worldline_core.pictures import fit_text, text_width_px
 from worldline_core.report.dataset_card import markdown_table, plain
 from worldline_core.report.progress import write_progress_page
 from worldline_core.store.remote import parse_location

@@ -26,9 +26,19 @@ from worldline_core.actions.overlays import (
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frames import Frames, in_step
 from worldline_core.errors import DataError
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
-from worldline_core.pictures.labels import INK, PAPER, Picture, font, text_strip, text_width_px
-from worldline_core.pictures.side_by_side import GAP_PX, STRIP_INK, STRIP_PAPER
+from worldline_core.pictures import (
+    COLUMN_GAP_PX,
+    INK,
+    PAPER,
+    STRIP_INK,
+    STRIP_PAPER,
+    Picture,
+    SheetRow,
+    contact_sheet,
+    font,
+    text_strip,
+    text_width_px,
+)
 from worldline_core.store.atomic import atomic_path
 
 HEADING_HEIGHT_PX = 28
@@ -126,7 +136,7 @@ def overlay_clip(
                 name = view_name(view) + (f"  ·  {title}" if title and not headings else "")
                 headings[view] = text_strip(name, tile.shape[1], HEADING_HEIGHT_PX, ink=STRIP_INK, paper=STRIP_PAPER)
             below = _blank(height - HEADING_HEIGHT_PX - tile.shape[0], tile.shape[1])
-            columns += [np.concatenate([headings[view], tile, below], axis=0), _blank(height, GAP_PX)]
+            columns += [np.concatenate([headings[view], tile, below], axis=0), _blank(height, COLUMN_GAP_PX)]
         row = np.concatenate(columns[:-1], axis=1)
         legend = legend_strip(
             tracks.arms,

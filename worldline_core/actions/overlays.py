@@ -30,7 +30,7 @@ from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
 from worldline_core.geometry.rotations import rotation_from_rot6d
-from worldline_core.pictures.labels import Picture, scale_frames, scaled_size
+from worldline_core.pictures import Picture, scale_frames, scaled_size
 
 Colour = tuple[int, int, int]
 ARM_COLOURS: dict[str, Colour] = {"left": (255, 150, 20), "right": (40, 150, 255)}

@@ -32,8 +32,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import CalibrationError, ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
-from worldline_core.pictures.contact_sheet import evenly_spaced
-from worldline_core.pictures.labels import png_bytes
+from worldline_core.pictures import evenly_spaced, png_bytes
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic

@@ -32,7 +32,7 @@ from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import jpeg_bytes
 from worldline_core.progress import Progress
 from worldline_core.scale.account import crash_evidence
 from worldline_core.scale.mapping import ends_the_run

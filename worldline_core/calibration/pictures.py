@@ -24,8 +24,17 @@ from worldline_core.actions.tool_projection import project_tools
 from worldline_core.calibration.residual import consistent_text, corrected_camera, off_text
 from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
 from worldline_core.errors import DataError
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced, pad
-from worldline_core.pictures.labels import INK, MUTED, Picture, draw_tag, text_strip
+from worldline_core.pictures import (
+    INK,
+    MUTED,
+    Picture,
+    SheetRow,
+    contact_sheet,
+    draw_tag,
+    evenly_spaced,
+    pad,
+    text_strip,
+)
 
 if TYPE_CHECKING:
     from worldline_core.calibration.diagnosis import Diagnosis, ViewMeasures

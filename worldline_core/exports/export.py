@@ -25,7 +25,7 @@ from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLi
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
 from worldline_core.exports.rollout import MCAP_FORMATS, export_rollout, mcap_file, shown_tracks
-from worldline_core.pictures.labels import png_bytes
+from worldline_core.pictures import png_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic

@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from worldline_core.exports.rerun_recording import log_frames, timeline
-from worldline_core.pictures.contact_sheet import KEPT_COLOUR, reason_colour
+from worldline_core.pictures import KEPT_COLOUR, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:

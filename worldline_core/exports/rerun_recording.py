@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
-from worldline_core.pictures.labels import jpeg_bytes, png_bytes
+from worldline_core.pictures import jpeg_bytes, png_bytes
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.pictures.side_by_side import write_side_by_side
+from worldline_core.pictures import write_side_by_side
 from worldline_core.rollout.rollout_set import RolloutSet
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from worldline_core.actions.overlays import heat_picture
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.pages.page import Table, number, percent, with_note, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet
+from worldline_core.pictures import SheetRow, contact_sheet
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.episode_sheet import episode_overlay
 from worldline_core.store.artifact_files import read_json

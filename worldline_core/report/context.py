@@ -15,7 +15,7 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.pages.page import render, render_macro
-from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
+from worldline_core.pictures import Picture, jpeg_bytes, png_bytes
 from worldline_core.report.video_scores import VideoScores
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import JsonObject, read_json

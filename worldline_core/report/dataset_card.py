@@ -18,8 +18,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.instructions import mentions_outcome
 from worldline_core.pages.charts import funnel_chart
 from worldline_core.pages.page import Table, markdown, render, words
-from worldline_core.pictures.contact_sheet import contact_sheet
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import contact_sheet, jpeg_bytes
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.dataset_facts import (
     UNKNOWN,

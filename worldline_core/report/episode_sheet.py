@@ -13,8 +13,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.pages.page import words
-from worldline_core.pictures.contact_sheet import SheetRow, evenly_spaced
-from worldline_core.pictures.labels import Picture
+from worldline_core.pictures import Picture, SheetRow, evenly_spaced
 
 MOMENTS = 6
 

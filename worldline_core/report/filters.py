@@ -19,8 +19,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
 from worldline_core.pages.charts import funnel_chart
 from worldline_core.pages.page import Table, code
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import Picture
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.store.artifact_files import JsonObject, read_rows
 

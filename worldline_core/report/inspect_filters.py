@@ -18,15 +18,17 @@ from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.signals import measure
 from worldline_core.filters.verdict import REASONS, Curve, Finding
 from worldline_core.pages.page import render
-from worldline_core.pictures.contact_sheet import (
+from worldline_core.pictures import (
     KEPT_COLOUR,
     ClipStrip,
+    Picture,
     clip_strip,
     evenly_spaced,
+    jpeg_bytes,
+    png_bytes,
     reason_colour,
     stacked,
 )
-from worldline_core.pictures.labels import Picture, jpeg_bytes, png_bytes
 from worldline_core.report.filters import KEPT, FilteredEpisode, numbers_text, read_outcomes
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic

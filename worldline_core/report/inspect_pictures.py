@@ -18,8 +18,7 @@ from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError, WorldLineError
 from worldline_core.exports.rollout import export_rollout, recording_content, shown_tracks
 from worldline_core.pages.page import render, words
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import Picture, png_bytes
+from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, png_bytes
 from worldline_core.progress import with_progress
 from worldline_core.report.episode_sheet import MOMENTS, episode_overlay, episode_rows, one_of_each
 from worldline_core.report.filters import episode_of

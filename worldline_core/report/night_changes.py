@@ -27,8 +27,7 @@ from worldline_core.data.video.frames import VideoFrames
 from worldline_core.evaluation.paired import PairedTest, Series, differences, margin_of, paired_tests, sign_of
 from worldline_core.evaluation.recordings import HEAD, stride_of
 from worldline_core.evaluation.scores import Interval
-from worldline_core.pictures.contact_sheet import SheetRow, contact_sheet, evenly_spaced
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import digest_value
 from worldline_core.store.atomic import write_bytes_atomic

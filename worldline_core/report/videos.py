@@ -22,8 +22,7 @@ from worldline_core.data.video.frames import Frames, VideoFrames
 from worldline_core.errors import DataError
 from worldline_core.exports.rollout import export_rollout
 from worldline_core.pages.page import words
-from worldline_core.pictures.labels import draw_tag
-from worldline_core.pictures.side_by_side import side_by_side, write_side_by_side, write_video
+from worldline_core.pictures import draw_tag, side_by_side, write_side_by_side, write_video
 from worldline_core.report.context import ReportContext, Section
 from worldline_core.report.video_scores import SPLIT_LABELS, Method, VideoScores, in_order
 

@@ -24,7 +24,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import DataError, WorldLineError
-from worldline_core.pictures.labels import jpeg_bytes
+from worldline_core.pictures import jpeg_bytes
 from worldline_core.policies.openpi import OpenpiPolicy
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.serving.recorded_starts import RecordedStart, save_played

@@ -1,1 +1,0 @@
-"""Labelled pictures: contact sheets, strips and side-by-side videos."""
