@@ -14,6 +14,7 @@ import pytest
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.errors import ConfigError, DataError
@@ -102,7 +103,8 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
 
 def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
     written = export(linked, tmp_path, ["mcap-ros2", "mcap-protobuf", "mcap", "rrd"], episode_ids=["e1#5-15"])
-    names = ["e1_5-15.mcap", "e1_5-15.protobuf.mcap", "e1_5-15.ros2.mcap", "e1_5-15.rrd"]
+    stem = safe_stem("e1#5-15")
+    names = [f"{stem}.mcap", f"{stem}.protobuf.mcap", f"{stem}.ros2.mcap", f"{stem}.rrd"]
     assert [path.name for path in written] == names
     episodes: Any = EpisodeSet.open(linked)
     for name in names[:3]:
@@ -112,7 +114,7 @@ def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
         assert np.array_equal(read.episode.state, episodes.episode(1).state)
     from rerun.chunk import RrdReader
 
-    reader = RrdReader(tmp_path / "e1_5-15.rrd")
+    reader = RrdReader(tmp_path / f"{stem}.rrd")
     assert len(reader.blueprints()) == 1
     assert {"/world/cameras/head/true", "/signals/action/right_gripper"} <= {c.entity_path for c in reader.stream()}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -133,4 +134,5 @@ def test_unknown_formats_and_episodes_are_refused(tmp_path: Path) -> None:
 
 
 def test_file_names_are_safe() -> None:
-    assert safe_stem("a/b c:../d") == "a_b_c____d"
+    assert re.fullmatch(r"a_b_c____d-[0-9a-f]{8}", safe_stem("a/b c:../d"))
+    assert len({safe_stem(name) for name in ("run 1", "run_1", "run.1")}) == 3

@@ -320,11 +320,15 @@ def fill_template(template: str, **values: int | str) -> str:
 
 
 def safe_stem(name: str) -> str:
-    """Any name as the beginning of a file name: what is no letter, digit, - or _ becomes _; of a long one a digest ends it."""
+    """Any name as the beginning of a file name; different names give different stems.
+
+    Other characters than letters, digits, - and _ become _; a digest ends every stem that is not the name itself.
+    """
     stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
-    if len(stem.encode()) <= _LONGEST_STEM:
+    if stem == name and len(stem.encode()) <= _LONGEST_STEM:
         return stem
-    return f"{stem[: _LONGEST_STEM // 4]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    kept = stem if len(stem.encode()) <= _LONGEST_STEM else stem[: _LONGEST_STEM // 4]
+    return f"{kept}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def safe_name(name: str, what: str) -> str:
