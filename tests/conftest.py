@@ -252,3 +252,11 @@ def make_spec() -> Callable[..., CausalSpec]:
         return CausalSpec.model_validate(values | changes)
 
     return make
+
+
+@pytest.fixture
+def reading_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Curation reads here, where a test can exchange what it calls, and not in a reader process."""
+    monkeypatch.setattr(
+        "worldline_core.data.curation.curate.read_limited", lambda _limits, function, *arguments: function(*arguments)
+    )

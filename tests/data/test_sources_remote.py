@@ -54,6 +54,7 @@ def preset(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("make", [videos, robocoin, galaxea, robomind])
+@pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
 def test_a_source_in_an_object_store(tmp_path: Path, make: Callable[[Path], dict[str, Any]]) -> None:
     root = tmp_path / "raw"
     root.mkdir()

@@ -23,6 +23,8 @@ from worldline_core.data.guards.source_paths import note_file, unchanged_files
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.store.artifact_files import digest_folder
 
+pytestmark = pytest.mark.usefixtures("reading_in_this_process")
+
 Make = Callable[[int], tuple[Path, CurateConfig]]
 
 

@@ -91,6 +91,7 @@ def video_folder(root: Path, sample: Any) -> dict[str, Any]:
     return {"kind": "video_folder"}
 
 
+@pytest.mark.usefixtures("reading_in_this_process")  # which alone has a file system in memory
 @pytest.mark.parametrize("write", [robotwin, agibot_world, enerverse_ac, unitree_h5, lerobot_v21, mcap, video_folder])
 def test_the_same_bytes_from_a_folder_and_from_elsewhere(
     tmp_path: Path, sample: Callable[..., tuple], write: Callable[[Path, Any], dict[str, Any]]

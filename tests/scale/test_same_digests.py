@@ -196,6 +196,7 @@ def test_killed_in_the_middle_and_resumed_elsewhere(
     assert len({row.episode_id for row in rows}) == COUNT + 1
 
 
+@pytest.mark.usefixtures("reading_in_this_process")
 def test_an_unforeseen_error_is_a_quarantined_episode(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,6 +222,7 @@ def test_an_unforeseen_error_is_a_quarantined_episode(
     assert "deadbeef" not in row.evidence + row.detail
 
 
+@pytest.mark.usefixtures("reading_in_this_process")
 def test_a_full_disk_ends_the_run(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import errno
 

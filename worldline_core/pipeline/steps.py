@@ -129,7 +129,7 @@ def _matches(name: str, pattern: str) -> bool:
 _STEPS = (
     Step(
         "curate",
-        4,
+        5,
         "worldline_core.data.curation.curate",
         "curate",
         "data.curation.curate_config.CurateConfig",

@@ -21,14 +21,16 @@ from worldline_core.data.episodes.episode_index import QuarantineRow, read_index
 from worldline_core.data.episodes.episode_set_writer import VIDEOS_FILE, EpisodeSetWriter
 from worldline_core.data.episodes.source import EpisodeSource
 from worldline_core.data.guards.plain_files import read_json
+from worldline_core.data.guards.reader_process import read_limited
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files, watch_run
 from worldline_core.data.sources.ids import check_id, unique_identity
 from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.errors import CalibrationError, DataError
-from worldline_core.scale.account import InputRow, check_account, write_account
-from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, map_episodes
-from worldline_core.store.remote import is_transient
+from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account
+from worldline_core.scale.mapping import EpisodeWork, SerialMapper, ShardMapper, ends_the_run, map_episodes
+from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, process_cache
+from worldline_core.store.store import helper_lock
 
 logger = logging.getLogger(__name__)
 
@@ -138,7 +140,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         )
 
     @cached_property
-    def _source(self) -> Callable[[int], EpisodeSource]:
+    def source(self) -> Callable[[int], EpisodeSource]:
         """Opens source `number`; the last few stay open."""
         run, sources, roots = self.run, self.config.sources, self.roots
 
@@ -159,7 +161,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         seen: set[str] = set()
         for number, source in enumerate(self.config.sources):
             episodes: list[ListedEpisode] = []
-            for listed_id in filter(source.includes, self._source(number).episode_ids()):
+            for listed_id in filter(source.includes, read_limited(self.config.reader, _episode_ids, self, number)):
                 repeated = listed_id in seen
                 identity = unique_identity(listed_id, number, seen)
                 seen |= {identity, listed_id}
@@ -174,10 +176,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         Raises: DataError where all do, or one that is required.
         """
         empty = [number for number, episodes in enumerate(listed) if not episodes]
-        said = {
-            number: nothing_found(self.config.sources[number], self._source(number), parse_location(self.roots[number]))
-            for number in empty
-        }
+        said = {number: read_limited(self.config.reader, _nothing_found, self, number) for number in empty}
         for number, error in said.items():
             if self.config.sources[number].require or len(empty) == 1 == len(listed):
                 raise error
@@ -191,18 +190,33 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
 
     def do(self, episode: ListedEpisode) -> InputRow:
         try:
+            return read_limited(self.config.reader, _process, self, episode, process_cache().max_bytes)
+        except RejectedInputError as error:
+            return self._quarantine(episode, error.reason, str(error), error.evidence)
+
+    def process(self, episode: ListedEpisode) -> InputRow:
+        """Keep or quarantine an episode; called in a reader process.
+
+        Raises: RejectedInputError (out_of_memory), MemoryError; UnreachableInputError; errors that end the run.
+        """
+        try:
             self._keep(episode)
-        except DataError as error:
+        except Exception as error:
             # A reader may have wrapped it: an input that cannot be reached just now is not a bad one.
             if is_transient(error):
+                raise UnreachableInputError("An input cannot be reached", got=first_line(error)) from error
+            if isinstance(error, MemoryError) or getattr(error, "reason", "") == "out_of_memory" or ends_the_run(error):
                 raise
             match error:
                 case RejectedInputError():
                     return self._quarantine(episode, error.reason, str(error), error.evidence)
                 case CalibrationError():
                     return self._quarantine(episode, "invalid_extrinsics", str(error), {})
-                case _:
+                case DataError():
                     return self._quarantine(episode, "unreadable", str(error), {})
+                case _:
+                    detail = f"{self.doing} ended with {type(error).__name__}: {portable_message(str(error))}"
+                    return self.quarantine_crashed(episode, detail, crash_evidence(error))
         return self.row(episode.identity)
 
     def _keep(self, episode: ListedEpisode) -> None:
@@ -215,7 +229,7 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         check_id(episode.listed_id, label)
         own = self.config.for_source(episode.source)
         with unchanged_files(episode.identity):
-            loaded = trimmed(own, self._source(episode.source).load(episode.listed_id))
+            loaded = trimmed(own, self.source(episode.source).load(episode.listed_id))
             check_episode(own, loaded)
             self.writer.add(*prepare_episode(own, loaded))
 
@@ -245,3 +259,28 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
             digest=found["fingerprint"]["digest"],
             stored_bytes=sum(file.stat().st_size for file in found.folder.iterdir()),
         )
+
+
+_opened: dict[str, CurateWork] = {}
+"""The work of the present run by the run's name, at most one: in a reader process all calls share what it has opened."""
+
+
+def _kept_open(work: CurateWork) -> CurateWork:
+    if work.run not in _opened:
+        _opened.clear()
+    return _opened.setdefault(work.run, work)
+
+
+def _episode_ids(work: CurateWork, source: int) -> list[str]:
+    return _kept_open(work).source(source).episode_ids()
+
+
+def _nothing_found(work: CurateWork, source: int) -> DataError:
+    work = _kept_open(work)
+    return nothing_found(work.config.sources[source], work.source(source), parse_location(work.roots[source]))
+
+
+def _process(work: CurateWork, episode: ListedEpisode, remote_cache_bytes: int) -> InputRow:
+    process_cache().max_bytes = remote_cache_bytes
+    with helper_lock(work.output):
+        return _kept_open(work).process(episode)

@@ -11,6 +11,7 @@ from worldline_core.data.curation.near_duplicates import NearDuplicateConfig
 from worldline_core.data.curation.scenes import LeakageConfig, Splits
 from worldline_core.data.episodes.instructions import InstructionConfig
 from worldline_core.data.episodes.view_recording import VideoMode
+from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
@@ -80,6 +81,10 @@ class CurateConfig(StrictModel):
         default=32,
         ge=1,
         description="frames from one key frame to the next: a clip that begins in between costs the decoding up to there",
+    )
+
+    reader: ReaderLimits = Field(
+        default=ReaderLimits(), description="what reading one recording may take: more is quarantined"
     )
 
     @model_validator(mode="after")

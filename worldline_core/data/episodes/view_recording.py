@@ -23,6 +23,7 @@ from av.packet import Packet
 from av.video.stream import VideoStream
 
 from worldline_core.data.guards.plain_files import expect_layout
+from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.lerobot.metadata import ImageSampler
 from worldline_core.data.lerobot.v3_writer import EpisodeVideo
@@ -145,6 +146,7 @@ def _copied(
         if pictures is None:
             return None
         for number, picture in enumerate(pictures):
+            still_reading()
             small.add(picture.luma, full_range=picture.full_range)
             if sampler.wants(number):
                 sampler.add(picture.rgb)
@@ -159,6 +161,7 @@ def _encoded(
     count = 0
     with ExitStack() as writing:
         for luma, full_range, rgb in _pictures(recorded):
+            still_reading()
             if count % recorded.step == 0 and count < recorded.num_frames:
                 small.add(luma, full_range=full_range)
                 image = rgb()

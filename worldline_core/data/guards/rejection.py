@@ -51,6 +51,8 @@ Reason = Literal[
     "near_duplicate",
     "scene_leak",
     "duplicate_id",
+    "out_of_time",
+    "out_of_memory",
     "crashed",
 ]
 REASONS: tuple[str, ...] = get_args(Reason)
@@ -125,15 +127,20 @@ def all_of(faults: Sequence[RejectedInputError], where: object) -> RejectedInput
 
 @contextmanager
 def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) -> Iterator[None]:
-    """Around reading: what a library raises for a damaged file becomes a rejection.
+    """Turns what a library raises for a damaged file into a rejection.
 
-    Raises: RejectedInputError (unreadable).
+    Raises: RejectedInputError (unreadable; out_of_memory where the library was refused memory).
     """
     try:
         yield
-    except faults as error:
+    except (MemoryError, *faults) as error:
+        refused = isinstance(error, MemoryError) or "memory" in str(error).lower()
         raise RejectedInputError(
-            "unreadable", what, where=where, got=str(error), next_step="copy the file again; it may be damaged"
+            "out_of_memory" if refused else "unreadable",
+            what,
+            where=where,
+            got=str(error),
+            next_step="copy the file again; it may be damaged",
         ) from error
 
 

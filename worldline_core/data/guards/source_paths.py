@@ -22,6 +22,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from upath import UPath
 
+from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, too_large
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.store.remote import AnyPath, list_files, parse_location, process_cache, remote_kind
@@ -179,6 +180,7 @@ def local_file(path: AnyPath) -> Path:
     Raises: RejectedInputError (missing_file, unreadable) for a remote file that is not there or not allowed;
         UnreachableInputError when the store does not answer.
     """
+    still_reading()
     if isinstance(path, Path):
         note_file(path)
         return path

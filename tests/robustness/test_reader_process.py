@@ -1,0 +1,113 @@
+"""What one recording may cost: its reader's process, never the run."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.errors import ConfigError
+
+LIMITS = ReaderLimits(memory_gb=2, seconds=60)
+
+
+def test_a_reader_is_another_process_and_is_kept() -> None:
+    first = read_limited(LIMITS, os.getpid)
+    assert first != os.getpid()
+    assert read_limited(LIMITS, os.getpid) == first
+
+
+def test_threads_read_side_by_side() -> None:
+    """Each with a reader of its own: the pauses do not add up."""
+    with ThreadPoolExecutor(3) as threads:
+        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 2.0), range(3)))  # all three are started
+        started = time.monotonic()
+        list(threads.map(lambda _: read_limited(LIMITS, time.sleep, 2.0), range(3)))
+    assert time.monotonic() - started < 5
+
+
+def test_what_a_function_raises_is_raised_here() -> None:
+    before = read_limited(LIMITS, os.getpid)
+    with pytest.raises(FileNotFoundError, match="no-such-file"):
+        read_limited(LIMITS, os.stat, "/no-such-file")
+    with pytest.raises(ConfigError, match="protocol"):
+        from worldline_core.store.remote import parse_location
+
+        read_limited(LIMITS, parse_location, "gopher2://x/y")
+    assert read_limited(LIMITS, os.getpid) == before
+
+
+def test_a_crash_is_named_and_costs_its_reader_only() -> None:
+    before = read_limited(LIMITS, os.getpid)
+    with pytest.raises(RejectedInputError, match="SIGABRT") as caught:
+        read_limited(LIMITS, os.abort)
+    assert caught.value.reason == "crashed"
+    assert read_limited(LIMITS, os.getpid) != before
+
+
+def test_a_crash_by_what_was_read_before_is_tried_again(tmp_path: Path) -> None:
+    """The second reader finds the mark of the first one."""
+    read_limited(LIMITS, os.getpid)
+    code = f"import os, pathlib; m = pathlib.Path({str(tmp_path / 'mark')!r}); m.exists() or (m.touch(), os.abort())"
+    read_limited(LIMITS, exec, code)
+    assert (tmp_path / "mark").exists()
+
+
+def test_too_much_memory() -> None:
+    with pytest.raises(RejectedInputError, match="2 GB") as caught:
+        read_limited(LIMITS, bytearray, 5 << 30)
+    assert caught.value.reason == "out_of_memory"
+    assert read_limited(LIMITS, len, bytes(1 << 20)) == 1 << 20
+
+
+def test_no_end() -> None:
+    started = time.monotonic()
+    with pytest.raises(RejectedInputError, match="1 s") as caught:
+        read_limited(ReaderLimits(seconds=1), time.sleep, 100)
+    assert caught.value.reason == "out_of_time"
+    assert time.monotonic() - started < 30
+
+
+def test_signs_of_life_put_the_deadline_off() -> None:
+    code = """
+import time
+from worldline_core.data.guards.reader_process import still_reading
+for _ in range(15):
+    time.sleep(0.3)
+    still_reading()
+"""
+    read_limited(ReaderLimits(seconds=3), exec, code)
+
+
+def test_a_reader_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:
+    """Even when that one is killed while the reader works."""
+    import signal
+    import subprocess
+    import sys
+
+    mark = tmp_path / "pid"
+    code = f"""
+from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
+read_limited(ReaderLimits(), exec, "import os, time, pathlib; pathlib.Path({str(mark)!r}).write_text(str(os.getpid())); time.sleep(100)")
+"""
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while not (mark.exists() and mark.read_text()):
+        assert process.poll() is None
+        time.sleep(0.05)
+    reader = int(mark.read_text())
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    for _ in range(100):
+        try:
+            status = Path(f"/proc/{reader}/stat").read_text().split()[2]
+        except FileNotFoundError:
+            return
+        if status == "Z":
+            return
+        time.sleep(0.1)
+    pytest.fail("the reader goes on")
