@@ -20,8 +20,8 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     export.add_argument("artifact", type=Path, metavar="FOLDER", help="an EpisodeSet or a RolloutSet")
     export.add_argument(
         "--format", action="append", required=True, dest="formats",
-        choices=("lerobot", "mcap", "mcap-protobuf", "mcap-ros2", "rrd", "mp4", "worldarena"),
-        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: JSON in Foxglove's schemas",
+        choices=("lerobot", "mcap", "mcap-ros2", "rrd", "mp4", "worldarena"),
+        help="repeatable; lerobot: EpisodeSets only, mp4 and worldarena: RolloutSets only; mcap: Foxglove's schemas",
     )  # fmt: skip
     export.add_argument("--output", type=Path, required=True, help="where the files go")
     export.add_argument(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from pydantic import ValidationError
 
 from worldline_core.data.curation.curate import curate
@@ -112,8 +112,9 @@ def test_a_distorted_mcap_is_curated_into_a_pinhole_recording(tmp_path: Path, sa
     path = tmp_path / "mcap" / "0.mcap"
     write_mcap_of_lens(path, episode, frames, lens, masks)
     with path.open("rb") as stream:
-        (message,) = [json.loads(m.data) for _, c, m in make_reader(stream).iter_messages(["/head/calibration"])]
-    assert message["distortion_model"] == model
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        (message,) = [message for *_, message in reader.iter_decoded_messages(["/head/calibration"])]
+    assert message.distortion_model == model
     assert read_exported_episode(McapFile(path)).distortions == {"head": lens}
     curated = curated_mcap(tmp_path)
     read = curated.episode(0)

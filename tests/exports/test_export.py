@@ -102,12 +102,12 @@ def test_lerobots_own_class_and_tools_work_on_an_export(
 
 
 def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
-    written = export(linked, tmp_path, ["mcap-ros2", "mcap-protobuf", "mcap", "rrd"], episode_ids=["e1#5-15"])
+    written = export(linked, tmp_path, ["mcap-ros2", "mcap", "rrd"], episode_ids=["e1#5-15"])
     stem = safe_stem("e1#5-15")
-    names = [f"{stem}.mcap", f"{stem}.protobuf.mcap", f"{stem}.ros2.mcap", f"{stem}.rrd"]
+    names = [f"{stem}.mcap", f"{stem}.ros2.mcap", f"{stem}.rrd"]
     assert [path.name for path in written] == names
     episodes: Any = EpisodeSet.open(linked)
-    for name in names[:3]:
+    for name in names[:2]:
         read: Any = read_exported_episode(McapFile(tmp_path / name))
         assert np.array_equal(read.frames("head"), episodes.frames(1, "head"))
         assert np.array_equal(read.robot_masks("head"), episodes.robot_masks(1, "head"))
@@ -152,9 +152,7 @@ def test_a_rerun_export_holds_the_tools_as_inspect_shows_them(tmp_path: Path, ca
 
 
 def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match=r"(?s)Not a format of EpisodeSet.*lerobot, mcap, mcap-protobuf, mcap-ros2, rrd.*mp4"
-    ):
+    with pytest.raises(ConfigError, match=r"(?s)Not a format of EpisodeSet.*lerobot, mcap, mcap-ros2, rrd.*mp4"):
         export(linked, tmp_path, ["mp4"])
     with pytest.raises(DataError, match=r"(?s)No such episode.*nothing"):
         export(linked, tmp_path, ["mcap"], episode_ids=["nothing"])

@@ -171,7 +171,7 @@ def test_frames_that_do_not_hang_together(tmp_path: Path, toy: Any) -> None:
     error = rejection(toy.declared(tmp_path))
     assert (error.reason, error.what) == ("invalid_extrinsics", "A frame has two parents")
     recording = toy.robot()
-    nothing = toy.transform("wrist", "odd", 0.0, [0, 0, 0], [0, 0, 0, 0])
+    nothing = toy.transform("wrist", "wrist_optical_frame", 0.0, [0, 0, 0], [0, 0, 0, 0])
     recording.add("/tf_static", "tf2_msgs/msg/TFMessage", 0.1, {"transforms": [nothing]}, headed=False)
     recording.write(tmp_path / "a.mcap")
     assert "without direction" in rejection(toy.declared(tmp_path)).what

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -61,29 +60,19 @@ def test_the_error_of_resampling_is_measured(tmp_path: Path, toy: Any) -> None:
     recording = toy.robot(jitter_s=0.004, seed=3)
     recording.write(tmp_path / "a.mcap")
     loaded = load(toy.declared(tmp_path))
-    notes = loaded.episode.conventions
-    stated = json.loads(str(notes["resampling"]))
-    # Counted again here, from the times that were sent.
+    # Counted again here, from the times that were sent; pictures were numbered in order of time.
     times = {
-        topic: np.sort([sent.time_ns for sent in recording.sent if sent.topic == topic and sent.time_ns is not None])
-        for topic in ("/head/image/compressed", "/wrist/image/compressed", "/joint_states")
+        topic: np.sort([sent.time_ns or sent.log_ns - 2_000_000 for sent in recording.sent if sent.topic == topic])
+        for topic in ("/head/image/compressed", "/wrist/image/compressed", "/joint_states", "/command", "/tf")
     }
     numbers = {view: toy.number_of(loaded.frames(view)) for view in loaded.views}
     begin = times["/head/image/compressed"][numbers["head"][0]]
     grid = begin + np.round(np.arange(loaded.episode.num_frames) * 1e9 / 30).astype(np.int64)
+    distances = {topic: np.abs(sent[None] - grid[:, None]) for topic, sent in times.items()}
     for view, topic in (("head", "/head/image/compressed"), ("right_wrist", "/wrist/image/compressed")):
-        sent = np.array([s.time_ns for s in recording.sent if s.topic == topic])
-        by_number = np.sort(sent)  # pictures were numbered in order of time; the jitter is less than half a step
-        distance = np.abs(by_number[None] - grid[:, None])
-        assert np.array_equal(numbers[view], distance.argmin(axis=1))
-        assert stated[f"image {view}"]["max_ms"] == pytest.approx(distance.min(axis=1).max() / 1e6, abs=1e-5)
-        assert stated[f"image {view}"]["mean_ms"] == pytest.approx(distance.min(axis=1).mean() / 1e6, abs=1e-5)
-    joint_distance = np.abs(times["/joint_states"][None] - grid[:, None]).min(axis=1) / 1e6
-    assert stated["topic /joint_states"]["max_ms"] == pytest.approx(joint_distance.max(), abs=1e-5)
-    seconds = (grid - toy.start_ns) / 1e9
-    error = np.abs(loaded.episode.state[:, :2] - toy.joints(seconds)).max()
-    assert error < float(notes["interpolation_error_rad"]) + 1e-6
-    assert notes["resampling_max_ms"] == max(each["max_ms"] for each in stated.values())
+        assert np.array_equal(numbers[view], distances[topic].argmin(axis=1))
+    largest = max(distance.min(axis=1).max() for distance in distances.values()) / 1e6
+    assert loaded.episode.conventions["resampling_max_ms"] == pytest.approx(largest, abs=1e-5)
 
 
 def test_a_set_is_made_of_them(tmp_path: Path, toy: Any) -> None:
@@ -100,7 +89,7 @@ def test_a_set_is_made_of_them(tmp_path: Path, toy: Any) -> None:
     assert np.all(np.diff(frames[:, 0, 0, 0].astype(int)) >= 1)
 
 
-def test_messages_out_of_order_are_sorted_and_counted(tmp_path: Path, toy: Any) -> None:
+def test_messages_out_of_order_are_sorted(tmp_path: Path, toy: Any) -> None:
     recording = toy.robot()
     for topic in ("/head/image/compressed", "/joint_states"):
         recording.change(topic, lambda sent: [sent[i ^ 1] if i ^ 1 < len(sent) else sent[i] for i in range(len(sent))])
@@ -108,9 +97,6 @@ def test_messages_out_of_order_are_sorted_and_counted(tmp_path: Path, toy: Any) 
     loaded = load(toy.declared(tmp_path))
     assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
     assert np.abs(loaded.episode.state[:, :2] - toy.joints(loaded.episode.timestamps)).max() < 1e-5
-    assert loaded.episode.conventions["messages_out_of_order"] == 45 + 150
-    toy.robot().write(tmp_path / "a.mcap")
-    assert load(toy.declared(tmp_path)).episode.conventions["messages_out_of_order"] == 0
 
 
 def test_messages_sent_twice_count_once(tmp_path: Path, toy: Any) -> None:
@@ -118,7 +104,6 @@ def test_messages_sent_twice_count_once(tmp_path: Path, toy: Any) -> None:
     recording.change("/head/image/compressed", lambda sent: [each for s in sent for each in (s, s)])
     recording.write(tmp_path / "a.mcap")
     loaded = load(toy.declared(tmp_path))
-    assert loaded.episode.conventions["messages_repeated"] == 90
     assert np.array_equal(toy.number_of(loaded.frames("head")), np.arange(90))
 
 
@@ -175,10 +160,9 @@ def test_clocks_that_disagree_are_measured_corrected_or_refused(tmp_path: Path, 
     assert np.array_equal(toy.number_of(by_log.frames("right_wrist")), toy.number_of(by_log.frames("head")))
 
 
-def test_header_and_log_time_differ_by_what_is_reported(tmp_path: Path, toy: Any) -> None:
+def test_header_and_log_time_differ(tmp_path: Path, toy: Any) -> None:
     toy.robot().write(tmp_path / "a.mcap")
     by_header, by_log = (load(toy.declared(tmp_path, time=time)).episode for time in ("header", "log"))
-    assert "/head/image/compressed: least 20.000, median 20.000" in str(by_header.conventions["header_to_log_ms"])
     assert by_header.conventions["timed_by_log"] == "/command"
     # Images are logged 20 ms late, joints 2 ms: by log time a frame meets joints that are 18 ms younger.
     younger = toy.joints(by_header.timestamps + 0.018)
@@ -295,7 +279,7 @@ def test_binning_region_rectification_and_lens(tmp_path: Path, toy: Any) -> None
     straight = load(toy_declared).episode
     assert np.array_equal(straight.cameras["head"].K, [[18, 0, 7], [0, 18, 5], [0, 0, 1]])
     assert "undistorted" not in straight.conventions
-    with pytest.raises(RejectedInputError, match="Calibration is of another image size"):
+    with pytest.raises(RejectedInputError, match="Calibration belongs to another image size"):
         with_info(height=24, width=32).frames("head")
 
 

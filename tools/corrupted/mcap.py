@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,8 @@ from worldline_core.data.mcap.exported import write_episode_mcap
 _BASES = 4
 _CHUNK = 0x06
 Sample = tuple[Episode, dict[str, np.ndarray]]
-_Change = Callable[[str, int, dict[str, Any]], dict[str, Any] | None]
+_Change = Callable[[str, int, Any], Any]
+"""(topic, number, protobuf message) -> the message, changed, or None to leave it out."""
 
 
 def _beyond_limit(sample: Sample, random: np.random.Generator) -> Sample:
@@ -62,17 +62,17 @@ def _dropped(topic: str, number: int) -> _Change:
     return lambda found, index, message: None if (found, index) == (topic, number) else message
 
 
-def _bomb(found: str, index: int, message: dict[str, Any]) -> dict[str, Any]:
+def _bomb(found: str, index: int, message: Any) -> Any:
     """A PNG header that claims 30,000 x 30,000 pixels."""
-    if found != "/head/image":
-        return message
-    content = bytearray(base64.b64decode(message["data"]))
-    content[16:24] = struct.pack(">II", 30_000, 30_000)
-    return {**message, "data": base64.b64encode(bytes(content)).decode()}
+    if found == "/head/image":
+        message.data = message.data[:16] + struct.pack(">II", 30_000, 30_000) + message.data[24:]
+    return message
 
 
-def _no_direction(found: str, index: int, message: dict[str, Any]) -> dict[str, Any]:
-    return {**message, "rotation": dict.fromkeys("xyzw", 0.0)} if found == "/tf" else message
+def _no_direction(found: str, index: int, message: Any) -> Any:
+    if found == "/tf":
+        message.rotation.Clear()
+    return message
 
 
 MESSAGE_KINDS: tuple[tuple[str, _Change, tuple[str, ...]], ...] = (
@@ -191,7 +191,9 @@ def _rewrite(path: Path, change: _Change, *, with_metadata: bool = True) -> None
                 continue
             index = count.get(channel.topic, 0)
             count[channel.topic] = index + 1
-            changed = change(channel.topic, index, json.loads(message.data))
+            name = schema.name.removeprefix("foxglove.")
+            published = getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+            changed = change(channel.topic, index, published.FromString(message.data))
             if changed is None:
                 continue
             if schema.name not in schemas:
@@ -200,6 +202,6 @@ def _rewrite(path: Path, change: _Change, *, with_metadata: bool = True) -> None
                 channels[channel.topic] = writer.register_channel(
                     channel.topic, channel.message_encoding, schemas[schema.name]
                 )
-            data = json.dumps(changed).encode()
-            writer.add_message(channels[channel.topic], message.log_time, data, message.publish_time, message.sequence)
+            data = changed.SerializeToString()
+            writer.add_message(channels[channel.topic], message.log_time, data, message.publish_time)
         writer.finish()

@@ -52,7 +52,7 @@ def export(
 
     Args:
         formats: of an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
-            artifact refers to another one's), `mcap`, `mcap-protobuf`, `mcap-ros2` and
+            artifact refers to another one's), `mcap`, `mcap-ros2` and
             `rrd` (one file per episode); of a RolloutSet all but `lerobot`, and `mp4` and
             `worldarena` (`export_worldarena`).
         episode_ids: which episodes; none: all.

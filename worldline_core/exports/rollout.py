@@ -15,8 +15,7 @@ from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.data.mcap.encodings import Encoding
-from worldline_core.data.mcap.exported import write_rollout_mcap
+from worldline_core.data.mcap.exported import Encoding, write_rollout_mcap
 from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
@@ -27,12 +26,12 @@ from worldline_core.rollout.rollout_set import RolloutSet
 if TYPE_CHECKING:
     from worldline_core.exports.rerun_recording import RecordingContent
 
-MCAP_FORMATS: dict[str, Encoding] = {"mcap": "json", "mcap-protobuf": "protobuf", "mcap-ros2": "ros2"}
+MCAP_FORMATS: dict[str, Encoding] = {"mcap": "protobuf", "mcap-ros2": "ros2"}
 FORMATS = ("mp4", "rrd", *MCAP_FORMATS)
 
 
 def mcap_file(folder: Path, stem: str, wanted: str) -> Path:
-    """`<stem>.mcap`, `<stem>.protobuf.mcap` or `<stem>.ros2.mcap`."""
+    """`<stem>.mcap` or `<stem>.ros2.mcap`."""
     return folder / f"{stem}{wanted.removeprefix('mcap').replace('-', '.')}.mcap"
 
 
@@ -51,8 +50,8 @@ def export_rollout(
     Args:
         rollout_sets: one set, or several by method name.
         tracks: action tracks for tool poses and heat maps; left out when None.
-        formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap`,
-            `mcap-protobuf`, `mcap-ros2` (one per method).
+        formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap`
+            and `mcap-ros2` (one per method).
         name: beginning of the file names (default: the episode's id).
 
     Raises:

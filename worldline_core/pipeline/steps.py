@@ -300,7 +300,7 @@ _STEPS = (
     ),
     Step(
         "report",
-        14,
+        15,
         "worldline_core.report.report",
         "report",
         "report.context.ReportConfig",

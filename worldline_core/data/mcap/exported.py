@@ -1,47 +1,53 @@
-"""Episodes and rollouts as MCAP files that Foxglove opens, and the reading of such an episode.
+"""This project's own MCAP files: episodes and rollouts written for Foxglove and ROS 2 tools, and episodes read back.
 
-Messages are in Foxglove's schemas (JSON or protobuf) or those of ROS 2 (CDR), all of a frame stamped with the frame's time
-in nanoseconds: `/<view>/image` CompressedImage (png is exact, jpeg is not), `/<view>/calibration` CameraCalibration, `/tf`
+Messages have Foxglove's schemas (protobuf) or those of ROS 2 (CDR), all of a frame stamped with the frame's time in
+nanoseconds: `/<view>/image` CompressedImage (png is exact, jpeg is not), `/<view>/calibration` CameraCalibration, `/tf`
 FrameTransform (cameras, tools), `/joint_states` and `/joint_commands` JointStates. In ROS 2 fixed cameras are in
 `/tf_static`. Everything else about an episode is one metadata record. The same input gives the same bytes.
 
-Read, it is a layout of the general reader that needs no declaration: the metadata say which topics there are. What differs
-from the recordings of others: a frame's messages are all of one time, so the instants are those of the states and nothing is
-resampled; states and gripper openings are taken as they are; robot masks are images.
+Unlike a recording of another tool, such a file describes itself: all messages of a frame have one time, so nothing is
+resampled; states and gripper openings are exact; robot masks are images.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import cv2
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from mcap.records import Schema
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+from mcap_ros2.writer import Writer as Ros2Writer
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack, Episode, EpisodeDescription
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, rejected_as
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.plain_files import expect_layout, parse_json
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.mcap.cameras import add_camera
-from worldline_core.data.mcap.encodings import Encoding, FoxgloveSchema, MessageFile, message_file
-from worldline_core.data.mcap.file import McapFile, Stream, read_streams
+from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.images import ImageTrack
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
+from worldline_core.data.mcap.transforms import add_camera
 from worldline_core.data.video.frames import Frames, MadeFrames, in_step
 from worldline_core.errors import DataError
 from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 from worldline_core.store.atomic import atomic_path
 
-ImageFormat = Literal["png", "jpeg"]
+Encoding = Literal["protobuf", "ros2"]
+Message = Mapping[str, Any]
+_Schema = Literal["CompressedImage", "CameraCalibration", "FrameTransform", "JointStates"]
 EPISODE_METADATA = "worldline.episode"
 FORMAT_VERSION = 2
-READABLE_VERSIONS = (1, FORMAT_VERSION)
-"""1 wrote joints as names and positions, in a schema of its own."""
 STATIC_TRANSFORMS = "/tf_static"
 _JPEG_QUALITY = 95
 
@@ -52,7 +58,7 @@ def write_episode_mcap(
     frames: Mapping[str, Frames],
     robot_masks: Mapping[str, Frames] | None = None,
     *,
-    encoding: Encoding = "json",
+    encoding: Encoding = "protobuf",
 ) -> None:
     """Write one episode; images are exact (png).
 
@@ -87,7 +93,7 @@ def write_rollout_mcap(
     metadata: Mapping[str, str] | None = None,
     cameras: Mapping[str, CameraTrack] | None = None,
     T_base_ee: np.ndarray | None = None,
-    encoding: Encoding = "json",
+    encoding: Encoding = "protobuf",
 ) -> None:
     """Write predicted videos, as JPEG of quality 95 (on average within 4 of 255).
 
@@ -115,25 +121,21 @@ def write_rollout_mcap(
 def _new_file(path: Path, name: str, metadata: Mapping[str, str], encoding: Encoding) -> Iterator[_Messages]:
     """A file with a metadata record, which appears when its messages are complete."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        file = message_file(stream, encoding)
-        file.add_metadata(name, metadata)
-        yield _Messages(file, static_transforms=STATIC_TRANSFORMS if encoding == "ros2" else "/tf")
-        file.finish()
+        messages = _Ros2Messages(stream) if encoding == "ros2" else _FoxgloveMessages(stream)
+        messages.writer.add_metadata(name, dict(metadata))
+        yield messages
+        messages.writer.finish()
 
 
 class _Messages:
-    """Writes messages of the time `time_ns`; ROS 2 has a topic of its own for transforms that stay."""
+    """Writes messages of the time `time_ns`, given in the fields of Foxglove's schemas."""
 
-    def __init__(self, file: MessageFile, static_transforms: str) -> None:
-        self.time_ns = 0
-        self._file = file
-        self._static_transforms = static_transforms
-        self._sequence: dict[str, int] = {}
+    writer: Writer | Ros2Writer
+    static_transforms: str
+    time_ns = 0
 
-    def add(self, topic: str, schema: FoxgloveSchema, message: Mapping[str, Any]) -> None:
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
-        self._file.write(topic, schema, message, self.time_ns, sequence)
+    def add(self, topic: str, schema: _Schema, message: Message) -> None:
+        raise NotImplementedError
 
     def add_poses(self, index: int, cameras: Mapping[str, CameraTrack], T_base_ee: np.ndarray | None) -> None:
         """Calibrations and fixed cameras with the first frame; moving cameras and tools with every frame."""
@@ -142,15 +144,63 @@ class _Messages:
                 self.add(f"/{view}/calibration", "CameraCalibration", _calibration(camera))
             if index == 0 or camera.moving:
                 pose = camera.T_base_camera[index if camera.moving else 0]
-                topic = "/tf" if camera.moving else self._static_transforms
+                topic = "/tf" if camera.moving else self.static_transforms
                 self.add(topic, "FrameTransform", _transform(f"{view}_camera", pose))
         for arm, pose in enumerate(T_base_ee[index] if T_base_ee is not None else ()):
             self.add("/tf", "FrameTransform", _transform(f"tool_{arm}", pose))
 
-    def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: ImageFormat) -> None:
+    def add_images(self, images: Mapping[tuple[str, str], np.ndarray], image_format: Literal["png", "jpeg"]) -> None:
         """By kind (image, robot_mask) and view."""
         for (kind, view), image in images.items():
             self.add(f"/{view}/{kind}", "CompressedImage", _image(image, f"{view}_camera", image_format))
+
+
+class _FoxgloveMessages(_Messages):
+    """Messages in protobuf, with the descriptors that Foxglove publishes."""
+
+    static_transforms = "/tf"
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.writer = self._writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._writer.start(profile="", library="worldline")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def add(self, topic: str, schema: _Schema, message: Message) -> None:
+        kind = _PROTOBUF[schema]
+        if schema not in self._schemas:
+            self._schemas[schema] = register_schema(self._writer, kind)
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[schema])
+        seconds, nanoseconds = divmod(self.time_ns, 10**9)
+        data = kind(timestamp={"seconds": seconds, "nanos": nanoseconds}, **message).SerializeToString()
+        self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns)
+
+
+class _Ros2Messages(_Messages):
+    """Messages in CDR, as the equivalents of sensor_msgs and tf2_msgs."""
+
+    static_transforms = STATIC_TRANSFORMS
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.writer = self._writer = Ros2Writer(stream, compression=CompressionType.ZSTD)
+        self._schemas: dict[str, Schema] = {}
+
+    def add(self, topic: str, schema: _Schema, message: Message) -> None:
+        name, converted = _ROS2[schema]
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_msgdef(name.replace("/", "/msg/"), _definition(name))
+        seconds, nanoseconds = divmod(self.time_ns, 10**9)
+        content = converted(message, {"sec": seconds, "nanosec": nanoseconds})
+        self._writer.write_message(topic, self._schemas[name], content, self.time_ns)
+
+
+_PROTOBUF: dict[_Schema, Any] = {
+    "CompressedImage": CompressedImage,
+    "CameraCalibration": CameraCalibration,
+    "FrameTransform": FrameTransform,
+    "JointStates": JointStates,
+}
 
 
 def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
@@ -168,7 +218,7 @@ def _metadata(episode: Episode, views: list[str]) -> dict[str, str]:
     return {key: json.dumps(value, sort_keys=True) for key, value in values.items()}
 
 
-def _image(frame: np.ndarray, frame_id: str, image_format: ImageFormat) -> dict[str, Any]:
+def _image(frame: np.ndarray, frame_id: str, image_format: Literal["png", "jpeg"]) -> dict[str, Any]:
     pixels = frame.astype(np.uint8) * 255 if frame.dtype == bool else cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
     done, encoded = cv2.imencode(f".{image_format}", pixels, settings)
@@ -201,13 +251,87 @@ def _transform(child: str, pose: np.ndarray) -> dict[str, Any]:
     }
 
 
+def _compressed_image(message: Message, stamp: Message) -> Message:
+    return {**_headed(message, stamp), "format": message["format"], "data": message["data"]}
+
+
+def _camera_info(message: Message, stamp: Message) -> Message:
+    same = {name: message[name] for name in ("height", "width", "distortion_model")}
+    matrices = {name.lower(): list(message[name]) for name in "DKRP"}
+    return {**_headed(message, stamp), **same, **matrices, "binning_x": 0, "binning_y": 0, "roi": {}}
+
+
+def _tf_message(message: Message, stamp: Message) -> Message:
+    transform = {name: message[name] for name in ("translation", "rotation")}
+    header = {"stamp": stamp, "frame_id": message["parent_frame_id"]}
+    return {"transforms": [{"header": header, "child_frame_id": message["child_frame_id"], "transform": transform}]}
+
+
+def _joint_state(message: Message, stamp: Message) -> Message:
+    names, positions = ([joint[field] for joint in message["joints"]] for field in ("name", "position"))
+    header = {"stamp": stamp, "frame_id": ""}
+    return {"header": header, "name": names, "position": positions, "velocity": [], "effort": []}
+
+
+def _headed(message: Message, stamp: Message) -> dict[str, Any]:
+    return {"header": {"stamp": stamp, "frame_id": message["frame_id"]}}
+
+
+_ROS2: dict[_Schema, tuple[str, Callable[[Message, Message], Message]]] = {
+    "CompressedImage": ("sensor_msgs/CompressedImage", _compressed_image),
+    "CameraCalibration": ("sensor_msgs/CameraInfo", _camera_info),
+    "FrameTransform": ("tf2_msgs/TFMessage", _tf_message),
+    "JointStates": ("sensor_msgs/JointState", _joint_state),
+}
+# Fields as ROS 2's common_interfaces and geometry2 define them, without their comments.
+_ROS2_FIELDS: dict[str, tuple[str, ...]] = {
+    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
+    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header", "string child_frame_id", "geometry_msgs/Transform transform",
+    ),
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset", "uint32 y_offset", "uint32 height", "uint32 width", "bool do_rectify",
+    ),
+    "sensor_msgs/CompressedImage": ("std_msgs/Header header", "string format", "uint8[] data"),
+    "sensor_msgs/CameraInfo": (
+        "std_msgs/Header header", "uint32 height", "uint32 width", "string distortion_model", "float64[] d",
+        "float64[9] k", "float64[9] r", "float64[12] p", "uint32 binning_x", "uint32 binning_y",
+        "sensor_msgs/RegionOfInterest roi",
+    ),
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header", "string[] name", "float64[] position", "float64[] velocity", "float64[] effort",
+    ),
+    "tf2_msgs/TFMessage": ("geometry_msgs/TransformStamped[] transforms",),
+}  # fmt: skip
+
+
+def _definition(name: str) -> str:
+    """Text of a message type: its own fields, then those of every type in them."""
+    parts: dict[str, str] = {}
+
+    def collect(found: str) -> None:
+        parts.setdefault(found, "\n".join(_ROS2_FIELDS[found]))
+        for field in _ROS2_FIELDS[found]:
+            kind = field.split()[0].split("[")[0]
+            if kind in _ROS2_FIELDS and kind not in parts:
+                collect(kind)
+
+    collect(name)
+    own, *others = parts.items()
+    return "".join([own[1], *(f"\n{'=' * 80}\nMSG: {kind}\n{fields}" for kind, fields in others)])
+
+
 def exported_episode_id(file: McapFile) -> str:
-    """The episode id that a file states.
+    """The episode id in a file's metadata.
 
     Raises: RejectedInputError (unreadable) when the file is damaged or holds no episode of this project.
     """
     with expect_layout(file.path, f"metadata {EPISODE_METADATA}"):
-        return str(_stated(file)["episode_id"])
+        return str(_read_metadata(file)["episode_id"])
 
 
 def read_exported_episode(file: McapFile) -> LoadedEpisode:
@@ -216,12 +340,12 @@ def read_exported_episode(file: McapFile) -> LoadedEpisode:
     Raises: RejectedInputError: unreadable, length_mismatch or missing_calibration where messages are missing.
     """
     file.check_sums()
-    about = _stated(file)
+    about = _read_metadata(file)
     with expect_layout(file.path, "an episode as this project writes it"):
         return _assembled(file, about)
 
 
-def _stated(file: McapFile) -> dict[str, Any]:
+def _read_metadata(file: McapFile) -> dict[str, Any]:
     if EPISODE_METADATA not in file.metadata:
         raise RejectedInputError(
             "unreadable",
@@ -232,12 +356,12 @@ def _stated(file: McapFile) -> dict[str, Any]:
         )
     where = f"{file.path}, {EPISODE_METADATA}"
     about = {key: parse_json(value, where) for key, value in file.metadata[EPISODE_METADATA].items()}
-    if about.get("format_version") not in READABLE_VERSIONS:
+    if about.get("format_version") != FORMAT_VERSION:
         raise RejectedInputError(
             "unreadable",
             "MCAP episode has another version",
             where=file.path,
-            expected=" or ".join(map(str, READABLE_VERSIONS)),
+            expected=FORMAT_VERSION,
             got=about.get("format_version"),
         )
     return about
@@ -254,7 +378,7 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
         **dict.fromkeys((f"/{view}/calibration" for view in moving), ("calibration",)),
         **dict.fromkeys((f"/{view}/{kind}" for view in views for kind in ("image", "robot_mask")), IMAGE_KINDS),
     }
-    streams = read_streams(file, roles)
+    streams = file.streams(roles)
     joints = {name: _all_of(streams, f"/joint_{name}s", num_frames, file) for name in ("state", "command")}
     images = {view: _all_of(streams, f"/{view}/image", video_frames, file) for view in views}
     masks = {view: _track(file, streams[topic]) for view in views if (topic := f"/{view}/robot_mask") in streams}
@@ -266,10 +390,10 @@ def _assembled(file: McapFile, about: Mapping[str, Any]) -> LoadedEpisode:
 
     cameras = RecordedCameras()
     for view in moving:
-        topic, frame = f"/{view}/calibration", f"{view}_camera"
+        topic = f"/{view}/calibration"
         (calibration,) = _all_of(streams, topic, 1, file).values
-        camera_poses = _poses(poses, frame, num_frames if moving[view] else 1, file)
-        add_camera(cameras, view, calibration, camera_poses, where=file.path, frame=frame, topic=topic)
+        camera_poses = _poses(poses, f"{view}_camera", num_frames if moving[view] else 1, file)
+        add_camera(cameras, view, calibration, camera_poses, where=f"{file.path}, topic {topic}")
     tools = [_poses(poses, f"tool_{arm}", num_frames, file) for arm in range(int(about["num_arms"]))]
     state, action = (
         np.array([value.position for value in joints[name].values], dtype=ARRAYS["state"].dtype)

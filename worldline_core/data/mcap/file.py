@@ -1,13 +1,15 @@
-"""One MCAP file: checked before it is unpacked, its topics, and the messages of some of them in the order of the file.
+"""One MCAP file: checked before it is unpacked, its topics, and the messages of chosen topics in the order of the file.
 
 The library trusts a chunk's header: it allocates what a zstd frame claims, and unpacks an lz4 frame to its end, up to 255
-bytes per byte. So the size of every chunk is checked first. Records (https://mcap.dev/spec): an opcode, a length of 8 bytes, then the record.
+bytes per byte. The size of every chunk is therefore checked first. Records (https://mcap.dev/spec): an opcode, a length
+of 8 bytes, then the record.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,8 +21,9 @@ import lz4.frame
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Footer, Schema
 from mcap.records import Message as Record
+from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
 from worldline_core.data.guards.rejection import MAX_CHUNK_BYTES, RejectedInputError, too_large
@@ -37,23 +40,42 @@ _DATA_END = 0x0F
 _FOOTER_BYTES = 9 + 20
 _LZ4_RATIO = 255
 # Two magics and an empty footer: in less than this the reader would look for the footer before the file's beginning.
-_SMALLEST_BYTES = 2 * 8 + 29
+_SMALLEST_BYTES = 2 * len(_MAGIC) + _FOOTER_BYTES
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """A decoded message: when it was logged, published, and by its own header made [ns] (None: it has none)."""
+@dataclass
+class Stream:
+    """Messages of one topic in the order of the file.
+
+    Attributes:
+        stamps_ns: times in the messages' headers; None where the schema has none.
+        log_ns: times at which the recorder wrote them.
+        values: decoded contents; empty for images.
+        key_frames: of a video, whether decoding can begin with a message.
+        frame: coordinate frame named by the first image.
+    """
 
     topic: str
     kind: Kind
-    log_ns: int
-    publish_ns: int
-    stamp_ns: int | None
-    value: Any
+    stamps_ns: list[int | None] = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    values: list[Any] = field(default_factory=list)
+    key_frames: list[bool] = field(default_factory=list)
+    frame: str = ""
+
+    @property
+    def has_header(self) -> bool:
+        """Whether the schema has a header time."""
+        return bool(self.stamps_ns) and self.stamps_ns[0] is not None
+
+    @property
+    def has_header_times(self) -> bool:
+        """Whether the times are set: a simulated clock is 0 once, a driver that sets none writes 0 always."""
+        return None not in self.stamps_ns and self.stamps_ns.count(0) <= 1
 
 
 class McapFile:
-    """Read access to one file; nothing is held open between calls.
+    """Read access to one file, which is open only while it is read.
 
     Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, not finished).
     """
@@ -65,9 +87,9 @@ class McapFile:
 
     @cached_property
     def _summary(self) -> Summary | None:
-        """None where the file is complete but has no summary; then it is read from the beginning."""
+        """None for a complete file without a summary, which is then read from its beginning."""
         chunks = check_chunks(regular_file(self.path, "MCAP file"), self.path)
-        with self._opened(indexed=True) as reader:
+        with self._reader(indexed=True) as reader:
             summary = reader.get_summary()
             indexed = [] if summary is None else [index.chunk_start_offset for index in summary.chunk_indexes]
             if len(set(indexed)) < len(indexed) or not set(indexed) <= set(chunks):
@@ -75,30 +97,25 @@ class McapFile:
             return summary
 
     def check_sums(self) -> None:
-        """Compare the whole file with the sums of its data and summary that it states (0: it states none).
+        """Compares the whole file with the checksums of its data and its summary (0: none).
 
         Raises: RejectedInputError (unreadable) where a byte differs.
         """
         path = regular_file(self.path, "MCAP file")
-        size, end = path.stat().st_size, _data_end(path)
-        with _undamaged(self.path), path.open("rb") as stream:
-            data = _sum(stream, 0, end)
-            stated = struct.unpack("<BQI", stream.read(13))[2]
-            if stated not in (0, data):
-                raise ValueError("data that do not give their sum")
-            stream.seek(size - len(_MAGIC) - _FOOTER_BYTES)
-            start, _, stated = struct.unpack("<9xQQI", stream.read(_FOOTER_BYTES))
-            if stated not in (0, _sum(stream, start or size - len(_MAGIC) - _FOOTER_BYTES, size - len(_MAGIC) - 4)):
-                raise ValueError("a summary that does not give its sum")
-
-    @property
-    def _indexed(self) -> bool:
-        return self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
+        with _damage_as_rejection(self.path), path.open("rb") as stream:
+            reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES)
+            (footer,) = deque(reader.records, maxlen=1)
+            if not isinstance(footer, Footer):
+                raise ValueError("no footer at the end")
+            end = path.stat().st_size - len(_MAGIC)
+            stream.seek(footer.summary_start or end - _FOOTER_BYTES)
+            if footer.summary_crc not in (0, zlib.crc32(stream.read(end - 4 - stream.tell()))):
+                raise ValueError("a summary that does not fit its checksum")
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name; of several of one name the last."""
-        with self._opened(indexed=self._indexed) as reader:
+        """Metadata records by name; the last one where a name is repeated."""
+        with self._reader() as reader:
             return {record.name: record.metadata for record in reader.iter_metadata()}
 
     @cached_property
@@ -129,7 +146,7 @@ class McapFile:
         return first
 
     def check_topics(self, wanted: Collection[str]) -> None:
-        """Raises: RejectedInputError (missing_topic) naming what is missing and what is there."""
+        """Raises: RejectedInputError (missing_topic) listing the missing topics and those in the file."""
         missing = sorted(set(wanted) - set(self.topics))
         if missing:
             raise RejectedInputError(
@@ -143,19 +160,49 @@ class McapFile:
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[Received]:
-        """Decoded messages of these topics with start <= log time < stop, in the order of the file.
+    ) -> Iterator[tuple[str, Kind, int, int | None, Any]]:
+        """(topic, kind, log time, header time or None, content) of these topics' messages with start <= log time < stop.
 
         Raises: RejectedInputError: unknown_schema, unreadable.
         """
         for schema, channel, record in self._records(topics, start_ns, stop_ns):
             kind, stamp_ns, value = self._decoder.decode(channel, schema, record.data)
-            yield Received(channel.topic, kind, record.log_time, record.publish_time, stamp_ns, value)
+            yield channel.topic, kind, record.log_time, stamp_ns, value
+
+    def streams(
+        self, roles: Mapping[str, tuple[Kind, ...]], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> dict[str, Stream]:
+        """Messages with start <= log time < stop by topic, for the topics of `roles` (topic -> accepted kinds).
+
+        Raises: RejectedInputError: unknown_schema for a topic with messages of another kind, or of several; unreadable.
+        """
+        streams: dict[str, Stream] = {}
+        for topic, kind, log_ns, stamp_ns, value in self.messages(roles, start_ns, stop_ns):
+            expected = (streams[topic].kind,) if topic in streams else roles[topic]
+            if kind not in expected:
+                raise RejectedInputError(
+                    "unknown_schema",
+                    "Topic has messages of another kind than its role or its first message",
+                    where=f"{self.path}, topic {topic}",
+                    expected=" or ".join(expected),
+                    got=f"{kind} ({self.topics.get(topic, '')})",
+                    next_step="correct the topics in curate.sources[]",
+                )
+            stream = streams.setdefault(topic, Stream(topic, kind))
+            stream.log_ns.append(log_ns)
+            stream.stamps_ns.append(stamp_ns)
+            if kind not in IMAGE_KINDS:
+                stream.values.append(value)
+                continue
+            stream.frame = stream.frame or value.frame
+            if kind == "video":
+                stream.key_frames.append(value.is_key_frame)
+        return streams
 
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Schema | None, Channel, Record]]:
-        with self._opened(indexed=self._indexed) as reader:
+        with self._reader() as reader:
             # Not in order of log time: the reader would hold all chunks that overlap in time.
             yield from reader.iter_messages(
                 None if topics is None else list(topics),
@@ -165,9 +212,12 @@ class McapFile:
             )
 
     @contextmanager
-    def _opened(self, *, indexed: bool) -> Iterator[McapReader]:
+    def _reader(self, *, indexed: bool | None = None) -> Iterator[McapReader]:
+        """A reader of the open file, by its index where the summary has one."""
+        if indexed is None:
+            indexed = self._summary is not None and bool(self._summary.chunk_indexes and self._summary.channels)
         path = regular_file(self.path, "MCAP file")
-        with _undamaged(self.path), path.open("rb") as stream:
+        with _damage_as_rejection(self.path), path.open("rb") as stream:
             if path.stat().st_size < _SMALLEST_BYTES:
                 raise EOFError(f"{path.stat().st_size} bytes")
             kind = SeekingReader if indexed else NonSeekingReader
@@ -175,7 +225,7 @@ class McapFile:
 
 
 @contextmanager
-def _undamaged(where: object) -> Iterator[None]:
+def _damage_as_rejection(where: object) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
@@ -189,80 +239,13 @@ def _undamaged(where: object) -> Iterator[None]:
         ) from error
 
 
-@dataclass
-class Stream:
-    """Messages of one topic in the order of the file.
-
-    Attributes:
-        stamps_ns: times that the messages state; None where the schema has none.
-        values: what they say; empty for images.
-        key_frames: of a video, whether decoding can begin with a message.
-        frame: the frame that the first message names, of images.
-    """
-
-    topic: str
-    kind: Kind
-    stamps_ns: list[int | None] = field(default_factory=list)
-    log_ns: list[int] = field(default_factory=list)
-    publish_ns: list[int] = field(default_factory=list)
-    values: list[Any] = field(default_factory=list)
-    key_frames: list[bool] = field(default_factory=list)
-    frame: str = ""
-
-    def add(self, received: Received) -> None:
-        self.stamps_ns.append(received.stamp_ns)
-        self.log_ns.append(received.log_ns)
-        self.publish_ns.append(received.publish_ns)
-        if self.kind not in IMAGE_KINDS:
-            self.values.append(received.value)
-            return
-        self.frame = self.frame or received.value.frame
-        if self.kind == "video":
-            self.key_frames.append(received.value.is_key_frame)
-
-    @property
-    def headed(self) -> bool:
-        """Whether the messages state their own time."""
-        return bool(self.stamps_ns) and self.stamps_ns[0] is not None
-
-    @property
-    def stamped(self) -> bool:
-        """Whether these times are set: a simulated clock begins at 0 once, a driver that sets none writes it always."""
-        return None not in self.stamps_ns and self.stamps_ns.count(0) <= 1
-
-
-def read_streams(
-    file: McapFile, roles: Mapping[str, tuple[Kind, ...]], start_ns: int | None = None, stop_ns: int | None = None
-) -> dict[str, Stream]:
-    """All messages of the topics of `roles` (topic -> kinds that it may be of) with start <= log time < stop, by topic.
-
-    Raises: RejectedInputError: unknown_schema for a topic that is of none of the kinds its role needs, or of several;
-        unreadable.
-    """
-    streams: dict[str, Stream] = {}
-    for received in file.messages(roles, start_ns, stop_ns):
-        topic, kind = received.topic, received.kind
-        expected = (streams[topic].kind,) if topic in streams else roles[topic]
-        if kind not in expected:
-            raise RejectedInputError(
-                "unknown_schema",
-                "Topic has messages of another kind than its role or its first message",
-                where=f"{file.path}, topic {topic}",
-                expected=" or ".join(expected),
-                got=f"{kind} ({file.topics.get(topic, '')})",
-                next_step="correct the topics in curate.sources[]",
-            )
-        streams.setdefault(topic, Stream(topic, kind)).add(received)
-    return streams
-
-
 def check_chunks(path: Path, where: object) -> list[int]:
-    """Where the chunks of the data section begin; none of them unpacks to too much.
+    """Offsets of the chunks of the data section, none of which unpacks to more than MAX_CHUNK_BYTES.
 
-    Raises: RejectedInputError: too_large, or unreadable for what is no MCAP file or breaks off, or has chunks elsewhere.
+    Raises: RejectedInputError: too_large; unreadable for what is no MCAP file, breaks off, or has chunks after its data.
     """
     size, chunks, ended = path.stat().st_size, list[int](), False
-    with _undamaged(where), path.open("rb") as stream:
+    with _damage_as_rejection(where), path.open("rb") as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
             raise ValueError("another beginning than that of an MCAP file")
         position = len(_MAGIC)
@@ -285,29 +268,8 @@ def check_chunks(path: Path, where: object) -> list[int]:
     return chunks
 
 
-def _data_end(path: Path) -> int:
-    """Where the record stands that ends the data of a file whose records `check_chunks` has gone through."""
-    with path.open("rb") as stream:
-        position = len(_MAGIC)
-        while True:
-            stream.seek(position)
-            opcode, length = struct.unpack("<BQ", stream.read(9))
-            if opcode == _DATA_END:
-                return position
-            position += 9 + length
-
-
-def _sum(stream: BinaryIO, start: int, stop: int) -> int:
-    """CRC-32 of the bytes start..stop (exclusive), behind which the stream then stands."""
-    stream.seek(start)
-    found, left = 0, stop - start
-    while left > 0 and (block := stream.read(min(left, 1 << 20))):
-        found, left = zlib.crc32(block, found), left - len(block)
-    return found
-
-
 def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
-    """Bytes that the chunk of this length, which begins here, unpacks to: the larger of what its header and its frame say.
+    """Size that the chunk record at the stream's position unpacks to: the larger of its header's and its frame's claim.
 
     Raises: ValueError, or what the decompressors raise, for a damaged chunk.
     """
@@ -319,9 +281,9 @@ def _unpacked_bytes(stream: BinaryIO, length: int) -> int:
     if packed_length > length:
         raise ValueError(f"a chunk of {packed_length} bytes in a record of {length}")
     if compression == b"zstd":
-        return max(declared, zstandard.frame_content_size(stream.read(min(packed_length, 32))))  # -1: not stated
+        return max(declared, zstandard.frame_content_size(stream.read(min(packed_length, 32))))  # -1: unknown
     if compression == b"lz4" and packed_length * _LZ4_RATIO > MAX_CHUNK_BYTES >= declared:
-        # An lz4 frame may unpack to more than it states; only a frame of this length can unpack to too much.
+        # An lz4 frame may unpack to more than it declares; only a frame of this length can unpack to too much.
         frame = lz4.frame.LZ4FrameDecompressor().decompress(stream.read(packed_length), max_length=MAX_CHUNK_BYTES + 1)
         return max(declared, len(frame))
     return declared

@@ -1,6 +1,6 @@
 """Images of a topic: read from the file in order of time, each decoded only when an instant needs it.
 
-Memory holds the images that lie out of order in the file, and one decoded image; never all of an episode.
+Memory holds one decoded image and those that are out of order in the file, never a whole episode.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 @dataclass(frozen=True)
 class ImageTrack:
-    """Which images of a topic are which frames of a view.
+    """Frames of a view as images of a topic.
 
     Attributes:
         around_ns: log times between which the topic's messages were counted; None: the file's beginning or end.
-        order: (n,) index, in the order of the file, of the message that is i-th in time.
-        chosen: (t,) index, in order of time, of the image of each frame; ascending, an image may repeat.
+        order: (n,) index in the file of the i-th message in time.
+        chosen: (t,) index in time of each frame's image; ascending, an image may repeat.
         key_frames: of a video, (n,) in order of time, whether decoding can begin there.
-        camera: whose calibrated size the images must have; None: any size.
+        camera: the images must have its calibrated size; None: any size.
     """
 
     file: McapFile
@@ -66,7 +66,7 @@ class ImageTrack:
         if self.camera is not None and shape[:2] != (self.camera.height, self.camera.width):
             raise RejectedInputError(
                 "missing_calibration",
-                "Calibration is of another image size",
+                "Calibration belongs to another image size",
                 where=f"{where}, view {self.camera.view}",
                 expected=f"{shape[1]}x{shape[0]}",
                 got=f"{self.camera.width}x{self.camera.height}",
@@ -110,15 +110,15 @@ class ImageTrack:
             raise _lost_frame(where, None)
 
     def _in_time(self, numbers: np.ndarray) -> Iterator[tuple[int, Any]]:
-        """(place in time, what the message says) for these places, ascending."""
+        """(index in time, content) of the messages with these indices, ascending."""
         place = {int(message): number for number, message in enumerate(self.order)}
         waiting: dict[int, Any] = {}
         wanted = [int(number) for number in numbers]
         needed, done = set(wanted), 0
-        for message, received in enumerate(self.file.messages([self.topic], *self.around_ns)):
+        for message, (*_, value) in enumerate(self.file.messages([self.topic], *self.around_ns)):
             number = place.get(message, -1)
             if number in needed:
-                waiting[number] = received.value
+                waiting[number] = value
             while done < len(wanted) and wanted[done] in waiting:
                 yield wanted[done], waiting.pop(wanted[done])
                 done += 1
@@ -133,11 +133,11 @@ class ImageTrack:
         )
 
 
-def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
+def frames_after_loss(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray) -> np.ndarray:
     """(n,) bool: video frames between a gap of more than 1.5 steps and the next key frame.
 
-    After a lost message a decoder raises no error and shows wrong pictures until the next key frame, so the loss is detected
-    from the times of the messages.
+    After a lost message a decoder returns wrong pictures, without an error, until the next key frame; so the loss is detected
+    by the times of the messages.
     """
     lost = np.concatenate([[False], np.diff(times_ns) > 1.5 * step_ns])
     last_loss = np.maximum.accumulate(np.where(lost, np.arange(len(lost)), -1))
@@ -146,7 +146,7 @@ def spoiled_frames(times_ns: np.ndarray, step_ns: float, key_frames: np.ndarray)
 
 
 def _decoded(messages: Iterator[tuple[int, EncodedImage]], where: str) -> Iterator[tuple[int, np.ndarray]]:
-    """(place in time, RGB) of video messages, each one frame in Annex B.
+    """(index in time, RGB) of video messages, each one frame in Annex B.
 
     Raises: RejectedInputError: unknown_schema for another codec, truncated_video for data that does not decode.
     """
@@ -205,7 +205,7 @@ def _raw_pixels(image: RawImage, where: str) -> np.ndarray:
     if image.step < image.width * channels or len(image.data) != image.step * image.height:
         raise RejectedInputError(
             "unreadable",
-            "Image has another number of bytes than it states",
+            "Image has another number of bytes than its size",
             where=where,
             expected=f"{image.height} rows of {image.step} bytes, at least {image.width * channels} each",
             got=f"{len(image.data)} bytes",

@@ -1,7 +1,7 @@
-"""What messages of ROS 2 and Foxglove schemas say, whatever they are encoded in (CDR, protobuf, JSON).
+"""Contents of messages of ROS 2 and Foxglove schemas, in any of their encodings (CDR, protobuf, JSON).
 
-A message is decoded into an object by the schema that the file itself holds; its fields are then read into the classes of
-this module.
+A message is decoded into an object by the schema that the file holds; its fields are then read into the classes of this
+module.
 """
 
 from __future__ import annotations
@@ -47,14 +47,13 @@ SCHEMA_KINDS: dict[str, Kind] = {
     "foxglove.FrameTransforms": "transforms",
     "foxglove.PoseInFrame": "pose",
     "foxglove.JointStates": "joints",
-    "worldline.JointStates": "joints",
 }
-"""Schema, without `/msg`, of every message that is understood; Foxglove's may also come as `foxglove_msgs`."""
+"""Schemas that can be read, without `/msg`; Foxglove's may also come as `foxglove_msgs`."""
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedImage:
-    """A JPEG or PNG image, or one frame of a video in Annex B; `format` as the message states it."""
+    """A JPEG or PNG image, or one frame of a video in Annex B; `format` as in the message."""
 
     frame: str
     data: bytes
@@ -64,7 +63,7 @@ class EncodedImage:
     def is_key_frame(self) -> bool:
         """Whether decoding can begin with this frame: an IDR picture (H.264), or any random access point (H.265).
 
-        Looks at the first picture's NAL unit only; parameter sets before it do not count (ITU-T H.264 and H.265, 7.4).
+        The first picture's NAL unit decides, not the parameter sets before it (ITU-T H.264 and H.265, 7.4).
         """
         position = 0
         while (position := self.data.find(b"\x00\x00\x01", position)) >= 0 and position + 3 < len(self.data):
@@ -110,7 +109,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Joints:
-    """Readings by joint; a field that a message leaves empty is empty here."""
+    """Readings by joint; a field may be empty."""
 
     names: tuple[str, ...]
     position: tuple[float, ...]
@@ -120,34 +119,25 @@ class Joints:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of `child` in `parent` [m], quaternion xyzw; the time is its own."""
+    """Pose of `child` in `parent`: x, y, z [m], qx, qy, qz, qw. A message of a single pose names no child."""
 
     parent: str
     child: str
     stamp_ns: int
     values: tuple[float, ...]
-    """x, y, z, qx, qy, qz, qw."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """x, y, z [m], qx, qy, qz, qw in `frame`."""
-
-    frame: str
-    values: tuple[float, ...]
-
-
-def _first_of(raw: Any, *names: str) -> Any:
-    """The first of these fields that the message has: ROS 2, protobuf and JSON spell some of them differently."""
+def _field(raw: Any, *names: str) -> Any:
+    """The first of these fields that the message has; ROS 2, protobuf and JSON spell some of them differently."""
     return getattr(raw, next((name for name in names if hasattr(raw, name)), names[0]))
 
 
 def _nanoseconds(time: Any) -> int:
-    return int(_first_of(time, "sec", "seconds")) * 10**9 + int(_first_of(time, "nanosec", "nsec", "nanos"))
+    return int(_field(time, "sec", "seconds")) * 10**9 + int(_field(time, "nanosec", "nsec", "nanos"))
 
 
-def _stated_time(raw: Any) -> int | None:
-    """Header time [ns]; None where the schema has none."""
+def _header_time(raw: Any) -> int | None:
+    """[ns]; None where the schema has none."""
     if hasattr(raw, "header"):
         return _nanoseconds(raw.header.stamp)
     return _nanoseconds(raw.timestamp) if hasattr(raw, "timestamp") else None
@@ -179,7 +169,7 @@ def _calibration(raw: Any) -> Calibration:
     if hasattr(raw, "binning_x"):
         binning, region = (int(raw.binning_x), int(raw.binning_y)), raw.roi
         roi = int(region.x_offset), int(region.y_offset), int(region.width), int(region.height)
-    D, K, P = (_numbers(_first_of(raw, name, name.lower())) for name in "DKP")
+    D, K, P = (_numbers(_field(raw, name, name.lower())) for name in "DKP")
     return Calibration(_frame(raw), int(raw.width), int(raw.height), str(raw.distortion_model), D, K, P, binning, roi)
 
 
@@ -187,7 +177,7 @@ def _joints(raw: Any) -> Joints:
     if not hasattr(raw, "joints"):
         velocity, effort = (_numbers(getattr(raw, field, ())) for field in ("velocity", "effort"))
         return Joints(tuple(str(name) for name in raw.name), _numbers(raw.position), velocity, effort)
-    joints = list(raw.joints)  # foxglove.JointStates: one record per joint, its readings optional
+    joints = list(raw.joints)  # foxglove.JointStates: a record for each joint, with optional readings
     position, velocity, effort = (
         tuple(float(getattr(joint, field)) if _is_set(joint, field) else float("nan") for joint in joints)
         for field in ("position", "velocity", "effort")
@@ -196,7 +186,7 @@ def _joints(raw: Any) -> Joints:
 
 
 def _is_set(raw: Any, name: str) -> bool:
-    """Whether an optional field has a value; protobuf shows an unset number as 0."""
+    """Whether an optional field has a value; protobuf returns 0 for an unset number."""
     return bool(raw.HasField(name)) if hasattr(raw, "HasField") else hasattr(raw, name)
 
 
@@ -216,6 +206,11 @@ def _transform(raw: Any) -> Transform:
     return Transform(str(parent).lstrip("/"), str(raw.child_frame_id).lstrip("/"), _nanoseconds(stamp), values)
 
 
+def _pose(raw: Any) -> Transform:
+    values = _pose_values(raw.pose.position, raw.pose.orientation)
+    return Transform(_frame(raw).lstrip("/"), "", _header_time(raw) or 0, values)
+
+
 def _marker(raw: Any) -> str:
     return str(raw.data).lower() if isinstance(raw.data, bool) else str(raw.data)
 
@@ -228,13 +223,13 @@ _READERS: dict[Kind, Callable[[Any], Any]] = {
     "joints": _joints,
     "numbers": lambda raw: _numbers(raw.data),
     "transforms": lambda raw: tuple(map(_transform, raw.transforms if hasattr(raw, "transforms") else [raw])),
-    "pose": lambda raw: Pose(_frame(raw).lstrip("/"), _pose_values(raw.pose.position, raw.pose.orientation)),
+    "pose": _pose,
     "marker": _marker,
 }
 
 
 def _as_object(value: Any) -> Any:
-    """Parsed JSON with mappings as objects, whose fields are read like those of the other encodings."""
+    """Parsed JSON with mappings as objects, to be read like the other encodings."""
     if isinstance(value, dict):
         return SimpleNamespace(**{name: _as_object(field) for name, field in value.items()})
     return [_as_object(item) for item in value] if isinstance(value, list) else value
@@ -255,7 +250,7 @@ class MessageDecoder:
         self._channels: dict[int, tuple[Kind, Callable[[bytes], Any]]] = {}
 
     def decode(self, channel: Channel, schema: Schema | None, data: bytes) -> tuple[Kind, int | None, Any]:
-        """Kind of a message, the time that it states itself [ns] (None: its schema has no place for one), what it says.
+        """Kind of a message, its header time [ns] (None where the schema has none), and its content.
 
         Raises: RejectedInputError: unknown_schema; unreadable where the bytes are not of the schema.
         """
@@ -264,7 +259,7 @@ class MessageDecoder:
         kind, decode = self._channels[channel.id]
         try:
             raw = decode(data)
-            return kind, _stated_time(raw), _READERS[kind](raw)
+            return kind, _header_time(raw), _READERS[kind](raw)
         except _FAULTS as error:
             raise RejectedInputError(
                 "unreadable",

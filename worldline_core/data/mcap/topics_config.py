@@ -1,4 +1,4 @@
-"""What the user says about MCAP recordings: which topic is which view, joint, command, frame; what may be missing."""
+"""Declaration of an MCAP recording: which topic is which view, joint, command and frame, and what may be missing."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class TimeRanges(StrictModel):
 
 
 class Markers(StrictModel):
-    """Episodes lie between messages of a topic (std_msgs String or Bool, whose values are the texts true and false)."""
+    """Episodes between messages of a topic (std_msgs String or Bool, read as the texts true and false)."""
 
     by: Literal["markers"] = "markers"
     topic: str
@@ -154,7 +154,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     static_transforms: tuple[str, ...] = Field(default=("/tf_static",), description="topics of transforms that stay")
     episodes: Annotated[WholeFiles | TimeRanges | Markers, Field(discriminator="by")] = WholeFiles()
     instruction: str = ""
-    time: Literal["header", "log", "publish"] = Field(
+    time: Literal["header", "log"] = Field(
         default="header", description="which time of a message counts; messages without a header: their log time"
     )
     time_offsets_ms: dict[str, float] = Field(
@@ -168,9 +168,6 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
     max_gap_s: float = Field(default=0.2, gt=0, description="largest interval between joint readings or transforms")
     max_trim_s: float = Field(
         default=1.0, ge=0, description="how much later a topic may begin, or earlier end, than the others"
-    )
-    max_disorder_s: float = Field(
-        default=1.0, gt=0, description="how late a message may come; more is a clock set back"
     )
     max_clock_skew_ms: float = Field(
         default=200.0,
@@ -205,7 +202,7 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         return self
 
     def offset_ns(self, topic: str) -> int:
-        """What is added to a topic's header times."""
+        """Correction added to a topic's header times [ns]."""
         return round(self.time_offsets_ms.get(topic, 0.0) * 1e6)
 
     @property
@@ -214,13 +211,18 @@ class McapTopicsSourceConfig(ForeignSourceConfig):
         return self.primary_view or ("head" if "head" in self.views else next(iter(self.views)))
 
     @property
+    def readings(self) -> list[TopicReadings]:
+        """Joints and grippers of all arms, measured and commanded."""
+        both = [each for arm in self.arms for each in (arm.state, arm.command) if each is not None]
+        return [readings for each in both for readings in (each.joints, each.gripper)]
+
+    @property
     def topics(self) -> dict[str, set[str]]:
         """Declared topics by what they are expected to hold."""
-        readings = [each for arm in self.arms for each in (arm.state, arm.command) if each is not None]
         return {
             "images": {view.image for view in self.views.values()},
             "calibrations": {view.calibration for view in self.views.values() if view.calibration is not None},
-            "readings": {topic for each in readings for topic in (each.joints.topic, each.gripper.topic)},
+            "readings": {readings.topic for readings in self.readings},
             "tool poses": {arm.tool_pose for arm in self.arms if arm.tool_pose is not None},
             "transforms": {*self.transforms, *self.static_transforms},
         }

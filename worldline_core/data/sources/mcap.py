@@ -2,8 +2,8 @@
 
 Of the latter, topics are declared (`McapTopicsSourceConfig`), nothing is guessed, and the recording is brought to a fixed
 rate: every instant gets the nearest image of each view, joints and poses between their neighbours, transforms by slerp.
-How far off in time that is, what was out of order, lost or timed by another clock is written into the episode's
-conventions. See docs/mcap.md.
+How far off in time that is, and what was lost or timed by another clock, is written into the episode's conventions. See
+docs/mcap.md.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
+from operator import itemgetter
 from typing import Literal
 
 from worldline_core.data.episodes.source import LoadedEpisode, SourceConfigBase
@@ -18,7 +19,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
 from worldline_core.data.mcap.exported import exported_episode_id, read_exported_episode
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.data.mcap.topics import Segment, read_topics_episode
+from worldline_core.data.mcap.recording import Segment, read_topics_episode
 from worldline_core.data.mcap.topics_config import Markers, McapTopicsSourceConfig, TimeRanges, WholeFiles
 from worldline_core.errors import DataError
 
@@ -128,12 +129,10 @@ def _segments(rule: WholeFiles | TimeRanges | Markers, file: McapFile | None, re
 def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
     """Start to stop; a start without a stop, or the reverse, is an episode that cannot be read."""
     file.check_topics([rule.topic])
-    found = [message for message in file.messages([rule.topic]) if message.kind == "marker"]
-    found.sort(key=lambda message: message.log_ns)
+    markers = [(log_ns, str(text)) for _, kind, log_ns, _, text in file.messages([rule.topic]) if kind == "marker"]
     begun: tuple[int, re.Match[str]] | None = None
     count = 0
-    for message in found:
-        text = str(message.value)
+    for log_ns, text in sorted(markers, key=itemgetter(0)):
         start, stop = re.fullmatch(rule.start, text), re.fullmatch(rule.stop, text)
         if start is None and stop is None:
             continue
@@ -142,12 +141,12 @@ def _between_markers(rule: Markers, file: McapFile) -> Iterator[Segment]:
             count += 1
             begun = None
         if start is not None:
-            begun = message.log_ns, start
+            begun = log_ns, start
         elif stop is not None and begun is not None:
             instruction = begun[1].groupdict().get("instruction")
             outcome = stop.groupdict().get("outcome")
             known = outcome if outcome in ("success", "failure") else None
-            yield Segment(f"{count:04d}", begun[0], message.log_ns, instruction=instruction, outcome=known)
+            yield Segment(f"{count:04d}", begun[0], log_ns, instruction=instruction, outcome=known)
             count, begun = count + 1, None
     if begun is not None:
         yield _unpaired(rule, file, count, "the end of the file")

@@ -1,0 +1,459 @@
+"""One episode of another tool's MCAP recording: declared topics read, checked, and brought to instants of a fixed rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Episode, Outcome
+from worldline_core.data.episodes.recorded_poses import RecordedCameras
+from worldline_core.data.episodes.source import LoadedEpisode
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.mcap.file import McapFile, Stream
+from worldline_core.data.mcap.images import ImageTrack, frames_after_loss
+from worldline_core.data.mcap.messages import IMAGE_KINDS, Calibration, Joints, Kind
+from worldline_core.data.mcap.timing import (
+    Arrivals,
+    Clocks,
+    check_gaps,
+    in_order,
+    instants,
+    largest_distance_ms,
+    nearest,
+    resampled,
+    resampled_poses,
+)
+from worldline_core.data.mcap.topics_config import ArmReadings, McapTopicsSourceConfig, TopicReadings
+from worldline_core.data.mcap.transforms import TransformTree, add_camera, checked_poses
+
+LAYOUT = "mcap topics"
+_KINDS: dict[str, tuple[Kind, ...]] = {
+    "images": IMAGE_KINDS,
+    "calibrations": ("calibration",),
+    "readings": ("joints", "numbers"),
+    "tool poses": ("pose",),
+    "transforms": ("transforms",),
+}
+_READING_MARGIN_NS = 10**9
+"""Messages logged up to this long before and after an episode are read too: their own time may lie within it, and the instants at
+its ends need a message on both sides."""
+_TOGETHER_NS = 1_000_000
+"""Topics that begin within a millisecond begin together: no image is left out for that."""
+_FIXED_TOLERANCE = 1e-6
+"""A camera is fixed if no entry of its pose moves by more [m, or entries of R]."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """An episode inside of a file.
+
+    Attributes:
+        name: distinguishes it from others of the file; empty for a whole file.
+        start_ns, stop_ns: log times; None: from the beginning, to the end.
+        relative: the times count from the file's first message.
+        fault: why it cannot be read, where that is known already.
+    """
+
+    name: str = ""
+    start_ns: int | None = None
+    stop_ns: int | None = None
+    relative: bool = False
+    instruction: str | None = None
+    outcome: Outcome | None = None
+    fault: RejectedInputError | None = None
+
+    def log_times(self, file: McapFile) -> tuple[int | None, int | None]:
+        """First and last log time [ns]."""
+        if not self.relative:
+            return self.start_ns, self.stop_ns
+        first = file.first_log_ns
+        return first + (self.start_ns or 0), None if self.stop_ns is None else first + self.stop_ns
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """Measurements of a topic in order of time, (n, d)."""
+
+    topic: str
+    arrivals: Arrivals
+    values: np.ndarray
+
+    @property
+    def times_ns(self) -> np.ndarray:
+        return self.arrivals.times_ns
+
+
+class _Recording:
+    """Topics of one episode, before resampling.
+
+    Raises: RejectedInputError with the reason.
+    """
+
+    def __init__(self, config: McapTopicsSourceConfig, file: McapFile, segment: Segment) -> None:
+        self.config, self.file = config, file
+        start, stop = segment.log_times(file)
+        self.start_log_ns = start
+        self.around_ns = (
+            None if start is None else max(start - _READING_MARGIN_NS, 0),
+            None if stop is None else stop + _READING_MARGIN_NS,
+        )
+        self.streams = self._read_streams()
+        self.clocks = clocks = Clocks.from_streams(config, self.streams, file.path)
+        self.start_ns, self.stop_ns = (None if t is None else t - clocks.header_to_log_ns for t in (start, stop))
+        self.signals = {readings: self._signal(readings) for readings in config.readings}
+        self.tools: dict[str, _Signal] = {}
+        self.tool_frames: dict[str, str] = {}
+        """By arm: the frame of its recorded poses or, without them, the tool itself."""
+        for arm in config.arms:
+            if arm.tool_frame is not None:
+                self.tool_frames[arm.name] = arm.tool_frame.lstrip("/")
+            elif arm.tool_pose is not None:
+                self.tools[arm.name], self.tool_frames[arm.name] = self._tool(arm.tool_pose)
+        self.images = {
+            view: in_order(clocks.times_ns(self.streams[each.image]), self.at(each.image))
+            for view, each in config.views.items()
+        }
+        read = {view: self._calibration(each.calibration) for view, each in config.views.items() if each.calibration}
+        self.calibrations = read
+        self.camera_frames = {
+            view: (config.views[view].frame or read[view].frame or self.streams[config.views[view].image].frame)
+            .lstrip("/")
+            for view in read
+        }  # fmt: skip
+        self.tree = self._transforms([*self.camera_frames.values(), *self.tool_frames.values()])
+
+    def at(self, topic: str) -> str:
+        return f"{self.file.path}, topic {topic}"
+
+    def _read_streams(self) -> dict[str, Stream]:
+        """Every topic that the episode needs; a missing transform is reported where a pose needs it.
+
+        Raises: RejectedInputError (missing_topic) for one that is not in the file, or silent during the episode.
+        """
+        topics = self.config.topics
+        roles: dict[str, tuple[Kind, ...]] = {
+            topic: kinds for role, kinds in _KINDS.items() if role != "transforms" for topic in sorted(topics[role])
+        }
+        self.file.check_topics(roles)
+        needed = set(roles) - topics["calibrations"]
+        roles |= {topic: _KINDS["transforms"] for topic in self.config.transforms if topic in self.file.topics}
+        streams = self.file.streams(roles, *self.around_ns)
+        silent = sorted(needed - set(streams))
+        if silent:
+            counts = ", ".join(f"{topic}: {len(stream.log_ns)}" for topic, stream in sorted(streams.items()))
+            raise RejectedInputError(
+                "missing_topic",
+                "A topic has no messages during the episode",
+                where=self.file.path,
+                expected=", ".join(silent),
+                got=counts or "no messages",
+            )
+        return streams
+
+    def _signal(self, readings: TopicReadings) -> _Signal:
+        """The declared numbers of a topic; messages with other joints (several drivers may share it) are left out.
+
+        Raises: RejectedInputError: missing_column where no message has the joints or columns; clock_jump.
+        """
+        stream = self.streams[readings.topic]
+        taken: list[int] = []
+        rows: list[list[float]] = []
+        for number, value in enumerate(stream.values):
+            if not isinstance(value, Joints):
+                columns, numbers = readings.columns, value
+            elif readings.names is not None and set(readings.names) <= set(value.names):
+                columns, numbers = [value.names.index(name) for name in readings.names], getattr(value, readings.field)
+            else:
+                columns, numbers = None, ()
+            if columns is not None and max(columns) < len(numbers):
+                taken.append(number)
+                rows.append([numbers[column] for column in columns])
+        if not rows:
+            raise self._missing(stream, readings)
+        arrivals = in_order(self.clocks.times_ns(stream)[taken], self.at(stream.topic))
+        return _Signal(stream.topic, arrivals, np.array(rows, np.float64)[arrivals.order])
+
+    def _missing(self, stream: Stream, readings: TopicReadings) -> RejectedInputError:
+        first = stream.values[0]
+        if isinstance(first, Joints):
+            known = sorted({name for value in stream.values for name in value.names})
+            got = f"joints {', '.join(known)}; {len(getattr(first, readings.field))} {readings.field} values"
+        else:
+            got = f"{len(first)} columns"
+        wanted = readings.names if readings.names is not None else tuple(map(str, readings.columns or ()))
+        return RejectedInputError(
+            "missing_column",
+            "No message of a topic has the declared joints or columns",
+            where=self.at(stream.topic),
+            expected=f"{readings.field} of {', '.join(wanted)}",
+            got=got,
+        )
+
+    def _tool(self, topic: str) -> tuple[_Signal, str]:
+        """Poses (n, 7) of a topic, and the frame that they are given in.
+
+        Raises: RejectedInputError: invalid_tool_pose, clock_jump.
+        """
+        stream = self.streams[topic]
+        values = checked_poses([pose.values for pose in stream.values], "invalid_tool_pose", self.at(topic))
+        frames = sorted({pose.parent for pose in stream.values})
+        if len(frames) != 1:
+            got = ", ".join(frames)
+            raise RejectedInputError(
+                "invalid_tool_pose", "Tool poses change their frame", where=self.at(topic), expected="one", got=got
+            )
+        arrivals = in_order(self.clocks.times_ns(stream), self.at(topic))
+        return _Signal(topic, arrivals, values[arrivals.order]), frames[0]
+
+    def _calibration(self, topic: str) -> Calibration:
+        """The calibration around the episode, or in the whole file where it was sent only once.
+
+        Raises: RejectedInputError: missing_calibration; changing_calibration when messages differ: a zoom, or two cameras
+            on one topic.
+        """
+        if topic in self.streams:
+            values = self.streams[topic].values
+        else:
+            values = [value for _, kind, _, _, value in self.file.messages([topic]) if kind == "calibration"]
+        if not values:
+            raise RejectedInputError("missing_calibration", "Calibration topic has no messages", where=self.at(topic))
+        first = values[0]
+        different = next((value for value in values if value != first), None)
+        if different is not None:
+            raise RejectedInputError(
+                "changing_calibration",
+                "Calibration changes during the recording",
+                where=self.at(topic),
+                expected=f"K {list(first.K)}, D {list(first.D)} of {first.width}x{first.height}",
+                got=f"K {list(different.K)}, D {list(different.D)} of {different.width}x{different.height}",
+            )
+        return first
+
+    def _transforms(self, wanted: Iterable[str]) -> TransformTree:
+        """The frames of the episode.
+
+        Static transforms come from the whole file, moving ones from around the episode. Where these do not lead to a
+        wanted frame, the moving ones before the episode are read too: a fixed camera may be published once, when the
+        recording starts.
+
+        Raises: RejectedInputError (invalid_extrinsics) for a frame with two parents.
+        """
+        config = self.config
+
+        def read_static(topics: Iterable[str], stop_ns: int | None) -> TransformTree:
+            tree = TransformTree(self.file.path, config.max_gap_s)
+            present = [topic for topic in topics if topic in self.file.topics]
+            for _, _, log_ns, _, transforms in self.file.messages(present, None, stop_ns) if present else ():
+                tree.add(transforms, [log_ns] * len(transforms), static=True)
+            return tree
+
+        tree = read_static(config.static_transforms, None)
+        for stream in (self.streams[topic] for topic in config.transforms if topic in self.streams):
+            offset_ns = config.offset_ns(stream.topic)
+            for transforms, time_ns in zip(stream.values, self.clocks.times_ns(stream), strict=True):
+                times = [int(time_ns)] * len(transforms)
+                if config.time == "header":  # every transform of a message has its own
+                    times = [transform.stamp_ns + offset_ns for transform in transforms]
+                tree.add(transforms, times, static=False)
+        start = self.start_log_ns
+        if start is not None and not all(tree.connected(config.base_frame, frame) for frame in wanted):
+            tree.complete(read_static(config.transforms, start))
+        return tree
+
+    def moving_times(self) -> list[np.ndarray]:
+        """Times of the moving transforms that cameras and tools hang on."""
+        frames = [*self.camera_frames.values(), *self.tool_frames.values()]
+        return [times for frame in frames for times in self.tree.moving_times(self.config.base_frame, frame)]
+
+    def all_signals(self) -> list[_Signal]:
+        return [*self.signals.values(), *self.tools.values()]
+
+    def grid(self) -> np.ndarray:
+        """(t,) instants [ns]: from the first image of the primary view after all topics have begun, until the first ends.
+
+        Raises: RejectedInputError: time_gap for a topic that is silent for too long, too_short.
+        """
+        config = self.config
+        # Gaps between images are judged in `chosen_images`, by the distance of instants from the nearest image.
+        topics = [(config.views[view].image, each.times_ns, float("inf")) for view, each in self.images.items()]
+        topics += [(signal.topic, signal.times_ns, config.max_gap_s) for signal in self.all_signals()]
+        start = min(int(times[0]) for _, times, _ in topics) if self.start_ns is None else self.start_ns
+        stop = max(int(times[-1]) for _, times, _ in topics) if self.stop_ns is None else self.stop_ns
+        for topic, times, max_gap_s in topics:
+            check_gaps(times, start, stop, max_gap_s=max_gap_s, max_trim_s=config.max_trim_s, where=self.at(topic))
+        everything = [*(times for _, times, _ in topics), *self.moving_times()]
+        first = max(start, *(int(times[0]) for times in everything))
+        last = min(stop, *(int(times[-1]) for times in everything))
+        primary = self.images[config.timing_view].times_ns
+        begin = int(np.searchsorted(primary, first - _TOGETHER_NS))
+        grid = instants(int(primary[begin]), last, config.fps) if begin < len(primary) else np.zeros(0, np.int64)
+        if len(grid) < 2:
+            raise RejectedInputError(
+                "too_short",
+                "Topics overlap for less than two frames",
+                where=self.file.path,
+                expected=f"at least {1 / config.fps:.3f} s",
+                got=f"{max(last - first, 0) / 1e9:.3f} s",
+                next_step="if the topics' clocks differ, set time: log or time_offsets_ms",
+            )
+        return grid
+
+    def chosen_images(self, view: str, grid: np.ndarray) -> np.ndarray:
+        """(t,) the nearest image of each instant.
+
+        Raises: RejectedInputError: wrong_fps for a camera slower than the wanted rate, time_gap where images are missing.
+        """
+        config, arrivals = self.config, self.images[view]
+        where = self.at(config.views[view].image)
+        if arrivals.median_step_ns * config.fps > 1.25e9:
+            measured = 1e9 / arrivals.median_step_ns
+            raise RejectedInputError(
+                "wrong_fps",
+                "Camera is slower than the wanted rate",
+                where=where,
+                expected=f"{config.fps} fps",
+                got=f"{measured:.2f} fps",
+                next_step="lower the source's fps",
+                evidence={"wanted_fps": config.fps, "measured_fps": measured},
+            )
+        chosen = nearest(arrivals.times_ns, grid)
+        distance = np.abs(arrivals.times_ns[chosen] - grid) * config.fps / 1e9
+        if distance.max() > config.max_image_distance_frames:
+            worst = int(np.argmax(distance))
+            at_s = float((grid[worst] - grid[0]) / 1e9)
+            raise RejectedInputError(
+                "time_gap",
+                "Images are missing",
+                where=where,
+                expected=f"an image within {config.max_image_distance_frames} frames of every instant",
+                got=f"{distance.max():.2f} frames at {at_s:.3f} s",
+                evidence={
+                    "view": view,
+                    "gap_s": float(2 * distance.max() / config.fps),
+                    "at_s": at_s,
+                    "instants_without": int(np.count_nonzero(distance > config.max_image_distance_frames)),
+                },
+            )
+        return chosen
+
+    def track(self, view: str, chosen: np.ndarray, camera: CameraTrack | None) -> ImageTrack:
+        """Raises: RejectedInputError (truncated_video) for video frames that depend on a lost message."""
+        stream, arrivals = self.streams[self.config.views[view].image], self.images[view]
+        keys = np.array(stream.key_frames, bool)[arrivals.order] if stream.key_frames else None
+        if keys is not None:
+            spoiled = frames_after_loss(arrivals.times_ns, arrivals.median_step_ns, keys)[chosen]
+            if spoiled.any():
+                first = int(np.argmax(spoiled))
+                raise RejectedInputError(
+                    "truncated_video",
+                    "Video frames depend on a message that is missing",
+                    where=f"{self.at(stream.topic)}, frame {first}",
+                    expected=f"a message every {arrivals.median_step_ns / 1e6:.1f} ms between key frames",
+                    got=f"{int(spoiled.sum())} of {len(chosen)} frames after a gap, before the next key frame",
+                    next_step="cut the recording at the gap",
+                    evidence={"first_frame": first, "frames": int(spoiled.sum())},
+                )
+        return ImageTrack(self.file, stream.topic, stream.kind, self.around_ns, arrivals.order, chosen, keys, camera)
+
+    def _resampled(self, readings: TopicReadings, grid: np.ndarray) -> np.ndarray:
+        signal = self.signals[readings]
+        return resampled(signal.times_ns, signal.values, grid, hold=readings.resample == "hold")
+
+    def arm_vectors(self, arms: Iterable[ArmReadings], grid: np.ndarray) -> tuple[np.ndarray, int]:
+        """(t, J) joints [rad] and opening of each arm, and how many openings lay outside of 0..1."""
+        columns, outside = [], 0
+        for arm in arms:
+            joints, fingers = self._resampled(arm.joints, grid), self._resampled(arm.gripper, grid)
+            opening, beyond = arm.gripper.range.opening(fingers.mean(axis=1))
+            columns += [np.deg2rad(joints) if arm.joints.unit == "deg" else joints, opening[:, None]]
+            outside += beyond
+        return np.concatenate(columns, axis=1), outside
+
+    def tool_poses(self, grid: np.ndarray) -> np.ndarray | None:
+        """(t, A, 4, 4) T_base_tool where it is recorded, else None."""
+        base = self.config.base_frame
+        poses: list[np.ndarray] = []
+        for arm, frame in self.tool_frames.items():
+            pose = self.tree.poses(base, frame, grid) if frame != base else np.eye(4)
+            if arm in self.tools:
+                tool = self.tools[arm]
+                pose = pose @ resampled_poses(tool.times_ns, tool.values, grid)
+            poses.append(np.broadcast_to(pose, (len(grid), 4, 4)))
+        return np.stack(poses, axis=1) if poses else None
+
+
+def read_topics_episode(
+    config: McapTopicsSourceConfig, file: McapFile, segment: Segment, episode_id: str, scene: str
+) -> LoadedEpisode:
+    """The episode; its images stay in the file until they are asked for.
+
+    Raises: RejectedInputError with the reason.
+    """
+    recording = _Recording(config, file, segment)
+    grid = recording.grid()
+    chosen = {view: recording.chosen_images(view, grid) for view in config.views}
+    cameras = RecordedCameras()
+    for view, frame in recording.camera_frames.items():
+        topics = config.views[view]
+        poses = recording.tree.poses(config.base_frame, frame, grid)
+        fixed = np.abs(poses - poses[:1]).max() <= _FIXED_TOLERANCE
+        where = f"{recording.at(topics.calibration or '')}, frame {frame}"
+        calibration = recording.calibrations[view]
+        add_camera(cameras, view, calibration, poses[:1] if fixed else poses, where=where, rectified=topics.rectified)
+    state, outside = recording.arm_vectors([arm.state for arm in config.arms], grid)
+    action, commands = state, [arm.command for arm in config.arms if arm.command is not None]
+    if commands:
+        action, beyond = recording.arm_vectors(commands, grid)
+        outside += beyond
+    state_names = _state_names(config)
+    tools = recording.tool_poses(grid)
+    signals = recording.all_signals()
+    images = recording.images
+    times = [each.times_ns for each in (*images.values(), *signals)] + recording.moving_times()
+    # Signals of the same messages count once.
+    arrivals = {(signal.topic, len(signal.times_ns)): signal.arrivals for signal in signals}
+    without_header = ", ".join(recording.clocks.without_header)
+    episode = Episode(
+        episode_id=episode_id,
+        source=config.label,
+        embodiment=config.embodiment,
+        scene=scene,
+        task_family=config.task_family,
+        instruction=(segment.instruction if segment.instruction is not None else config.instruction).strip(),
+        outcome=segment.outcome or config.outcome,
+        split=config.split,
+        fps=config.fps,
+        state=state.astype(np.float32),
+        action=action.astype(np.float32),
+        timestamps=(grid - grid[0]) / 1e9,
+        cameras=cameras.tracks,
+        T_base_ee=tools,
+        gripper=None if tools is None else state[:, [name.endswith("/gripper") for name in state_names]],
+        primary_view=config.timing_view,
+        state_names=state_names,
+        conventions={
+            "layout": LAYOUT,
+            "time": config.time,
+            "clock_skew_ms": round(recording.clocks.skew_ms, 6),
+            "resampling_max_ms": round(max(largest_distance_ms(each, grid) for each in times), 6),
+            "messages_lost": sum(each.lost for each in (*images.values(), *arrivals.values())),
+            "repeated_images": sum(int(len(numbers) - len(np.unique(numbers))) for numbers in chosen.values()),
+            "gripper_overshoot": outside,
+            "action": "commanded" if commands else f"{REPEATS_STATE}: no commands are recorded",
+            **({"timed_by_log": without_header} if without_header else {}),
+            **cameras.notes(),
+        },
+    )
+    tracks = {view: recording.track(view, chosen[view], cameras.tracks.get(view)) for view in config.views}
+    return LoadedEpisode(episode, tuple(config.views), lambda view: tracks[view].frames(), distortions=cameras.lenses)
+
+
+def _state_names(config: McapTopicsSourceConfig) -> tuple[str, ...]:
+    names: list[str] = []
+    for arm in config.arms:
+        joints = arm.state.joints
+        given = joints.names or tuple(f"joint_{number}" for number in range(1, joints.width + 1))
+        names += [f"{arm.name}/{name}" for name in (*given, "gripper")]
+    return tuple(names)
