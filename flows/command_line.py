@@ -166,7 +166,7 @@ def _pipeline(arguments: argparse.Namespace) -> None:
 
 def _nightly(arguments: argparse.Namespace) -> None:
     if arguments.accept is not None:
-        from worldline_core.report.nightly import accept_night
+        from worldline_core.report.comparison import accept_night
 
         accept_night(arguments.artifacts / "nightly", arguments.accept)
         print(f"later nights are held against {arguments.accept}")

@@ -80,7 +80,7 @@ def _card(arguments: argparse.Namespace) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from worldline_core.report.run_comparison import as_json, as_table, compare_runs, write_tidy
+    from worldline_core.report.comparison import as_table, compare_runs, write_tidy
 
     methods = None if arguments.methods is None else (arguments.methods[0], arguments.methods[1])
     rows = compare_runs(arguments.first, arguments.second, methods, arguments.metric)
@@ -88,8 +88,9 @@ def _compare(arguments: argparse.Namespace) -> None:
         write_tidy(arguments.scores, (arguments.first, arguments.second))
     if arguments.json:
         import json
+        from dataclasses import asdict
 
-        print(json.dumps(as_json(rows), indent=1))
+        print(json.dumps([asdict(row) for row in rows], indent=1))
     else:
         print(as_table(rows))
 

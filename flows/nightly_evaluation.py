@@ -11,7 +11,8 @@ from tasks.run_nodes import run_nodes
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan, without_training
-from worldline_core.report.nightly import NightlyComparison, compare_with_history, refuse_regressions
+from worldline_core.report.comparison import NightlyComparison
+from worldline_core.report.nightly import compare_with_history, refuse_regressions
 
 
 @task(name="compare_nights", persist_result=False)

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from worldline_core.evaluation.paired import read_series, write_series
-from worldline_core.report.nightly import scores_file
+from worldline_core.report.comparison import scores_file
 
 PREFECT = [sys.executable, "-m", "prefect"]
 

@@ -12,8 +12,8 @@ from scipy.stats import ttest_rel
 from worldline_core.errors import RegressionError
 from worldline_core.evaluation.paired import Series, differences, paired_tests, read_scores
 from worldline_core.evaluation.scores import Score, summarise, write_scores
-from worldline_core.report.night_changes import DRIFT_NIGHTS, compare_series
-from worldline_core.report.nightly import compare_with_history, record_night, refuse_regressions
+from worldline_core.report.comparison import DRIFT_NIGHTS, compare_series, record_night
+from worldline_core.report.nightly import compare_with_history, refuse_regressions
 
 METRICS = ("robot_iou", "robot_iou_exact", "ssim", "hsd", "psnr", "end_effector_error_px")
 METHODS = ("shipped_stage2", "shipped_causal", "copy_first_frame")
@@ -98,7 +98,7 @@ def test_false_alarms_are_rare_over_two_hundred_nights_of_pure_noise() -> None:
         for _ in range(100):
             present = world.series()
             nights += 1
-            if any(found.worse_by for found in compare_series(present, good[-DRIFT_NIGHTS:]).values()):
+            if any(found.verdict == "worse" for found in compare_series(present, good[-DRIFT_NIGHTS:]).values()):
                 alarms += 1
             else:
                 good.append(present)
@@ -109,7 +109,7 @@ def test_false_alarms_are_rare_over_two_hundred_nights_of_pure_noise() -> None:
 def test_losses_are_found_almost_always() -> None:
     world = World(5)
     good = [world.series() for _ in range(DRIFT_NIGHTS)]
-    found = [compare_series(world.series(loss=0.03), good)[IOU].worse_by is not None for _ in range(20)]
+    found = [compare_series(world.series(loss=0.03), good)[IOU].verdict == "worse" for _ in range(20)]
     assert sum(found) >= 19
 
 
@@ -119,34 +119,34 @@ def test_a_slow_drift_is_found_before_it_is_three_points() -> None:
     for number in range(1, 11):
         present = world.series(loss=0.003 * number)
         tested = compare_series(present, good[-DRIFT_NIGHTS:])[IOU]
-        if tested.worse_by:
+        if tested.verdict == "worse":
             break
         good.append(present)
     else:
         pytest.fail("a drift of 0.003 a night was not found in ten nights")
-    assert tested.worse_by in ("level", "drift")
+    assert tested.question in ("level", "drift")
 
 
 def test_the_same_scores_and_rounding_are_no_change() -> None:
     night = World(7).series()
     rounded = {name: {r: value - 1e-6 for r, value in values.items()} for name, values in night.items()}
     for present in (night, rounded):
-        assert not any(found.worse_by for found in compare_series(present, [night] * DRIFT_NIGHTS).values())
+        assert not any(found.verdict == "worse" for found in compare_series(present, [night] * DRIFT_NIGHTS).values())
     # A loss that is the same on every recording has no spread, and is no chance.
     lower = {name: {r: value - 0.03 for r, value in values.items()} for name, values in night.items()}
-    assert compare_series(lower, [night])[IOU].worse_by == "step"
+    assert compare_series(lower, [night])[IOU][:2] == ("worse", "step")
     error = IOU.replace("robot_iou", "end_effector_error_px")
     higher = {name: {r: value + 0.3 for r, value in values.items()} for name, values in night.items()}
     tested = compare_series(higher, [night])
-    assert tested[error].worse_by  # of an error more is worse
-    assert tested[IOU].better
+    assert tested[error].verdict == "worse"  # of an error more is worse
+    assert tested[IOU].verdict == "better"
 
 
 def test_only_recordings_of_both_nights_count() -> None:
     first = {IOU: {f"e{n}": 0.5 for n in range(20)}}
     second = {IOU: {f"e{n}": 0.5 if n < 20 else 0.0 for n in range(10, 40)}}
     assert sorted(differences(second, first)[IOU]) == [f"e{n}" for n in range(10, 20)]
-    assert compare_series(second, [first])[IOU].worse_by is None
+    assert compare_series(second, [first])[IOU].verdict == "same"
     assert compare_series({IOU: {"other": 0.1}}, [first]) == {}
 
 

@@ -11,15 +11,9 @@ import pytest
 
 from worldline_core.errors import ArtifactError, RegressionError
 from worldline_core.evaluation.scores import Interval
-from worldline_core.report import nightly
-from worldline_core.report.nightly import (
-    Change,
-    accept_night,
-    compare_with_history,
-    read_history,
-    record_night,
-    refuse_regressions,
-)
+from worldline_core.report import comparison
+from worldline_core.report.comparison import Change, accept_night, read_history, record_night
+from worldline_core.report.nightly import compare_with_history, refuse_regressions
 
 
 def scores(folder: Path, mean: float) -> dict[str, Path]:
@@ -101,8 +95,8 @@ def test_a_named_night_is_not_replaced(tmp_path: Path) -> None:
 
 def test_nights_that_end_at_once_are_all_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     history, meet = tmp_path / "history", threading.Barrier(4)
-    read = nightly.read_history
-    monkeypatch.setattr(nightly, "read_history", lambda folder: (read(folder), time.sleep(0.05))[0])
+    read = comparison.read_history
+    monkeypatch.setattr(comparison, "read_history", lambda folder: (read(folder), time.sleep(0.05))[0])
 
     def work(number: int) -> None:
         found = scores(tmp_path / str(number), 0.6)

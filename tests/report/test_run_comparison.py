@@ -16,8 +16,7 @@ import pytest
 from flows.command_line import main
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import SCORES_FILE, Score, summarise, write_scores
-from worldline_core.report.nightly import record_night
-from worldline_core.report.run_comparison import as_table, compare_runs
+from worldline_core.report.comparison import as_table, compare_runs, record_night
 
 NUMBER = 24
 

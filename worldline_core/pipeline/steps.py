@@ -290,7 +290,7 @@ _STEPS = (
     ),
     Step(
         "ablation_table",
-        1,
+        2,
         "worldline_core.report.ablation_table",
         "ablation_table",
         "report.ablation_table.AblationTableConfig",

@@ -19,7 +19,6 @@ from worldline_core.report.cost import cost_section
 from worldline_core.report.dataset_card import data_section
 from worldline_core.report.decisions import planning_section, policy_section
 from worldline_core.report.filters import filters_section
-from worldline_core.report.nightly import nights_section
 from worldline_core.report.provenance import models_section, provenance_section
 from worldline_core.report.quality import quality_section
 from worldline_core.report.summary import overview
@@ -50,8 +49,7 @@ def report(config: ReportConfig, inputs: Mapping[str, Path], output: Path) -> di
     shutil.rmtree(output / "media", ignore_errors=True)
     remove_unfinished(output)
     context = ReportContext(config, dict(inputs), output)
-    makers = [nights_section, *SECTIONS] if "history" in inputs else SECTIONS
-    sections = [make(context) for make in with_progress(makers, "report", "section")]
+    sections = [make(context) for make in with_progress(SECTIONS, "report", "section")]
     context.write_pages(overview(context, sections), sections)
     missing = [section.anchor for section in sections if section.missing]
     pages = len(sections) + 1 - len(missing)

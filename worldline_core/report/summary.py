@@ -28,7 +28,6 @@ ABOUT = {
     "training": "Loss curves of every stage of this run.",
     "models": "The weights that were used, and their cards.",
     "provenance": "Digests, seeds, configurations, versions and times of every artifact.",
-    "nights": "This night's scores beside those of the nights before.",
 }
 """What each page shows, for the list of pages."""
 
