@@ -18,8 +18,8 @@ from worldline_core.shipped import SHIPPED, project_path
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What one look at the machine found.
+class MachineCheck:
+    """One property of the machine, checked.
 
     Attributes:
         next_step: what the user can do about it; empty where nothing need be done.
@@ -31,7 +31,7 @@ class Finding:
     next_step: str = ""
 
 
-def examine_machine(project: Path) -> list[Finding]:
+def examine_machine(project: Path) -> list[MachineCheck]:
     """What the project needs, in the order of a report."""
     return [
         _system(),
@@ -48,7 +48,7 @@ def examine_machine(project: Path) -> list[Finding]:
     ]
 
 
-def format_findings(findings: list[Finding]) -> str:
+def format_findings(findings: list[MachineCheck]) -> str:
     """A table for people."""
     marks = {"ok": "ok      ", "missing": "MISSING ", "optional": "optional"}
     width = max(len(finding.name) for finding in findings)
@@ -57,73 +57,75 @@ def format_findings(findings: list[Finding]) -> str:
     return "\n".join(lines + (["", "What you can do:", *advice] if advice else []))
 
 
-def _system() -> Finding:
+def _system() -> MachineCheck:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Finding(
+    return MachineCheck(
         "system", "ok", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores"
     )
 
 
-def _memory() -> Finding:
+def _memory() -> MachineCheck:
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     advice = "" if total >= 6 else "the tiny preset needs about 6 GiB; lower batch sizes with --set"
-    return Finding("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
+    return MachineCheck("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
 
 
-def _disk(project: Path) -> Finding:
+def _disk(project: Path) -> MachineCheck:
     free = shutil.disk_usage(project).free / 2**30
-    return Finding(
+    return MachineCheck(
         "disk", "ok" if free >= 10 else "missing", f"{free:.0f} GiB free", "" if free >= 10 else "free some space"
     )
 
 
-def _accelerator() -> Finding:
+def _accelerator() -> MachineCheck:
     import torch
 
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
-        return Finding(
+        return MachineCheck(
             "accelerator",
             "ok",
             f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}",
         )
-    return Finding(
+    return MachineCheck(
         "accelerator", "optional", f"none; torch {torch.__version__} on the CPU",
         "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more",
     )  # fmt: skip
 
 
-def _bfloat16() -> Finding:
+def _bfloat16() -> MachineCheck:
     import torch
 
     fast = (
         bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
         and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     )
-    return Finding("CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower")
+    return MachineCheck(
+        "CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower"
+    )
 
 
-def _codec() -> Finding:
+def _codec() -> MachineCheck:
     import av
 
     missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
     if missing:
-        return Finding(
+        return MachineCheck(
             "video codecs", "missing", f"PyAV {av.__version__} without {', '.join(missing)}", "reinstall av from PyPI"
         )
-    return Finding("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
+    return MachineCheck("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
 
 
-def _decoder() -> Finding:
+def _decoder() -> MachineCheck:
     from worldline_core.data.video.frame_decoder import describe_decoders
 
     found = describe_decoders()
     status = "optional" if found["next_step"] else "ok"
     reason = f" (torchcodec: {found['torchcodec']})" if found["next_step"] else ""
-    return Finding("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
+    return MachineCheck("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
 
 
-def _packages() -> list[Finding]:
+def _packages() -> list[MachineCheck]:
     extras = {
         "mujoco": "sim (worldline record)",
         "h5py": "hdf5 (HDF5 sources)",
@@ -136,16 +138,18 @@ def _packages() -> list[Finding]:
         present = importlib.util.find_spec(package) is not None
         advice = "" if present else installing(purpose.split()[0])
         findings.append(
-            Finding(f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice)
+            MachineCheck(
+                f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice
+            )
         )
     return findings
 
 
-def _software_gl() -> Finding:
+def _software_gl() -> MachineCheck:
     libraries = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
     if libraries:
-        return Finding("headless GL", "ok", ", ".join(libraries))
-    return Finding(
+        return MachineCheck("headless GL", "ok", ", ".join(libraries))
+    return MachineCheck(
         "headless GL",
         "optional",
         "none",
@@ -153,13 +157,13 @@ def _software_gl() -> Finding:
     )
 
 
-def _weights(project: Path) -> list[Finding]:
+def _weights(project: Path) -> list[MachineCheck]:
     findings = []
     for name in ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter"):
         folder = project_path(project, SHIPPED / "models" / name)
         present = any(folder.glob("*.safetensors"))
         findings.append(
-            Finding(
+            MachineCheck(
                 f"weights {name}",
                 "ok" if present else "missing",
                 str(folder.relative_to(project) if folder.is_relative_to(project) else folder) if present else "absent",
@@ -175,23 +179,23 @@ def _weights(project: Path) -> list[Finding]:
     ):
         present = (hub / f"models--{repository.replace('/', '--')}").is_dir()
         findings.append(
-            Finding(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
+            MachineCheck(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
                      "" if present else "only the full-size preset needs it; download it where a hub is reachable")
         )  # fmt: skip
     return findings
 
 
-def _prefect_api() -> Finding:
+def _prefect_api() -> MachineCheck:
     url = os.environ.get("PREFECT_API_URL")
     if not url:
-        return Finding("Prefect API", "ok", "none set: flows start a temporary server")
+        return MachineCheck("Prefect API", "ok", "none set: flows start a temporary server")
     if not url.startswith(("http://", "https://")):
-        return Finding("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
+        return MachineCheck("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
     try:
         with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=3) as answer:  # noqa: S310 - scheme checked above
-            return Finding("Prefect API", "ok", f"{url} answers {answer.status}")
+            return MachineCheck("Prefect API", "ok", f"{url} answers {answer.status}")
     except (urllib.error.URLError, TimeoutError) as error:
-        return Finding(
+        return MachineCheck(
             "Prefect API",
             "missing",
             f"{url}: {error}",

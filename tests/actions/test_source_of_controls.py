@@ -26,7 +26,7 @@ from worldline_core.actions.render_actions import render_actions
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import UNDESCRIBED, CameraTrack, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.open import SourceConfig, open_source
@@ -92,7 +92,7 @@ def kinematics_of(
 
     def of(episode: Episode) -> ArmKinematics:
         """Of a robot that nobody describes: of one with as many joints."""
-        if episode.embodiment == UNDESCRIBED:
+        if episode.embodiment == NO_EMBODIMENT:
             return {3: toy, 7: ArmKinematics(load_embodiment("ur5e"))}[episode.state.shape[1]]
         return agibot if episode.embodiment == "agibot_g1" else ArmKinematics(load_embodiment(episode.embodiment))
 

@@ -9,7 +9,7 @@ import pytest
 
 from worldline_core.config import CONFIG_ROOT, load_config, preset_names, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.episodes.episode import UNDESCRIBED
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.sources.open import SourceConfig
 from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS
 from worldline_core.errors import ConfigError
@@ -23,7 +23,7 @@ from worldline_core.recorder.record import RecordConfig, plan_jobs
 
 TEMPLATES = sorted([*(CONFIG_ROOT / "sources").glob("*.yaml"), *(CONFIG_ROOT / "filters").glob("*.yaml")])
 RECORDINGS = sorted((CONFIG_ROOT / "recording").glob("*.yaml"))
-KNOWN = {*embodiment_names(), UNDESCRIBED}
+KNOWN = {*embodiment_names(), NO_EMBODIMENT}
 
 
 def test_there_are_files_to_load() -> None:

@@ -25,7 +25,7 @@ from worldline_core.actions.episode_tracks import (
 from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
 from worldline_core.actions.overlays import OverlayStyle
 from worldline_core.actions.tool_projection import TrackCounts, add_counts
-from worldline_core.data.episodes.episode import UNDESCRIBED
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_parts import part_name
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
@@ -72,9 +72,9 @@ class RenderWork(ShardFilesWork[ProjectedEpisode]):
         return KinematicsByName(self.config.description_paths)
 
     def _kinematics_of(self, embodiment: str) -> ArmKinematics:
-        if embodiment == UNDESCRIBED:
+        if embodiment == NO_EMBODIMENT:
             raise ConfigError(
-                "Nobody describes the robot of the recording", got=f"embodiment: {UNDESCRIBED}",
+                "Nobody describes the robot of the recording", got=f"embodiment: {NO_EMBODIMENT}",
                 expected="a robot of `worldline embodiment list`",
                 next_step="declare the robot and its arms in the source; without, Stage I alone learns from it",
             )  # fmt: skip

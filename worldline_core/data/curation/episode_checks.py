@@ -7,7 +7,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from worldline_core.data.curation.curate_config import AVAILABLE, CurateConfig
-from worldline_core.data.episodes.episode import UNDESCRIBED, CameraTrack, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, CameraTrack, Episode
 from worldline_core.data.episodes.recorded_poses import camera_pose, check_intrinsics
 from worldline_core.data.episodes.source import LoadedEpisode
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_finite, check_length, collect_faults
@@ -86,7 +86,7 @@ def check_values(episode: Episode) -> None:
 
 def check_embodiment(episode: Episode) -> None:
     """Raises: RejectedInputError (unknown_embodiment) when nobody describes the robot, and the recording does not say so."""
-    if episode.state_kind == "none" or episode.embodiment == UNDESCRIBED:
+    if episode.state_kind == "none" or episode.embodiment == NO_EMBODIMENT:
         return
     try:
         check_embodiment_name(episode.embodiment)
@@ -122,7 +122,7 @@ def check_joints(episode: Episode, tolerance_rad: float) -> None:
             next_step="declare the unit of the source",
             evidence={"max_abs_rad": worst},
         )
-    if episode.embodiment == UNDESCRIBED:
+    if episode.embodiment == NO_EMBODIMENT:
         return
     embodiment = _embodiment(episode.embodiment)
     if embodiment.state_size != episode.state.shape[1]:

@@ -19,7 +19,7 @@ from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import CameraPose, ImageTransform
 
 VIEWS = ("head", "left_wrist", "right_wrist")
-UNDESCRIBED = "none"
+NO_EMBODIMENT = "none"
 """Embodiment of recordings whose robot nobody describes: there is no forward kinematics of their joints."""
 TaskFamily = Literal["grasp", "lift", "place", "state_change", "unknown"]
 Outcome = Literal["success", "failure", "unknown"]

@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from worldline_core.data.episodes.episode import LABELS, UNDESCRIBED, Episode
+from worldline_core.data.episodes.episode import LABELS, NO_EMBODIMENT, Episode
 from worldline_core.data.episodes.episode_index import (
     INDEX_FILE,
     EpisodeRow,
@@ -238,7 +238,7 @@ def _dataset_episode(part: Part) -> DatasetEpisode:
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
     episode, views = part.episode, tuple(part.videos)
     reason = "missing_view" if len(views) < 2 else "missing_calibration" if set(views) - set(episode.cameras) else None
-    if reason is None and episode.embodiment == UNDESCRIBED and episode.T_base_ee is None:
+    if reason is None and episode.embodiment == NO_EMBODIMENT and episode.T_base_ee is None:
         reason = "missing_kinematics"
     if episode.state_kind == "none":
         reason = "missing_actions"

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
-from worldline_core.data.episodes.episode import TRAINING_SPLITS, UNDESCRIBED, Episode, Outcome, Split, TaskFamily
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, TRAINING_SPLITS, Episode, Outcome, Split, TaskFamily
 from worldline_core.data.guards.rejection import RejectedInputError, collect_faults
 from worldline_core.data.guards.source_paths import SourceFolder
 from worldline_core.data.video.clip import VideoClip, read_clip
@@ -157,11 +157,11 @@ class SourceConfigBase(StrictModel):
 
 
 def _described(name: str) -> str:
-    if name != UNDESCRIBED:
+    if name != NO_EMBODIMENT:
         try:
             check_embodiment_name(name)
         except ConfigError as error:
-            next_step = f"{error.next_step}; or embodiment: {UNDESCRIBED}, which takes the recordings for Stage I"
+            next_step = f"{error.next_step}; or embodiment: {NO_EMBODIMENT}, which takes the recordings for Stage I"
             raise ValueError(f"nobody describes the robot {name} ({error.expected}); {next_step}") from error
     return name
 

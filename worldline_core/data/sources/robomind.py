@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from worldline_core.data.episodes.episode import REPEATS_STATE, UNDESCRIBED, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, Episode
 from worldline_core.data.episodes.source import (
     EmbodimentName,
     ForeignSourceConfig,
@@ -145,15 +145,15 @@ _AGILEX_2 = _three("camera_front", "camera_left", "camera_right")
 ROBOMIND_LAYOUTS: dict[LayoutName, RobomindLayout] = {
     "h5_franka_1rgb": RobomindLayout(1, "franka_panda", _ARM_7, _TOP, "puppet"),
     "h5_franka_3rgb": RobomindLayout(1, "franka_panda", _ARM_7, _TOP, "puppet", "standard"),
-    "h5_franka_fr3_dual": RobomindLayout(1, UNDESCRIBED, _ARMS_7, {"head": "camera_front"}, "master"),
+    "h5_franka_fr3_dual": RobomindLayout(1, NO_EMBODIMENT, _ARMS_7, {"head": "camera_front"}, "master"),
     "h5_ur_1rgb": RobomindLayout(1, "ur5e", _ARM_6, _TOP, "puppet", "standard"),
-    "h5_agilex_3rgb": RobomindLayout(1, UNDESCRIBED, _AGILEX, _AGILEX_1, "master", "as_written"),
-    "h5_tienkung_gello_1rgb": RobomindLayout(1, UNDESCRIBED, _ARMS_7, _TOP, "master", "as_written"),
-    "h5_tienkung_prod1_gello_1rgb": RobomindLayout(1, UNDESCRIBED, _ARMS_7, _TOP, "master"),
-    "h5_tienkung_xsens_1rgb": RobomindLayout(1, UNDESCRIBED, _HANDS, _TOP, "puppet", "as_written"),
-    "v2_franka": RobomindLayout(2, UNDESCRIBED, _aligned(7), _WRISTS, "master"),
-    "v2_ur": RobomindLayout(2, UNDESCRIBED, _aligned(6), _WRISTS, "master"),
-    "v2_agilex": RobomindLayout(2, UNDESCRIBED, _aligned(6), _AGILEX_2, "master"),
+    "h5_agilex_3rgb": RobomindLayout(1, NO_EMBODIMENT, _AGILEX, _AGILEX_1, "master", "as_written"),
+    "h5_tienkung_gello_1rgb": RobomindLayout(1, NO_EMBODIMENT, _ARMS_7, _TOP, "master", "as_written"),
+    "h5_tienkung_prod1_gello_1rgb": RobomindLayout(1, NO_EMBODIMENT, _ARMS_7, _TOP, "master"),
+    "h5_tienkung_xsens_1rgb": RobomindLayout(1, NO_EMBODIMENT, _HANDS, _TOP, "puppet", "as_written"),
+    "v2_franka": RobomindLayout(2, NO_EMBODIMENT, _aligned(7), _WRISTS, "master"),
+    "v2_ur": RobomindLayout(2, NO_EMBODIMENT, _aligned(6), _WRISTS, "master"),
+    "v2_agilex": RobomindLayout(2, NO_EMBODIMENT, _aligned(6), _AGILEX_2, "master"),
 }
 
 

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.episodes.episode import REPEATS_STATE, UNDESCRIBED, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
@@ -46,7 +46,7 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
 
     kind: Literal["robotwin"] = "robotwin"
     fps: float = Field(gt=0)
-    embodiment: EmbodimentName = UNDESCRIBED
+    embodiment: EmbodimentName = NO_EMBODIMENT
     views: dict[str, str] = Field(
         default={"head": "head_camera", "left_wrist": "left_camera", "right_wrist": "right_camera"},
         min_length=1,
