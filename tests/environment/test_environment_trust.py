@@ -11,13 +11,15 @@ import pytest
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError
-from worldline_core.evaluation.policy.novelty import KnownRecordings, control_vectors, setup_vectors
-from worldline_core.evaluation.policy.saved_trust import (
+from worldline_core.evaluation.policy.trust import (
+    Calibration,
     JudgedBy,
+    KnownRecordings,
     PredictedBy,
-    SavedMethod,
-    SavedTrust,
+    TrustModel,
     content_digest,
+    control_vectors,
+    setup_vectors,
 )
 
 ROBOT = "ur5e_silver"
@@ -42,21 +44,20 @@ def test_info_says_how_far_the_judge_is_to_be_trusted(project_root: Path, tmp_pa
     )
     body, place = setup_vectors(seen[0])
     near = [0.01 * random.normal(size=vectors.shape) for _ in range(8)]
-    saved = SavedTrust(
-        format=1,
+    saved = TrustModel(
         judged_by=JudgedBy(
             judge="measured", views=("head",), segmenter="learned",
             segmenter_weights=content_digest(shipped / "models" / "segmenter"),
         ),
-        embodiments=(ROBOT,), least_trust=0.6, training_recordings=8,
-        methods={"causal": SavedMethod(
+        embodiments=(ROBOT,), least_trust=0.6, novelty_level=0.05, training_recordings=8,
+        methods={"causal": Calibration(
             predicted_by=PredictedBy(
                 checkpoint=content_digest(shipped / "models" / "causal"), sampler="block_causal", steps=None
             ),
             signals=("doubt", "new_controls"), weights=(2.0, 0.0, -0.5),
         )},
-        controls=KnownRecordings([(arms, vectors), *((arms, vectors + noise) for noise in near)]),
-        setups=KnownRecordings([(body, place + 0.01 * random.normal(size=place.shape)) for _ in range(8)]),
+        controls=KnownRecordings.of([(arms, vectors), *((arms, vectors + noise) for noise in near)]),
+        setups=KnownRecordings.of([(body, place + 0.01 * random.normal(size=place.shape)) for _ in range(8)]),
     )  # fmt: skip
     saved.write(tmp_path)
     environment = WorldLineEnv(trust=tmp_path, **options)
@@ -67,10 +68,10 @@ def test_info_says_how_far_the_judge_is_to_be_trusted(project_root: Path, tmp_pa
     assert strange["do_not_trust"].startswith("new controls")
     assert strange["trust"] < usual["trust"]
 
-    with pytest.raises(ConfigError, match=r"(?s)of the measured judge.*success None"):
+    with pytest.raises(ConfigError, match="success None"):
         WorldLineEnv(trust=tmp_path, **options, success=None)
-    with pytest.raises(ConfigError, match=r"(?s)not of these simulations.*is of other videos than these.*2 steps"):
+    with pytest.raises(ConfigError, match="steps=2"):
         WorldLineEnv(trust=tmp_path, **options, steps=2)
     options["embodiment"] = "viperx_pearl"
-    with pytest.raises(ConfigError, match=r"(?s)not made with these robots.*viperx_pearl"):
+    with pytest.raises(ConfigError, match="other robots: viperx_pearl"):
         WorldLineEnv(trust=tmp_path, **options)

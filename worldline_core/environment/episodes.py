@@ -15,9 +15,16 @@ from worldline_core.environment.starts import Start
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.judge import confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.policy.novelty import control_vectors, setup_vectors
-from worldline_core.evaluation.policy.saved_trust import JudgedBy, PredictedBy, SavedTrust, content_digest
-from worldline_core.evaluation.policy.trust import Calibration, reasons
+from worldline_core.evaluation.policy.trust import (
+    Calibration,
+    JudgedBy,
+    PredictedBy,
+    TrustModel,
+    content_digest,
+    control_vectors,
+    reasons,
+    setup_vectors,
+)
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment
@@ -50,7 +57,7 @@ class TrustedJudge:
     ) -> None:
         opened = open_segmenter("learned", learned=segmenter, sam3=None)
         self._judge = MeasuredEvidenceJudge(opened, states_confidence=True)
-        self._saved = SavedTrust.read(saved)
+        self._saved = TrustModel.read(saved)
         digest = content_digest(segmenter)
         self._saved.require(
             JudgedBy(judge="measured", views=tuple(views), segmenter="learned", segmenter_weights=digest), (embodiment,)

@@ -1,4 +1,4 @@
-"""What the evaluations and the segmenter's training are told. No torch in here."""
+"""Configuration of the evaluation steps and of the segmenter's training; imports no torch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from worldline_core.untrusted_text import carries_credentials
 
 
 class VLMConfig(StrictModel):
-    """A local Qwen3-VL folder, or a server. A key is never configured: only the variable that holds it."""
+    """A local Qwen3-VL folder, or a server whose key is in an environment variable."""
 
     weights: Path | None = Field(default=None, description="local Qwen3-VL folder")
     url: str | None = Field(default=None, description="OpenAI-compatible server, up to and with /v1")
@@ -82,7 +82,7 @@ class SegmenterConfig(StrictModel):
 
 
 class VideoEvaluationConfig(StrictModel):
-    """What evaluate_video measures."""
+    """Views, segmenters and metrics of evaluate_video."""
 
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
     segmenters: tuple[SegmenterName, ...] = Field(
@@ -93,17 +93,11 @@ class VideoEvaluationConfig(StrictModel):
     comparisons: tuple[tuple[str, str], ...] | None = Field(
         default=None, description="pairs of methods whose differences are reported; none: every pair"
     )
-    # Left out of dumps at their defaults: evaluations made before they existed keep their key in the store.
-    metrics: tuple[str, ...] = Field(
-        default=(), exclude_if=lambda value: not value, description="further metrics: " + ", ".join(ON_REQUEST)
-    )
+    metrics: tuple[str, ...] = Field(default=(), description="further metrics: " + ", ".join(ON_REQUEST))
     changed_controls: dict[str, dict[Literal["shuffled", "mirrored", "delayed"], str]] = Field(
-        default={}, exclude_if=lambda value: not value,
-        description="of a method, the methods that are the same model under changed controls",
-    )  # fmt: skip
-    fvd_weights: Path | None = Field(
-        default=None, exclude_if=lambda value: value is None, description="local TorchScript file of I3D; none: no FVD"
+        default={}, description="by method, the methods that are the same model under changed controls"
     )
+    fvd_weights: Path | None = Field(default=None, description="local TorchScript file of I3D; none: no FVD")
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
 
@@ -143,25 +137,25 @@ class VideoEvaluationConfig(StrictModel):
 
 
 class TrustConfig(StrictModel):
-    """When a verdict on a predicted video is marked "do not trust"."""
+    """Thresholds of the mark "do not trust" on verdicts, and where their calibration comes from."""
 
     novelty_level: float = Field(
-        default=0.05, gt=0, lt=0.5, description="share of the training recordings that would count as new themselves"
+        default=0.05, gt=0, lt=0.5, description="share of the training recordings whose own novelty is above 1"
     )
     least_trust: float = Field(
-        default=0.6, ge=0, le=1, description="verdicts that are less likely to be right than this are marked"
+        default=0.6, ge=0, le=1, description="verdicts less likely to be right than this are marked"
     )
     compare_with: dict[str, str] = Field(
-        default={}, description="of a method, another one: where verdicts on both differ, they are less to be trusted"
+        default={}, description="by method, another one whose verdicts are compared: disagreement lowers trust"
     )
     calibration: Path | None = Field(
-        default=None, exclude_if=lambda value: value is None,
-        description="trust.safetensors of an earlier evaluation, or its folder: recordings need no outcome then",
-    )  # fmt: skip
+        default=None,
+        description="trust.safetensors of an earlier evaluation, or its folder; outcomes may be unknown then",
+    )
 
 
 class PolicyEvaluationConfig(StrictModel):
-    """Who judges, and what."""
+    """Judge and trajectories of evaluate_policy."""
 
     judge: Literal["measured", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()
@@ -170,17 +164,14 @@ class PolicyEvaluationConfig(StrictModel):
     views: tuple[Literal["head", "left_wrist", "right_wrist"], ...] = VIEWS
     splits: tuple[str, ...] = ("test", "ood_test")
     balanced: bool = True
-    max_per_group: int | None = Field(default=None, ge=1, description="of each outcome, in each split and family")
+    max_per_group: int | None = Field(default=None, ge=1, description="of each outcome in each split and family")
     compare_policies: bool = Field(
         default=False,
-        description="a source of the episodes is a policy: compare their recorded and predicted success rates",
-        exclude_if=lambda value: not value,
+        description="sources of the episodes are policies: compare their recorded and predicted success rates",
     )
     trust: TrustConfig | None = Field(
         default=None,
-        description="say of each verdict how far it is to be trusted; recordings of the training splits among the episodes "
-        "tell what is new to the model",
-        exclude_if=lambda value: value is None,
+        description="trust in each verdict; novelty is measured against the training splits of the episodes",
     )
     resamples: int = Field(default=2000, ge=100)
     seed: int = Field(default=42, ge=0)
@@ -197,7 +188,7 @@ class PolicyEvaluationConfig(StrictModel):
 
 
 class PlanningConfig(StrictModel):
-    """Who selects, and among how many."""
+    """Selector and budgets of evaluate_planning."""
 
     selector: Literal["measured", "qwen3_vl", "openai"] = "measured"
     vlm: VLMConfig = VLMConfig()

@@ -260,7 +260,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_video",
-        2,
+        3,
         "worldline_core.evaluation.video.evaluate_video",
         "evaluate_video",
         "evaluation.evaluation_config.VideoEvaluationConfig",
@@ -270,7 +270,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_policy",
-        5,
+        6,
         "worldline_core.evaluation.policy.evaluate_policy",
         "evaluate_policy",
         "evaluation.evaluation_config.PolicyEvaluationConfig",
@@ -280,7 +280,7 @@ _STEPS = (
     ),
     Step(
         "evaluate_planning",
-        4,
+        5,
         "worldline_core.evaluation.planning.evaluate_planning",
         "evaluate_planning",
         "evaluation.evaluation_config.PlanningConfig",

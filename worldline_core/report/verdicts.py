@@ -6,18 +6,13 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 
-from markupsafe import Markup
-
-from worldline_core.evaluation.policy.agreement import STATISTICS
 from worldline_core.evaluation.policy.evidence import failure_kind
-from worldline_core.evaluation.policy.trust import SIGNALS
 from worldline_core.pages.charts import Series, line_chart
-from worldline_core.pages.page import Table, number, percent, with_note, words
+from worldline_core.pages.page import Table, number, percent, with_note
 from worldline_core.report.video_scores import TRUE_METHOD, Method, in_order, predicting
 from worldline_core.store.artifact_files import JsonObject
 
 DECISIONS_FILE = "decisions.parquet"
-MARK = Markup('<strong class="mark">do not trust</strong>')
 
 
 def task_confusion(verdicts: Sequence[JsonObject]) -> Table | None:
@@ -80,7 +75,7 @@ def _kind(row: JsonObject) -> str:
 
 
 def trust_view(trust: JsonObject) -> dict[str, object]:
-    """Reliability, risk against coverage, what the signals tell, and the marks."""
+    """Reliability of trust, its detection of errors, and the marks."""
     methods = trust["methods"]
     known = [m for m in predicting(methods) if methods[m.name]["available"]]
     reliability = [
@@ -97,11 +92,6 @@ def trust_view(trust: JsonObject) -> dict[str, object]:
             title="Are verdicts right as often as they say?", x_label="stated probability of a right verdict",
             y_label="share of right verdicts, 95 % interval", in_percent=True,
         ),
-        line_chart(
-            [_coverage(methods[m.name]["coverage"], m.long_label, m.colour) for m in known],
-            title="What is gained where the least trusted are left out", x_label="share of the verdicts that are kept",
-            y_label="wrong among the kept, 95 % interval", in_percent=True,
-        ),
     ] if known else []  # fmt: skip
     return {
         "recordings": trust["training_recordings"],
@@ -112,17 +102,8 @@ def trust_view(trust: JsonObject) -> dict[str, object]:
         "tables": [
             _detection(methods, known),
             _marks(methods, known),
-            _rankings(methods, known),
-            _marked_policies(methods),
-            *_least(methods, known),
         ],
     }
-
-
-def _coverage(coverage: JsonObject, label: str, colour: str) -> Series:
-    shares = sorted(coverage, key=float)
-    mean, low, high = ([coverage[share][key] for share in shares] for key in ("value", "low", "high"))
-    return Series(label, [float(share) for share in shares], mean, low, high, colour)
 
 
 def _told(found: JsonObject, bounds: tuple[str, str] = ("low", "high")) -> object:
@@ -134,14 +115,13 @@ def _told(found: JsonObject, bounds: tuple[str, str] = ("low", "high")) -> objec
 
 
 def _detection(methods: JsonObject, known: Sequence[Method]) -> Table | None:
-    """How well wrong verdicts are told from right ones, by each signal alone and together."""
+    """Detection of wrong verdicts by trust, and its calibration error."""
     rows: list[list[object]] = []
     for m in known:
         found = methods[m.name]
-        signals = [_told(found["signals"][name]["auroc"]) if name in found["signals"] else None for name in SIGNALS]
-        rows.append([m.long_label, *signals, _told(found["auroc"]), _told(found["calibration_error"])])
-    headings = ["Verdicts on videos of", *[words(name).capitalize() for name in SIGNALS], "Trust", "Calibration error"]
-    caption = "How well wrong verdicts are told from right ones: AUROC (0.5 is chance), 95 % interval over starts"
+        rows.append([m.long_label, _told(found["auroc"]), _told(found["calibration_error"])])
+    headings = ["Verdicts on videos of", "AUROC", "Calibration error"]
+    caption = "How well trust detects wrong verdicts (AUROC, 0.5 is chance), 95 % interval over starts"
     return Table(headings, rows, range(1, len(headings)), caption, dense=True) if rows else None
 
 
@@ -150,95 +130,11 @@ def _marks(methods: JsonObject, known: Sequence[Method]) -> Table | None:
     rows: list[list[object]] = []
     for m in known:
         found = methods[m.name]
-        errors = [found["error"], found["marked"]["error"], found["marked"]["error_of_others"]]
-        rows.append([m.long_label, found["verdicts"], found["marked"]["count"], *map(_told, errors)])
+        errors = [found["error"], found["error_of_marked"], found["error_of_others"]]
+        rows.append([m.long_label, found["verdicts"], found["marked"], *map(_told, errors)])
     headings = ["Verdicts on videos of", "Verdicts", "Marked", "Wrong", "Wrong among marked", "Wrong among others"]
     return (
         Table(headings, rows, range(1, 6), "What the marks leave out, 95 % interval over starts", dense=True)
         if rows
         else None
     )
-
-
-def _rankings(methods: JsonObject, known: Sequence[Method]) -> Table | None:
-    """How policies rank without the least trusted verdicts, against the recorded rates of all attempts."""
-    rows: list[list[object]] = []
-    for m in known:
-        for kept, found in sorted(methods[m.name].get("policies", {}).items(), key=_leaving_out):
-            what = {"1.00": "all", "not marked": kept}.get(kept) or f"{percent(float(kept))} most trusted"
-            cells = [_told({**found[s], **_both(found[s])}) if s in found else None for s in STATISTICS]
-            same = found.get("with_all_verdicts", {}).get("pearson")
-            rows.append(
-                [m.long_label, what, found["ranked"], *cells, None if same is None else _told({**same, **_both(same)})]
-            )
-    if not rows:
-        return None
-    headings = [
-        "Videos of",
-        "Verdicts",
-        "Policies",
-        "Pearson r",
-        "Spearman rho",
-        "MMRV",
-        "Error of rates",
-        "r with all their verdicts",
-    ]
-    caption = "Agreement of the policies' success rates where other verdicts are left out, 95 % interval over starts and policies"
-    return Table(headings, rows, range(2, 8), caption, dense=True)
-
-
-def _leaving_out(choice: tuple[str, JsonObject]) -> tuple[bool, str]:
-    """All verdicts first, then fewer and fewer of the most trusted, then those without a mark."""
-    kept = choice[0]
-    return kept.startswith("not"), "" if kept.startswith("not") else f"{1 - float(kept):.2f}"
-
-
-def _both(found: JsonObject) -> JsonObject:
-    low, high = found["over_starts_and_policies"] or (None, None)
-    return {"low": low, "high": high}
-
-
-def _marked_policies(methods: JsonObject) -> Table | None:
-    """Share of the marked verdicts of every source of episodes; one most of whose verdicts are marked bears the mark itself."""
-    shown = predicting(methods)
-    shares = {m.name: methods[m.name]["marked"]["policies"] for m in shown}
-    names = sorted({name for found in shares.values() for name in found})
-    if len(names) < 2:
-        return None
-    rows: list[list[object]] = []
-    for name in sorted(names, key=lambda name: -max(found.get(name, 0.0) for found in shares.values())):
-        found = [shares[m.name].get(name) for m in shown]
-        rows.append(
-            [
-                name,
-                *[None if x is None else percent(x) for x in found],
-                MARK if max(x or 0.0 for x in found) > 0.5 else "",
-            ]
-        )
-    headings = ["Policy", *[m.long_label for m in shown], ""]
-    return Table(headings, rows, range(1, len(shown) + 1), "Marked verdicts by policy", dense=True)
-
-
-def _least(methods: JsonObject, known: Sequence[Method]) -> list[Table]:
-    """The least trusted verdicts of every method."""
-    headings = ["Episode", "Judged", "Recorded", "Trust", "Why", ""]
-    return [
-        Table(
-            headings,
-            [
-                [
-                    v["episode_id"],
-                    v["predicted"],
-                    v["outcome"],
-                    number(v["trust"]),
-                    v["do_not_trust"],
-                    MARK if v["do_not_trust"] else "",
-                ]
-                for v in methods[m.name]["least_trusted"]
-            ],
-            (3,),
-            f"The least trusted verdicts on videos of {m.long_label}",
-            dense=True,
-        )
-        for m in known
-    ]

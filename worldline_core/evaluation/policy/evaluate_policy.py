@@ -1,8 +1,8 @@
 """The step evaluate_policy: does a judge who sees only predicted videos agree with what really happened?
 
-As many successes as failures are judged in every split and task family: of every method those that it predicted, first of
-all those that all methods predicted, so that one with few videos narrows no other's figure. The recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling. Accuracy is pooled per seed
-and averaged over seeds, by split and task family, with intervals.
+As many successes as failures are judged in every split and task family: of every method those that it predicted, first of all those
+that all methods predicted. The recorded videos are judged too (method ``true``): that accuracy is the judge's own ceiling. Accuracy
+is pooled per seed and averaged over seeds, by split and task family, with intervals.
 """
 
 from __future__ import annotations
@@ -18,16 +18,21 @@ from typing import Any
 
 import numpy as np
 
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import DataError
+from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
 from worldline_core.evaluation.policy.judge import Judge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
-from worldline_core.evaluation.policy.novelty import KnownSetting
-from worldline_core.evaluation.policy.saved_trust import JudgedBy, SavedMethod, SavedTrust, content_digest, predicted_by
-from worldline_core.evaluation.policy.trust import TRUST_COLUMNS, calibrated, trust_verdicts
+from worldline_core.evaluation.policy.trust import (
+    TRUST_COLUMNS,
+    JudgedBy,
+    TrustModel,
+    assess_trust,
+    content_digest,
+)
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import (
     TRUE_METHOD,
@@ -50,6 +55,7 @@ from worldline_core.evaluation.scores import (
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.evaluation.vlm_models import open_vlm
 from worldline_core.progress import with_progress
+from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
 
 logger = logging.getLogger(__name__)
@@ -57,150 +63,73 @@ logger = logging.getLogger(__name__)
 DECISIONS_FILE = "decisions.parquet"
 _OUTCOMES = ("success", "failure")
 _ALL = "all"
+_LABELS = ("episode_id", "embodiment", "split", "scene", "task_family", "instruction", "outcome")
 _COLUMNS = (
     "method", "episode_id", "embodiment", "split", "scene", "task_family", "seed", "instruction", "outcome",
     "predicted", "evidence_family", "decided_by", "answers", "malformed_answers", "evidence",
 )  # fmt: skip
-_LABELS = ("episode_id", "embodiment", "split", "scene", "task_family", "instruction", "outcome")
 
 
 def evaluate_policy(config: PolicyEvaluationConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Judge every method's videos and compare with the recorded outcomes.
 
     Inputs: episodes, rollouts.<method>; tracks and segmenter where the judge uses them.
-    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json (with
-    ``compare_policies`` also how success rates of policies agree: ``agreement.py``; with ``trust`` how far verdicts are to be
-    trusted: ``trust.py``); with ``trust`` also trust.safetensors, for evaluations without outcomes (``saved_trust.py``).
+    Output: scores.parquet (metric ``correct``), decisions.parquet (every verdict with its evidence), summary.json; with ``trust`` also
+    trust.safetensors, for evaluations without outcomes.
     """
-    episodes = EpisodeSet.open(inputs["episodes"])
-    rollouts = open_rollouts(inputs)
-    tracks = open_tracks(inputs)
-    judge = open_judge(config, inputs.get("segmenter"))
-    asked = None if config.trust is None else config.trust.calibration
-    saved = None if asked is None else SavedTrust.read(asked)
-    recordings = None if saved is None else (saved.controls, saved.setups, saved.training_recordings)
-    known = None if config.trust is None else KnownSetting.of(episodes, tracks, config.trust, recordings)
+    episodes, rollouts, tracks = EpisodeSet.open(inputs["episodes"]), open_rollouts(inputs), open_tracks(inputs)
     predicted = {method: set(rollout.episode_ids) for method, rollout in rollouts.items()}
     times = Counter(name for names in predicted.values() for name in names)
     rows = rows_of(episodes, times)
     chosen = choose_trajectories(config, rows, times)
-    outcomes = chosen_outcomes(config)
-    judged_by = JudgedBy(
-        judge=judge.name, views=config.views, segmenter=config.segmenter,
-        segmenter_weights=content_digest(inputs["segmenter"]) if "segmenter" in inputs else None,
-    )  # fmt: skip
-    if saved is not None:
-        saved.require(judged_by, {row.embodiment for row in chosen})
     if config.compare_policies and chosen:
         require_policies({row.source for row in chosen})
+    judge = open_judge(config, inputs.get("segmenter"))
+    trust = open_trust(config, inputs, judge, episodes, tracks, chosen)
 
-    def verdict_on(row: EpisodeRow, method: str, seed: int) -> dict[str, Any]:
-        rollout = rollouts.get(method)
+    def judge_video(row: EpisodeRow, rollout: RolloutSet | None, seed: int) -> dict[str, Any]:
         video = trajectory_of(episodes, row, config.views, rollout=rollout, seed=seed, tracks=tracks)
         seen = video.num_frames * (1 if rollout is None else stride_of(rollout, row))
         return {"num_frames": seen, **asdict(judge_trajectory(judge, video))}
 
-    decisions: list[dict[str, Any]] = []
-    too_short: Counter[str] = Counter()
+    judged: list[dict[str, Any]] = []
     for row in with_progress(chosen, "evaluate_policy", "recording"):
-        name = row.episode_id
-        videos = [
-            (TRUE_METHOD, 0),
-            *(
-                (method, seed)
-                for method in rollouts
-                if name in predicted[method]
-                for seed in rollouts[method].seeds(name)
-            ),
-        ]
-        for method, seed in videos:
-            part = part_file(output / "run" / "parts", method, name, seed)
-            verdict = kept_part(part, partial(verdict_on, row, method, seed))
-            if verdict["num_frames"] < row.video_frames:
-                too_short[method] += 1  # the outcome may lie after the end of this video
-                continue
-            decisions.append({
-                "method": method,
-                "seed": seed,
-                **{label: getattr(row, label) for label in _LABELS},
-                **{key: verdict[key] for key in ("decided_by", "answers", "malformed_answers")},
-                "predicted": "success" if verdict["success"] else "failure",
-                "evidence_family": verdict["family"],
-                "evidence": json.dumps(verdict["statements"], sort_keys=True),
-                "confidence": confidence_of(verdict),
-            })  # fmt: skip
+        known_to = [method for method, names in predicted.items() if row.episode_id in names]
+        predictions = [(method, seed) for method in known_to for seed in rollouts[method].seeds(row.episode_id)]
+        for method, seed in [(TRUE_METHOD, 0), *predictions]:
+            part = part_file(output / "run" / "parts", method, row.episode_id, seed)
+            verdict = kept_part(part, partial(judge_video, row, rollouts.get(method), seed))
+            judged.append(_decision(row, method, seed, verdict))
+    # The outcome may lie after the end of a video that is shorter than its recording.
+    too_short = Counter(verdict["method"] for verdict in judged if not verdict["whole"])
     if too_short:
         logger.warning("Predictions shorter than their recordings were not judged: %s", dict(too_short))
-    judgeable = [row for row in rows if row.split in config.splits and row.outcome in outcomes]
-    judged = {row["episode_id"] for row in decisions if row["method"] != TRUE_METHOD}
-    counts: dict[str, Any] = {
-        "found": len(rows),
-        "kept": len(judged),
-        "left_out": {
-            "in other splits": sum(row.split not in config.splits for row in rows),
-            "without a recorded success or failure": sum(
-                row.split in config.splits and row.outcome not in outcomes for row in rows
-            ),
-            "not drawn (evaluate_policy.balanced, max_per_group)": len(judgeable) - len(chosen),
-            "predicted shorter than recorded": len(chosen) - len(judged),
-        },
-    }
-    if not decisions:
-        left_out = ", ".join(f"{count} {reason}" for reason, count in counts["left_out"].items() if count)
-        raise DataError(
-            "No video can be judged",
-            where=inputs["episodes"],
-            expected=f"predictions of recordings of the splits {', '.join(config.splits)} that ended in success or failure",
-            got=f"{len(rows)} predicted episodes: {left_out}",
-            next_step="predict recordings with known outcomes, name a saved calibration (evaluate_policy.trust.calibration), or "
-            "leave the judgement out: evaluate_policy: null",
-        )
-    facts: dict[str, Any] = {"shorter_than_recording": dict(too_short)}
+    verdicts = [verdict for verdict in judged if verdict["whole"]]
+    counts = _count(config, rows, chosen, verdicts, inputs["episodes"])
+
+    known = [verdict for verdict in verdicts if verdict["outcome"] in _OUTCOMES]
     resampling = {"resamples": config.resamples, "seed": config.seed}
-    attempts = {row.episode_id: {"policy": row.source, "start": row.bank or row.episode_id} for row in chosen}
-    labelled = [
-        {"task": _verb(decision["instruction"]), **attempts[decision["episode_id"]], **decision}
-        for decision in decisions
-    ]
-    with_outcome = [row for row in labelled if row["outcome"] in _OUTCOMES]
-    if config.compare_policies and with_outcome:
-        facts["policies"] = policy_agreement(with_outcome, **resampling)
-    if config.trust is not None and known is not None:
-        news = {name: known.novelties(name) for name in {row["episode_id"] for row in labelled}}
-        of_predictions = [{**row, **news[row["episode_id"]]} for row in labelled if row["method"] != TRUE_METHOD]
-        made = {method: predicted_by(rollout.root) for method, rollout in rollouts.items()}
-        before = None if saved is None else {method: saved.calibration_of(by) for method, by in made.items()}
-        trusted, methods = trust_verdicts(
-            of_predictions, config.trust, policies=config.compare_policies, saved=before, **resampling
-        )
-        facts["trust"] = {
-            "settings": config.trust.model_dump(mode="json"), "training_recordings": known.count, "methods": methods,
-        }  # fmt: skip
-        columns = dict.fromkeys(TRUST_COLUMNS)
-        decisions = [{**columns, **row} for row in labelled if row["method"] == TRUE_METHOD] + trusted
-        if saved is None:
-            calibrations = {
-                method: SavedMethod(predicted_by=by, signals=found.signals, weights=tuple(found.weights))
-                for method, by in made.items()
-                if by is not None and methods.get(method, {}).get("available")
-                for found in (calibrated([row for row in trusted if row["method"] == method]),)
-            }
-            robots = tuple(sorted({row.embodiment for row in chosen}))
-            SavedTrust(
-                format=1, judged_by=judged_by, embodiments=robots, least_trust=config.trust.least_trust,
-                training_recordings=known.count, methods=calibrations, controls=known.controls, setups=known.setups,
-            ).write(output)  # fmt: skip
-    return counts | _write(config, decisions, facts, judge.name, output)
+    summary = summarise_decisions(verdicts, **resampling)
+    summary |= {"judge": judge.name, "interval": "95 % bootstrap over trajectories"}
+    summary["shorter_than_recording"] = dict(too_short)
+    if config.compare_policies and known:
+        summary["policies"] = policy_agreement(known, **resampling)
+    if config.trust and trust and tracks:
+        verdicts, summary["trust"] = assess_trust(verdicts, config.trust, trust, tracks, rollouts, output, **resampling)
+    verdicts = sorted(verdicts, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
+    write_table(output / DECISIONS_FILE, verdicts, _COLUMNS if trust is None else (*_COLUMNS, *TRUST_COLUMNS))
+    write_scores(output, map(_correctness, known))
+    write_json_atomic(output / SUMMARY_FILE, summary)
+    overall = {
+        name: found[_ALL]["accuracy"]["mean"] for name, found in summary["methods"].items() if "accuracy" in found[_ALL]
+    }
+    return counts | {"trajectories": summary["trajectories"], "judge": judge.name, "accuracy": overall}
 
 
 def chosen_outcomes(config: PolicyEvaluationConfig) -> tuple[str, ...]:
-    """Recordings with which outcomes are judged: with a calibration that was made before, also those whose outcome is unknown."""
+    """Outcomes of the recordings that are judged; with a saved calibration of trust also ``unknown``."""
     saved = config.trust is not None and config.trust.calibration is not None
     return (*_OUTCOMES, "unknown") if saved else _OUTCOMES
-
-
-def _verb(instruction: str) -> str:
-    return instruction.split(maxsplit=1)[0].lower() if instruction.strip() else "none"
 
 
 def choose_trajectories(
@@ -239,35 +168,91 @@ def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
     return VLMJudge(open_vlm(config.judge, config.vlm))
 
 
-def _write(
-    config: PolicyEvaluationConfig, rows: list[dict[str, Any]], facts: dict[str, Any], judge: str, output: Path
-) -> dict[str, Any]:
-    rows = sorted(rows, key=lambda row: (row["method"], row["episode_id"], row["seed"]))
-    write_table(output / DECISIONS_FILE, rows, _COLUMNS if config.trust is None else (*_COLUMNS, *TRUST_COLUMNS))
-    write_scores(
-        output,
-        [
-            Score(
-                row["method"], row["episode_id"], row["embodiment"], row["split"], "", row["seed"], "correct",
-                float(row["predicted"] == row["outcome"]), row["scene"], row["task_family"], row["outcome"],
-            )
-            for row in rows
-            if row["outcome"] in _OUTCOMES
-        ],
-    )  # fmt: skip
-    summary = summarise_decisions(rows, resamples=config.resamples, seed=config.seed)
-    summary |= {"judge": judge, "interval": "95 % bootstrap over trajectories", **facts}
-    write_json_atomic(output / SUMMARY_FILE, summary)
-    overall = {
-        method: values[_ALL]["accuracy"]["mean"]
-        for method, values in summary["methods"].items()
-        if "accuracy" in values[_ALL]
+def _decision(row: EpisodeRow, method: str, seed: int, verdict: Mapping[str, Any]) -> dict[str, Any]:
+    """A verdict with what its recording is; ``whole`` where the video shows the recording to its end."""
+    return {
+        **{label: getattr(row, label) for label in _LABELS},
+        **{key: verdict[key] for key in ("decided_by", "answers", "malformed_answers")},
+        "method": method,
+        "seed": seed,
+        "policy": row.source,
+        "start": row.bank or row.episode_id,
+        "task": row.instruction.split(maxsplit=1)[0].lower() if row.instruction.strip() else "none",
+        "whole": verdict["num_frames"] >= row.video_frames,
+        "predicted": "success" if verdict["success"] else "failure",
+        "evidence_family": verdict["family"],
+        "evidence": json.dumps(verdict["statements"], sort_keys=True),
+        "confidence": confidence_of(verdict),
     }
-    return {"trajectories": summary["trajectories"], "judge": judge, "accuracy": overall}
+
+
+def open_trust(
+    config: PolicyEvaluationConfig,
+    inputs: Mapping[str, Path],
+    judge: Judge,
+    episodes: EpisodeSet,
+    tracks: ActionTracks | None,
+    chosen: Sequence[EpisodeRow],
+) -> TrustModel | None:
+    """The saved calibration of trust that the config names, or the training recordings; before anything is judged, for both may
+    not fit."""
+    if config.trust is None:
+        return None
+    if tracks is None:
+        raise ConfigError(
+            "Trust in verdicts needs the controls", where="evaluate_policy.trust", expected="the input tracks",
+            next_step="run render_actions and give its folder as --input tracks=FOLDER",
+        )  # fmt: skip
+    weights = content_digest(inputs["segmenter"]) if "segmenter" in inputs else None
+    judged_by = JudgedBy(judge=judge.name, views=config.views, segmenter=config.segmenter, segmenter_weights=weights)
+    if config.trust.calibration is None:
+        return TrustModel.of_training(episodes, tracks, judged_by, config.trust)
+    saved = TrustModel.read(config.trust.calibration)
+    saved.require(judged_by, {row.embodiment for row in chosen})
+    return saved
+
+
+def _count(
+    config: PolicyEvaluationConfig,
+    rows: Sequence[EpisodeRow],
+    chosen: Sequence[EpisodeRow],
+    verdicts: Sequence[Mapping[str, Any]],
+    where: Path,
+) -> dict[str, Any]:
+    """Episodes found, kept and left out by reason.
+
+    Raises: DataError when none is left.
+    """
+    inside = [row for row in rows if row.split in config.splits]
+    judgeable = [row for row in inside if row.outcome in chosen_outcomes(config)]
+    kept = len({verdict["episode_id"] for verdict in verdicts if verdict["method"] != TRUE_METHOD})
+    left_out = {
+        "in other splits": len(rows) - len(inside),
+        "without a recorded success or failure": len(inside) - len(judgeable),
+        "not drawn (evaluate_policy.balanced, max_per_group)": len(judgeable) - len(chosen),
+        "predicted shorter than recorded": len(chosen) - kept,
+    }
+    if not verdicts:
+        raise DataError(
+            "No video can be judged",
+            where=where,
+            expected=f"predictions of recordings of the splits {', '.join(config.splits)} that ended in success or failure",
+            got=f"{len(rows)} predicted episodes: " + ", ".join(f"{n} {reason}" for reason, n in left_out.items() if n),
+            next_step="predict recordings with known outcomes, name a saved calibration (evaluate_policy.trust.calibration), or "
+            "leave the judgement out: evaluate_policy: null",
+        )
+    return {"found": len(rows), "kept": kept, "left_out": left_out}
+
+
+def _correctness(row: Mapping[str, Any]) -> Score:
+    return Score(
+        row["method"], row["episode_id"], row["embodiment"], row["split"], "", row["seed"], "correct",
+        float(row["predicted"] == row["outcome"]), row["scene"], row["task_family"], row["outcome"],
+    )  # fmt: skip
 
 
 def summarise_decisions(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
-    """Accuracy of every method and group, and differences between methods. Where outcomes are unknown, only what was judged.
+    """Accuracy of every method and group, and differences between methods; of unknown outcomes the predicted success.
 
     Args:
         rows: verdicts with method, episode_id, seed, split, task_family, outcome, predicted, answers, malformed_answers.
