@@ -1,4 +1,4 @@
-"""A small corpus with every kind of damage: all accounted for, each by the reason that is true (benchmarks/corruption.py
+"""A small corpus with every kind of damage: all accounted for, each by the reason that is true (benchmarks/robustness.py
 does the same with thousands of recordings)."""
 
 from __future__ import annotations

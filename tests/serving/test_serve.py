@@ -150,7 +150,7 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
 
 @pytest.mark.slow
 def test_many_sessions_at_once_are_neither_lost_nor_mixed_up(serving: Callable) -> None:
-    """The short version of `benchmarks/serve_load.py`; one client in four vanishes in the middle."""
+    """The short version of `benchmarks/serving.py`; one client in four vanishes in the middle."""
     episodes = [EPISODE, "aloha_viperx-test-s1-00000"]
 
     def alone(client: SimulatorClient, number: int) -> str:

@@ -49,7 +49,7 @@ class CalibrationDoctorConfig(StrictModel):
     """Lengths in metres, angles in degrees, scores in units of log-likelihood.
 
     The typical values are medians over the healthy training episodes of the shipped recordings
-    (`benchmarks/calibration_doctor.py --typical` prints them); they hold for other recordings as far as these
+    (`benchmarks/calibration.py mistakes --typical` prints them); they hold for other recordings as far as these
     resemble them, so the decisions rest on differences between readings.
     """
 

@@ -1,10 +1,18 @@
-"""How often the calibration doctor names a mistake: every usual one, injected one at a time into healthy recordings.
+"""How often the calibration check names a mistake, and how large a camera error it sees: both injected into healthy recordings.
 
-Run: `python benchmarks/calibration_doctor.py [--splits test,ood_test] [--every 1] [--mistakes ...] [--output out.json]`.
-Recordings with an injected defect (injected_defects.json) are left out. Quaternion, Euler, pose unit and tool offset are
-injected into the same episodes rewritten as tool poses by forward kinematics. `--without-mounts` withholds the wrist
-cameras' stated mounts from the doctor; `--imperfect` disturbs the recordings as careful calibration would; `--typical` prints what healthy episodes reach, where the typical values of
-`CalibrationDoctorConfig` come from (use it on the training split only).
+    python benchmarks/calibration.py mistakes [--splits test,ood_test] [--every 1] [--imperfect] [--without-mounts]
+    python benchmarks/calibration.py cameras [--every 2] [--seeds 0,1] [--imperfect]
+
+Both take `--agibot FOLDER --agibot-urdf FILE` (AgiBot's published samples). Recordings with an injected defect
+(injected_defects.json) are left out.
+
+- `mistakes`: every usual mistake, one at a time. Quaternion, Euler, pose unit and tool offset are injected into the same
+  episodes rewritten as tool poses by forward kinematics. `--without-mounts` withholds the wrist cameras' stated mounts;
+  `--imperfect` disturbs the recordings as careful calibration would; `--typical` prints what healthy episodes reach, the
+  origin of the typical values of `CalibrationDoctorConfig` (use it on the training split only).
+- `cameras`: one view at a time with an error of growing size, in a direction that the seed chooses, the same in all
+  episodes of a seed. For single episodes and for sources of 20: errors found, the kind they were named by, and the
+  error that could have gone unseen (median bound). The first rows are false alarms on healthy recordings.
 """
 
 from __future__ import annotations
@@ -13,35 +21,40 @@ import argparse
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import RECORDINGS, command_line, print_table
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis
-from worldline_core.calibration.observation import small_gray
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, Residual
+from worldline_core.calibration.motion_fit import PARAMETERS, moved_camera
+from worldline_core.calibration.observation import Observation, observe, small_gray
+from worldline_core.calibration.reading import read
+from worldline_core.calibration.residual import KINDS, combined, consistent_text, estimate_residuals, standing_out
 from worldline_core.calibration.source_diagnosis import diagnose_set
-from worldline_core.data.episodes.conventions import (
-    RecordedConventions,
-    applicable,
-    apply_conventions,
-)
+from worldline_core.data.episodes.conventions import RecordedConventions, applicable, apply_conventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
+from worldline_core.filters.filter_config import FilterDoctorConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.rotations import quaternion_xyzw_from_rotation
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
-from worldline_core.store.atomic import write_json_atomic
 
-RECORDINGS = Path(__file__).resolve().parents[1] / "artifacts" / "shipped" / "recordings"
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)
 SCALES = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.33)
+NUMBERED = ("tool_offset_z_m", "intrinsics_size", "camera_lag_frames", "image_lag_frames")
+CASES = {
+    "head": (("rotation", (1, 2, 3, 5, 10)), ("focal length", (3, 5, 10, 15)), ("translation", (30, 60))),
+    "wrist": (("rotation", (5, 10)), ("focal length", (15,))),
+}
+TOGETHER, DRAWS = 20, 10
 
 
 @dataclass(frozen=True)
@@ -55,7 +68,7 @@ class Healthy:
 
 
 def as_tool_poses(episode: Episode, kinematics: ArmKinematics) -> Episode:
-    """The same episode as a source that records tool poses would give it: xyz, quaternion xyzw, gripper for each arm."""
+    """The episode as recorded in tool poses: xyz, quaternion xyzw, gripper for each arm."""
     arms = kinematics.embodiment.arms
     blocks = []
     for values in (episode.state, episode.action):
@@ -77,7 +90,7 @@ def as_tool_poses(episode: Episode, kinematics: ArmKinematics) -> Episode:
 
 
 def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
-    """The same robot whose wrist camera mounts nobody wrote down."""
+    """The robot without the mounts of its wrist cameras."""
     embodiment = kinematics.embodiment
     arms = tuple(
         arm.model_copy(update={"wrist_camera": arm.wrist_camera and arm.wrist_camera.model_copy(update={"link": ""})})
@@ -90,7 +103,7 @@ def without_mounts(kinematics: ArmKinematics) -> ArmKinematics:
 
 
 def imperfect(episode: Episode, seed: int) -> Episode:
-    """The episode as a careful laboratory would have it: calibrated to millimetres, not to rounding.
+    """The episode calibrated to millimetres, as a careful laboratory would have it.
 
     Camera mounts off by 5 mm and 1 degree and unsteady by 1 mm and 0.2 degrees, fixed cameras off by 10 mm and 1 degree,
     focal lengths by 1.5 %, principal points by 1 % of the image, joints noisy by 0.002 rad (standard deviations).
@@ -145,7 +158,7 @@ def agibot(root: Path, description: Path) -> Iterator[Healthy]:
 
 
 def observable(name: str, episode: Healthy, diagnosis: Diagnosis, config: CalibrationDoctorConfig) -> bool:
-    """Whether a recording holds anything that a mistake would change in a way that can be known to be wrong."""
+    """True if a recording holds anything that this mistake would make recognisably wrong."""
     kinematics, state = episode.kinematics, episode.joints.state_kind
     if name == "image_lag_frames":
         return min(len(images) for images in episode.gray.values()) > config.min_image_pairs
@@ -161,12 +174,8 @@ def observable(name: str, episode: Healthy, diagnosis: Diagnosis, config: Calibr
 
 def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, RecordedConventions]]:
     """(name, episode to spoil, conventions); numbers vary with `choice`, the same for a whole source."""
-    height, width = (
-        next(iter(episode.joints.cameras.values())).height,
-        next(iter(episode.joints.cameras.values())).width,
-    )
-    scale = SCALES[choice % len(SCALES)]
-    size = (round(height * scale), round(width * scale))
+    camera, scale = next(iter(episode.joints.cameras.values())), SCALES[choice % len(SCALES)]
+    size = (round(camera.height * scale), round(camera.width * scale))
     cases = [
         ("none", episode.joints, RecordedConventions()),
         ("none (tool poses)", episode.poses, RecordedConventions()),
@@ -190,24 +199,12 @@ def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, Reco
             yield name, base, conventions
 
 
-def examine(
-    episode: Healthy, base: Episode, conventions: RecordedConventions, config: CalibrationDoctorConfig, mounts: bool
-) -> Diagnosis:
-    spoiled = corrupt(base, conventions)
-    images = corrupted_image_frames(base.num_frames, conventions)
-    gray = {view: values[images] for view, values in episode.gray.items()}
-    kinematics = episode.kinematics
-    if kinematics is not None and not mounts:
-        kinematics = without_mounts(kinematics)
-    return diagnose(spoiled, gray, kinematics, config)
-
-
 def named(diagnosis: Diagnosis) -> str:
     return diagnosis.best.mistake if diagnosis.verdict == "explained" else diagnosis.verdict
 
 
 def right(name: str, conventions: RecordedConventions, found: str, value: RecordedConventions) -> bool:
-    """The mistake by name, a lag to within a frame; a healthy episode must not be called anything."""
+    """True if the mistake is named, a lag to within a frame, and a healthy episode is called nothing."""
     if name.startswith("none"):
         return found in ("consistent", "too_little_evidence")
     if found != name:
@@ -217,20 +214,7 @@ def right(name: str, conventions: RecordedConventions, found: str, value: Record
     return True
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--recordings", type=Path, default=RECORDINGS)
-    parser.add_argument("--splits", default="test,ood_test")
-    parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--mistakes", default="", help="comma-separated; default: all")
-    parser.add_argument("--without-mounts", action="store_true")
-    parser.add_argument("--imperfect", action="store_true", help="disturb the healthy calibration by millimetres first")
-    parser.add_argument("--agibot", type=Path, help="folder of AgiBot (GE-Sim) samples to spoil instead")
-    parser.add_argument("--agibot-urdf", type=Path, help="kinematic description of the AgiBot G1")
-    parser.add_argument("--typical", action="store_true")
-    parser.add_argument("--verbose", action="store_true")
-    parser.add_argument("--output", type=Path)
-    arguments = parser.parse_args()
+def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) -> None:
     config = CalibrationDoctorConfig()
     wanted = {name for name in arguments.mistakes.split(",") if name}
     confusion: dict[str, Counter[str]] = defaultdict(Counter)
@@ -238,19 +222,20 @@ def main() -> None:
     sets: dict[tuple[str, str], list[Diagnosis]] = defaultdict(list)
     truth: dict[tuple[str, str], RecordedConventions] = {}
     lag_errors: dict[str, list[float]] = defaultdict(list)
-    measures: dict[str, list[float]] = defaultdict(list)
+    healthy_values: dict[str, list[float]] = defaultdict(list)
     spent, count = 0.0, 0
     unobservable: Counter[str] = Counter()
-    if arguments.agibot is not None:
-        items = agibot(arguments.agibot, arguments.agibot_urdf)
-    else:
-        items = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every, arguments.imperfect)
     for number, episode in enumerate(items):
         for name, base, conventions in injected(episode, number):
             if wanted and name not in wanted:
                 continue
+            images = corrupted_image_frames(base.num_frames, conventions)
+            gray = {view: values[images] for view, values in episode.gray.items()}
+            kinematics = episode.kinematics
+            if kinematics is not None and arguments.without_mounts:
+                kinematics = without_mounts(kinematics)
             start = time.process_time()
-            diagnosis = examine(episode, base, conventions, config, not arguments.without_mounts)
+            diagnosis = diagnose(corrupt(base, conventions), gray, kinematics, config)
             spent, count = spent + time.process_time() - start, count + 1
             found = named(diagnosis)
             if not observable(name, episode, diagnosis, config):
@@ -263,49 +248,33 @@ def main() -> None:
             if arguments.verbose and not correct[name][-1]:
                 explain(name, conventions, diagnosis)
             if arguments.typical and name.startswith("none"):
-                rival = {e.mistake: e.score - diagnosis.none.score for e in reversed(diagnosis.ranked)}
-                for mistake, margin in rival.items():
-                    measures[f"{name}: margin of {mistake}"].append(margin)
-                for view in diagnosis.measures:
-                    kind = f"{name}: {'wrist' if view.view.endswith('wrist') else 'still'} "
-                    for field in ("flow_agreement", "motion_overlap", "finger_flow"):
-                        if getattr(view, field) is not None:
-                            measures[kind + field].append(getattr(view, field))
-            same_number = conventions.departures and conventions.departures[0] in _NUMBERED
-            if not same_number:  # numbered mistakes vary over episodes here; a source has one value
+                collect_typical(name, diagnosis, healthy_values)
+            if not (conventions.departures and conventions.departures[0] in NUMBERED):
+                # Numbered mistakes vary over episodes here, while a source has one value.
                 sets[name, episode.joints.embodiment].append(diagnosis)
                 truth[name, episode.joints.embodiment] = conventions
     set_correct: dict[str, list[bool]] = defaultdict(list)
     for (name, embodiment), diagnoses in sets.items():
         summed = diagnose_set(embodiment, diagnoses, config)
-        found = summed.best.mistake if summed.verdict == "explained" else summed.verdict
-        set_correct[name].append(right(name, truth[name, embodiment], found, summed.best.conventions))
+        set_correct[name].append(right(name, truth[name, embodiment], named(summed), summed.best.conventions))
     report(confusion, correct, set_correct, lag_errors)
     for case, times in unobservable.items():
         print(f"not observable in the recording, not counted: {case} ({times})")
     print(f"{count} diagnoses, {spent / max(count, 1) * 1e3:.0f} ms of CPU each")
-    for name, values in measures.items():
+    for name, values in healthy_values.items():
         low, middle, high = np.percentile(values, [5, 50, 95])
         print(f"{name}: 5 % {low:.2f}, median {middle:.2f}, 95 % {high:.2f}, max {max(values):.2f} (n = {len(values)})")
-    if arguments.output is not None:
-        write_json_atomic(
-            arguments.output,
-            {
-                "splits": arguments.splits,
-                "every": arguments.every,
-                "imperfect": arguments.imperfect,
-                "stated_mounts": not arguments.without_mounts,
-                "confusion": {name: dict(found) for name, found in confusion.items()},
-                "correct_share": {name: float(np.mean(values)) for name, values in correct.items()},
-                "correct_share_of_sources": {name: float(np.mean(values)) for name, values in set_correct.items()},
-                "not_observable": dict(unobservable),
-                "lag_errors_frames": lag_errors,
-                "cpu_ms_a_diagnosis": spent / max(count, 1) * 1e3,
-            },
-        )
 
 
-_NUMBERED = ("tool_offset_z_m", "intrinsics_size", "camera_lag_frames", "image_lag_frames")
+def collect_typical(name: str, diagnosis: Diagnosis, values: dict[str, list[float]]) -> None:
+    """Margins of the rival readings and measures of each view of a healthy episode."""
+    for mistake, score in {e.mistake: e.score for e in reversed(diagnosis.ranked)}.items():
+        values[f"{name}: margin of {mistake}"].append(score - diagnosis.none.score)
+    for view in diagnosis.measures:
+        kind = f"{name}: {'wrist' if view.view.endswith('wrist') else 'still'} "
+        for measure in ("flow_agreement", "motion_overlap", "finger_flow"):
+            if getattr(view, measure) is not None:
+                values[kind + measure].append(getattr(view, measure))
 
 
 def explain(name: str, conventions: RecordedConventions, diagnosis: Diagnosis) -> None:
@@ -322,13 +291,13 @@ def report(
     set_correct: dict[str, list[bool]],
     lag_errors: dict[str, list[float]],
 ) -> None:
-    print(f"{'injected':20} {'n':>4} {'right':>6} {'sources':>8}  found instead")
+    rows = []
     for name, found in confusion.items():
-        shares = f"{100 * np.mean(correct[name]):5.1f}%"
-        sources = f"{100 * np.mean(set_correct[name]):6.0f}%" if set_correct.get(name) else "      -"
+        sources = f"{100 * np.mean(set_correct[name]):.0f} %" if set_correct.get(name) else ""
         accepted = {name} if not name.startswith("none") else {"consistent", "too_little_evidence"}
         others = ", ".join(f"{k} {v}" for k, v in found.most_common() if k not in accepted)
-        print(f"{name:20} {sum(found.values()):4d} {shares} {sources}  {others}")
+        rows.append((name, found.total(), f"{100 * np.mean(correct[name]):.1f} %", sources, others))
+    print_table(("injected", "episodes", "right", "right over sources", "found instead"), rows)
     mistakes = [value for name, values in correct.items() if not name.startswith("none") for value in values]
     clean = [value for name, values in correct.items() if name.startswith("none") for value in values]
     if mistakes:
@@ -339,6 +308,152 @@ def report(
         print(
             f"{name}: {100 * np.mean(np.abs(errors) <= 1):.1f} % within one frame, largest error {np.abs(errors).max()}"
         )
+
+
+# Errors of one camera
+
+
+@dataclass
+class Tally:
+    """Results of one case: of single episodes and of sources."""
+
+    alone: list[bool] = field(default_factory=list)
+    together: list[bool] = field(default_factory=list)
+    named: Counter[str] = field(default_factory=Counter)
+    unseen_alone: list[float] = field(default_factory=list)
+    unseen_together: list[float] = field(default_factory=list)
+
+
+def spoiled(observation: Observation, view: str, theta: np.ndarray) -> Observation:
+    """The same pictures with one camera's calibration changed."""
+    episode = observation.episode
+    cameras = {**episode.cameras, view: moved_camera(episode.cameras[view], theta)}
+    gray = {view: observation.gray[view]}
+    return replace(observation, episode=replace(episode, cameras=cameras), gray=gray)
+
+
+def errors(seed: int, view: str) -> Iterator[tuple[str, float, np.ndarray]]:
+    """(kind, size in its unit, parameters): of each case one direction."""
+    random = np.random.default_rng([seed, len(view)])
+    for name, sizes in CASES["wrist" if view.endswith("wrist") else view]:
+        kind = KINDS[name]
+        direction = random.normal(size=kind.parameters.stop - kind.parameters.start)
+        for size in sizes:
+            theta = np.zeros(PARAMETERS)
+            theta[kind.parameters] = direction / np.linalg.norm(direction) * size / kind.scale
+            yield name, size, theta
+
+
+def count(
+    tally: Tally, kind: str, episodes: Sequence[tuple[Residual, ...]], config: CalibrationDoctorConfig, seed: int
+) -> None:
+    """Add what is found in single episodes, and in sources drawn from them."""
+    for residuals in episodes:
+        tally.alone.append(bool(standing_out(residuals, config.off_alone)))
+        tally.unseen_alone += [r.within for r in residuals if r.kind == kind]
+    random = np.random.default_rng(seed)
+    for _ in range(DRAWS):
+        drawn = random.choice(len(episodes), min(TOGETHER, len(episodes)), replace=False)
+        residuals = combined([episodes[i] for i in drawn])
+        off = standing_out(residuals, config.off_together)
+        tally.together.append(bool(off))
+        tally.named.update(residual.kind for residual in off)
+        tally.unseen_together += [r.within for r in residuals if r.kind == kind]
+
+
+def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
+    config = CalibrationDoctorConfig()
+    observations = [observe(item.joints, item.gray, item.kinematics) for item in items]
+
+    def estimated(observed: Observation) -> tuple[Residual, ...]:
+        reading = read(observed, RecordedConventions())
+        return () if reading is None else estimate_residuals(observed, reading, config)
+
+    start = time.process_time()
+    clean = [estimated(observed) for observed in observations]
+    print(f"{(time.process_time() - start) / len(items) * 1e3:.0f} ms of CPU an episode", flush=True)
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for view in ("head", "left_wrist"):
+            shown = [i for i, observed in enumerate(observations) if view in observed.gray]
+            of_view = [tuple(r for r in clean[i] if r.view == view) for i in shown]
+            for kind in ("rotation", "focal length"):
+                tally = Tally()
+                count(tally, kind, of_view, config, 0)
+                yield row(f"{view}: healthy, {kind}", tally)
+            tallies: dict[str, Tally] = defaultdict(Tally)
+            for seed in seeds:
+                for kind, size, theta in errors(seed, view):
+                    found = [estimated(spoiled(observations[i], view, theta)) for i in shown]
+                    count(tallies[f"{view}: {kind} {size:g} {KINDS[kind].unit}"], kind, found, config, seed)
+            yield from (row(name, tally) for name, tally in tallies.items())
+        yield exchanged_wrist_videos(items)
+
+    columns = ("error", "found in one episode", "unseen up to", "found in 20", "unseen up to", "named")
+    print_table(columns, rows())
+
+
+def exchanged_wrist_videos(items: Sequence[Healthy]) -> tuple[str, ...]:
+    """Row of exchanged wrist videos, examined as the filter does."""
+    found = []
+    for item in items:
+        views = [arm.camera_view for arm in item.kinematics.embodiment.arms] if item.kinematics is not None else []
+        if len(views) == 2:
+            gray = item.gray | {one: item.gray[two] for one, two in (views, views[::-1])}
+            found.append(diagnose(item.joints, gray, item.kinematics, FilterDoctorConfig()))
+    alone = np.mean([diagnosis.best.mistake == "wrist_videos" for diagnosis in found])
+    together = diagnose_set("exchanged", found).best.mistake
+    return "wrist videos exchanged", f"{100 * alone:.0f} % of {len(found)}", "", f"all together: {together}", "", ""
+
+
+def row(name: str, tally: Tally) -> tuple[str, ...]:
+    kinds = ", ".join(f"{kind} {number}" for kind, number in tally.named.most_common())
+    return (
+        name,
+        f"{100 * np.mean(tally.alone):.0f} % of {len(tally.alone)}",
+        f"{np.median(tally.unseen_alone):.1f}",
+        f"{100 * np.mean(tally.together):.0f} % of {len(tally.together)}",
+        f"{np.median(tally.unseen_together):.1f}",
+        kinds,
+    )
+
+
+def turned_heads(items: Iterator[Healthy]) -> None:
+    """AgiBot's samples as published, and with the head camera turned by five degrees."""
+    config = CalibrationDoctorConfig()
+    for item in items:
+        theta = np.zeros(PARAMETERS)
+        theta[1] = np.radians(5)
+        head = moved_camera(item.joints.cameras["head"], theta)
+        turned = replace(item.joints, cameras={**item.joints.cameras, "head": head})
+        for name, episode in (("as published", item.joints), ("head turned by 5 deg", turned)):
+            found = diagnose(episode, item.gray, item.kinematics, config)
+            print(f"AgiBot {episode.episode_id}, {name}: {found.verdict}; {consistent_text(found.residuals)}")
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("what", choices=("mistakes", "cameras"))
+    parser.add_argument("--recordings", type=Path, default=RECORDINGS)
+    parser.add_argument("--splits", default="test,ood_test")
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--imperfect", action="store_true", help="disturb the healthy calibration by millimetres first")
+    parser.add_argument("--agibot", type=Path, help="folder of AgiBot (GE-Sim) samples")
+    parser.add_argument("--agibot-urdf", type=Path, help="kinematic description of the AgiBot G1")
+    parser.add_argument("--seeds", default="0,1", help="cameras: directions of the errors")
+    parser.add_argument("--mistakes", default="", help="mistakes: these only, comma-separated")
+    parser.add_argument("--without-mounts", action="store_true", help="mistakes: without stated wrist camera mounts")
+    parser.add_argument("--typical", action="store_true", help="mistakes: print what healthy episodes reach")
+    parser.add_argument("--verbose", action="store_true", help="mistakes: explain the missed ones")
+    arguments = parser.parse_args()
+    shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every, arguments.imperfect)
+    samples = None if arguments.agibot is None else agibot(arguments.agibot, arguments.agibot_urdf)
+    if arguments.what == "mistakes":
+        measure_mistakes(shipped if samples is None else samples, arguments)
+        return
+    measure_cameras(list(shipped), [int(seed) for seed in arguments.seeds.split(",")])
+    if samples is not None:
+        turned_heads(samples)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,59 @@
+"""Command line, clocks and tables that the benchmarks share."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+from worldline_core.shipped import shipped_folder
+
+RECORDINGS = shipped_folder() / "recordings"
+
+
+def command_line(description: str | None) -> argparse.ArgumentParser:
+    """Parser whose help is the module's docstring as it is written."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def cpu_seconds() -> float:
+    """Processor time of this process and of its children that ended."""
+    return sum(os.times()[:4])
+
+
+def timed[T](work: Callable[[], T]) -> tuple[T, float, float]:
+    """Result, wall seconds and processor seconds of one call."""
+    wall, processor = time.perf_counter(), cpu_seconds()
+    result = work()
+    return result, time.perf_counter() - wall, cpu_seconds() - processor
+
+
+def best_seconds(call: Callable[[], object], at_least: float = 1.0) -> float:
+    """Best time of one call over at least `at_least` seconds of calls.
+
+    Processor time with one thread on a CPU, which a busy machine disturbs little, otherwise wall time.
+    """
+    import torch
+
+    clock = time.process_time if torch.get_num_threads() == 1 and not torch.cuda.is_available() else time.perf_counter
+    call()
+    best, spent = float("inf"), 0.0
+    while spent < at_least:
+        start = clock()
+        call()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        took = clock() - start
+        best, spent = min(best, took), spent + took
+    return best
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Prints a Markdown table, each row as soon as it is known; floats with three digits."""
+    print(f"\n| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    for row in rows:
+        cells = (f"{cell:,.3g}" if isinstance(cell, float) and abs(cell) < 1000 else
+                 f"{cell:,.0f}" if isinstance(cell, int | float) and not isinstance(cell, bool) else str(cell)
+                 for cell in row)  # fmt: skip
+        print(f"| {' | '.join(cells)} |", flush=True)
