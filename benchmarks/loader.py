@@ -28,16 +28,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from worldline_core.training.frame_source import FrameSource
 
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.frame_decoder import torchcodec_fault
-from worldline_core.training.clip_config import ClipSampling, FrameInput
-from worldline_core.training.clip_loader import ClipReader
-from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import Clip
-from worldline_core.training.frame_source import FrameSource, frame_rows
+from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.clip_loader import ClipDataset, read_ahead
+from worldline_core.training.clip_sampler import Clip, ClipSampler
 
 TICK = os.sysconf("SC_CLK_TCK")
 CASES: dict[str, dict[str, Any]] = {
@@ -177,19 +175,19 @@ class Baseline:
 def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes: int, rounds: int) -> dict[str, Any]:
     """Frames a second of the loader and of both baselines."""
     config = FrameInput.model_validate({"decoder": decoder, "image_size": case["size"]})
-    rows = frame_rows(episodes, VIEWS, primary_alone=False)
-    source = FrameSource(episodes, rows, config, tokenizer=None, latent_shape=(1, 1, 1), description={})
+    source = FrameSource(episodes, shipped_folder() / "models" / "tokenizer", config, views=VIEWS)
     sampling = ClipSampling.model_validate({"lengths": case["lengths"]})
-    sampler = ClipSampler(source, sampling, splits=["train"], batch_size=case["batch"], seed=0)
+    sampler = ClipSampler(source.rows, sampling, splits=["train"], start_step=1, batch_size=case["batch"], seed=0)
     steps = case["steps"]
     batches = [sampler.clips(index).clips for index in range(steps)]
     frames = len(VIEWS) * sum(clip.num_frames for batch in batches for clip in batch)
     raw, whole = (Baseline(work, source, batches, processes) for work in (decode_raw, decode_whole))
-    loader = ClipPrefetcher(ClipReader(source, sampler, VIEWS), workers=processes, stop=steps)
+    # Without end, so that every pass goes on with the next micro-steps.
+    loader = read_ahead(ClipDataset(source, sampler, VIEWS, ReadingConfig(workers=processes)), 0, None)
 
     def load() -> None:
-        for index in range(steps):
-            loader.read(index)
+        for _ in range(steps):
+            next(loader)
 
     baselines = {process.pid for process in (*raw.processes, *whole.processes)}
     load()
@@ -208,7 +206,6 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes:
             spent = processor_seconds([me, *workers]) - before, time.perf_counter() - started
             if turn:  # the first round opens files and touches memory for the first time
                 times[name].append(spent)
-    loader.close()
     raw.close()
     whole.close()
     found: dict[str, Any] = {"decoder": source.decoder.name, "frames_a_round": frames}

@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import jaxtyping
@@ -116,8 +115,7 @@ def forked_loaders(monkeypatch: pytest.MonkeyPatch) -> None:
     That training spawns them is tested with the ones that end with their training process.
     """
     multiprocessing.set_forkserver_preload(["torch", "cv2", "pyarrow.parquet", "pydantic", "scipy.spatial"])
-    contexts = SimpleNamespace(get_context=lambda _: multiprocessing.get_context("forkserver"))
-    monkeypatch.setattr("worldline_core.training.clip_prefetcher.multiprocessing", contexts)
+    monkeypatch.setattr("worldline_core.training.clip_loader.START_METHOD", "forkserver")
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from worldline_core.actions.action_maps import control_frames, stack_controls
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import DataError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.relational import SimilarityMatrices, common_shape, similarity_matrices
 from worldline_core.training.train_tokenizer import to_video
 from worldline_core.training.training_config import RelationalConfig

@@ -32,7 +32,7 @@ from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
 from worldline_core.store.artifact_files import read_json, read_json_lines
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.relational import RelationalTerm
 from worldline_core.training.stage1 import stage1_groups

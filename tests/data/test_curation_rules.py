@@ -257,20 +257,14 @@ def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
 def test_the_clip_sampler_follows_these_weights() -> None:
     """Drawn clips against the shares that the weights were made for."""
     from worldline_core.training.clip_config import ClipSampling
-    from worldline_core.training.clip_sampler import ClipSampler
-    from worldline_core.training.clip_source import ClipRow
+    from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 
     rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
     sampling = SourceSampling(shares={"large": 0.4, "small": 0.6})
 
     stored = [ClipRow(r.episode_id, r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
-
-    class Store:
-        start_step = 1
-        rows = stored
-
     config = ClipSampling(lengths=(33,), source_weights=source_weights(rows, sampling))
-    sampler = ClipSampler(Store(), config, splits=["train"], batch_size=50, seed=0)  # type: ignore[arg-type]
+    sampler = ClipSampler(stored, config, splits=["train"], start_step=1, batch_size=50, seed=0)
     drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
     share = sum(name.startswith("small") for name in drawn) / len(drawn)
     assert share == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / len(drawn)))

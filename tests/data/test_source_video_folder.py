@@ -205,9 +205,8 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
 
     from worldline_core.data.episodes.episode_set import EpisodeSetWriter
     from worldline_core.training.clip_config import EncodeLatentsConfig
-    from worldline_core.training.clip_source import training_rows
+    from worldline_core.training.clip_source import LatentStore, training_rows
     from worldline_core.training.encode_latents import encode_latents
-    from worldline_core.training.latent_store import LatentStore
     from worldline_core.training.stage1 import train_stage1
     from worldline_core.training.training_config import Stage1Config
 

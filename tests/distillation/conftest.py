@@ -18,7 +18,7 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, wr
 from worldline_core.data.episodes import episode_index
 from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.contracts import CausalSpec
-from worldline_core.training.latent_store import clip_key
+from worldline_core.training.clip_source import clip_key
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 FRAMES = 21

@@ -31,8 +31,8 @@ from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_file, folder_files
 from worldline_core.training.clip_loader import ClipLoader
-from worldline_core.training.clip_source import Clip
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_source import LatentStore
 
 
 def trainer(steps: int, **changes: object) -> dict[str, object]:

@@ -25,8 +25,8 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerC
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import plan
 from worldline_core.training.clip_config import EncodeLatentsConfig
+from worldline_core.training.clip_source import FrameSource
 from worldline_core.training.encode_latents import encode_latents
-from worldline_core.training.frame_source import FrameSource
 
 FRAME_INPUT = {"kind": "frames", "image_size": list(IMAGE), "start_step": 4}
 

@@ -17,7 +17,7 @@ from worldline_core.model.tokenizers import WanTokenizer
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training import train_tokenizer
-from worldline_core.training.frame_source import LoadedView
+from worldline_core.training.clip_source import LoadedView
 from worldline_core.training.train_tokenizer import train_small_decoder
 from worldline_core.training.training_config import TokenizerConfig
 

@@ -16,7 +16,7 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_token
 from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
-from worldline_core.training.frame_source import LoadedView
+from worldline_core.training.clip_source import LoadedView
 from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder
 from worldline_core.training.training_config import TokenizerConfig
 

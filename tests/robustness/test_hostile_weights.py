@@ -25,7 +25,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.publishing.content import check_manifest
 from worldline_core.store.artifact_files import read_json, read_json_lines
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.video_teacher import load_teacher
 
 

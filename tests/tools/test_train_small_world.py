@@ -35,7 +35,7 @@ from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.relational import TeacherSimilarities
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import load_teacher

@@ -18,7 +18,7 @@ from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, wr
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.world_model import WorldModelConfig
-from worldline_core.training.latent_store import LatentRow, group_key, single_key
+from worldline_core.training.clip_source import LatentRow, group_key, single_key
 
 FRAMES, CHANNELS, GRID, IMAGE = 17, 4, (4, 4), (32, 32)
 TINY_MODEL = {

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import DataError
 from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.latent_store import LatentStore
+from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.processes import BatchPlan
-from worldline_core.training.training_config import Stage1Config
 
 
 @pytest.fixture
@@ -21,8 +20,9 @@ def store(world: Any) -> LatentStore:
 
 
 def make(store: LatentStore, config: ClipSampling | None = None, **changes: Any) -> ClipSampler:
-    values: dict[str, Any] = {"splits": ["train"], "batch_size": 4, "seed": 3}
-    return ClipSampler(store, config or ClipSampling(lengths=(5, 9, 17)), **(values | changes))
+    values: dict[str, Any] = {"splits": ["train"], "start_step": store.start_step, "batch_size": 4, "seed": 3}
+    rows = changes.pop("rows", store.rows)
+    return ClipSampler(rows, config or ClipSampling(lengths=(5, 9, 17)), **(values | changes))
 
 
 def test_clips_are_a_pure_function_of_seed_and_step(store: LatentStore) -> None:
@@ -54,11 +54,10 @@ def test_ranks_share_the_global_batch(store: LatentStore) -> None:
 
 
 @pytest.mark.parametrize(("together", "world_size"), [(2, 1), (1, 2), (4, 2), (2, 4)])
-@pytest.mark.parametrize("order", ["weighted", "epochs"])
 def test_another_number_of_processes_goes_on_with_the_same_clips(
-    store: LatentStore, together: int, world_size: int, order: str
+    store: LatentStore, together: int, world_size: int
 ) -> None:
-    config = ClipSampling.model_validate({"lengths": (5, 9), "order": order})
+    config = ClipSampling(lengths=(5, 9))
     before = [
         make(store, config, batch_size=2, plan=BatchPlan(4, together, rank, together)) for rank in range(together)
     ]
@@ -110,98 +109,31 @@ def test_impossible_requests_are_named(store: LatentStore) -> None:
         make(store, ClipSampling(lengths=(33,)))
     with pytest.raises(ValidationError, match=r"lengths \[8, 15\]: a causal tokenizer codes clips of 4 k \+ 1"):
         ClipSampling(lengths=(5, 8, 15))
-    with pytest.raises(ValidationError, match="needs one weight"):
-        ClipSampling(lengths=(5, 9), length_weights=(1.0,))
-
-
-def every_clip(store: LatentStore, lengths: tuple[int, ...], hop: int = 4) -> set[tuple[str, int, int]]:
-    return {
-        (row.episode_id, start, length)
-        for row in store.rows
-        if row.split == "train"
-        for length in lengths
-        for start in range(0, row.num_frames - length + 1, hop)
-    }
-
-
-@pytest.mark.parametrize(("world_size", "hop"), [(1, None), (2, None), (3, 8)])
-def test_an_epoch_holds_every_clip_once_over_all_ranks(store: LatentStore, world_size: int, hop: int | None) -> None:
-    # 6 episodes x (4 + 3 + 1) starts at every fourth frame: 24, 18 and 6 clips; 12, 12 and 6 at every eighth.
-    config = ClipSampling(lengths=(5, 9, 17), order="epochs", hop=hop)
-    expected = every_clip(store, (5, 9, 17), hop or 4)
-    samplers = [
-        make(store, config, batch_size=6 // world_size, plan=BatchPlan(world_size, world_size, rank, world_size))
-        for rank in range(world_size)
-    ]
-    batches = len(expected) // 6
-    for epoch in range(2):
-        seen = Counter(
-            (clip.episode_id, clip.start, clip.num_frames)
-            for sampler in samplers
-            for index in range(epoch * batches, (epoch + 1) * batches)
-            for clip in sampler.clips(index).clips
-        )
-        assert set(seen) == expected
-        assert set(seen.values()) == {1}
-    assert samplers[0].clips_per_epoch == len(expected)
-    assert samplers[0].epochs(batches) == 1.0
-    assert make(store).epochs(batches) is None
-
-
-def test_an_epoch_goes_on_in_its_middle(store: LatentStore) -> None:
-    config = ClipSampling(lengths=(5, 9), order="epochs", view_weights={"primary": 1.0, "joint": 1.0})
-    whole = [make(store, config).clips(index) for index in range(30)]
-    later = make(store, config)
-    assert [later.clips(index) for index in range(13, 30)] == whole[13:]
-    assert {batch.view for batch in whole} == {"primary", None}
-    for batch in whole:
-        assert len({clip.num_frames for clip in batch.clips}) == 1
 
 
 def test_a_replacement_is_another_clip_of_the_same_kind(store: LatentStore) -> None:
-    for order in ("weighted", "epochs"):
-        sampler = make(store, ClipSampling(lengths=(5, 9), order=order))
-        drawn = [sampler.replacement(3, 1, attempt) for attempt in range(20)]
-        assert drawn == [make(store, ClipSampling(lengths=(5, 9), order=order)).replacement(3, 1, a) for a in range(20)]
-        assert {clip.num_frames for clip in drawn} == {sampler.clips(3).clips[1].num_frames}
-        assert len(set(drawn)) > 8
-        assert [sampler.replacement(3, 0, attempt) for attempt in range(20)] != drawn
+    sampler, again = (make(store, ClipSampling(lengths=(5, 9))) for _ in range(2))
+    drawn = [sampler.replacement(3, 1, attempt) for attempt in range(20)]
+    assert drawn == [again.replacement(3, 1, attempt) for attempt in range(20)]
+    assert {clip.num_frames for clip in drawn} == {sampler.clips(3).clips[1].num_frames}
+    assert len(set(drawn)) > 8
+    assert [sampler.replacement(3, 0, attempt) for attempt in range(20)] != drawn
 
 
 def test_lengths_may_be_a_range() -> None:
     assert ClipSampling.model_validate({"lengths": {"from": 33, "to": 129}}).lengths == tuple(range(33, 130, 4))
-    assert ClipSampling.model_validate({"lengths": {"from": 33, "to": 129, "step": 32}}).lengths == (33, 65, 97, 129)
-    for value in ({"from": 33}, {"from": 33, "to": 129, "steps": 4}, {"from": 33, "to": "129"}):
-        with pytest.raises(ValidationError, match="has the whole numbers"):
+    for value in ({"from": 33}, {"from": 33, "to": 129, "step": 4}, {"from": 33, "to": "129"}):
+        with pytest.raises(ValidationError, match="`from` and `to`"):
             ClipSampling.model_validate({"lengths": value})
-    for value in ({"from": 33, "to": 17}, {"from": 33, "to": 129, "step": 6}):
-        with pytest.raises(ValidationError, match="in steps of a multiple of 4"):
-            ClipSampling.model_validate({"lengths": value})
+    with pytest.raises(ValidationError, match="at least 1 item"):
+        ClipSampling.model_validate({"lengths": {"from": 33, "to": 17}})
 
 
-def test_epochs_refuse_what_they_cannot_heed(store: LatentStore) -> None:
-    for changes in ({"length_weights": (1.0, 2.0)}, {"source_weights": {"a": 2.0}}, {"single_view_factor": 2}):
-        with pytest.raises(ValidationError, match="epochs take every clip once"):
-            ClipSampling.model_validate({"lengths": (5, 9), "order": "epochs", **changes})
-    with pytest.raises(ConfigError, match="cannot start at every hop"):
-        make(store, ClipSampling(lengths=(5,), order="epochs", hop=6))
-    with pytest.raises(ValidationError, match="only epochs have one"):
-        ClipSampling(lengths=(5,), hop=8)
-
-
-def test_configurations_from_before_epochs_keep_their_form() -> None:
-    # Keys of artifacts and fingerprints of training states are made of these dumps.
-    assert set(ClipSampling().model_dump(mode="json")) == {
-        "lengths",
-        "length_weights",
-        "strides",
-        "source_weights",
-        "view_weights",
-        "single_view_factor",
-    }
-    stated = ClipSampling(order="epochs", hop=8).model_dump(mode="json")
-    assert (stated["order"], stated["hop"]) == ("epochs", 8)
-    trainer = {"steps": 1}
-    assert "input" not in Stage1Config.model_validate({"trainer": trainer}).model_dump(mode="json")
-    changed = Stage1Config.model_validate({"trainer": trainer, "input": {"kind": "latents", "workers": 2}})
-    assert changed.model_dump(mode="json")["input"]["workers"] == 2
+def test_the_draws_of_a_seed_stay_what_they_are(store: LatentStore) -> None:
+    """Checkpoints name a seed; the clips that it draws are fixed here."""
+    config = ClipSampling(lengths=(5, 9), view_weights={"joint": 1.0, "head": 1.0}, single_view_factor=2)
+    batches = [make(store, config, batch_size=2).clips(index) for index in range(3)]
+    assert [batch.view for batch in batches] == ["head", None, None]
+    drawn = [(int(clip.episode_id[-1]), clip.start) for batch in batches for clip in batch.clips]
+    assert drawn == [(4, 8), (6, 4), (2, 4), (3, 4), (6, 0), (4, 0), (4, 4), (4, 8)]
+    assert {clip.num_frames for batch in batches for clip in batch.clips} == {9}

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 import torch
 
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.relational import TeacherSimilarities, similarity_matrices
 
 

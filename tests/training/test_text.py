@@ -14,9 +14,9 @@ from worldline_core.model.text import ClipFacts, Cosmos3Text, load_text_encoder
 from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rehearsal.outside_models import write_qwen2_tokenizer
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_source import Clip, ClipBatch
+from worldline_core.training.clip_sampler import Clip, ClipBatch
+from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.training_config import Stage1Config
 

@@ -244,8 +244,6 @@ def test_how_a_run_is_shared_and_saved_does_not_name_it(tmp_path: Path) -> None:
     keys = {store.key("train", 1, TrainerConfig.model_validate({"steps": 1, **rest}), {}) for rest in ({}, SHARED)}
     assert len(keys) == 1
     assert plain != identity_digests({"config": TrainerConfig(steps=2).model_dump(mode="json")})
-    # What was made before these settings existed keeps its key.
-    assert not {"sharding", "saving", "global_batch"} & TrainerConfig(steps=1).model_dump().keys()
 
 
 def test_batches_that_cannot_be_shared_out_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_source import latent_frame_count
+from worldline_core.training.clip_sampler import latent_frame_count
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 

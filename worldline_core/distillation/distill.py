@@ -49,8 +49,8 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import ClipRow, ClipSource, named_rows, training_rows
+from worldline_core.training.clip_sampler import ClipRow, ClipSampler
+from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.processes import (
     ALONE,
     BatchPlan,
@@ -60,7 +60,7 @@ from worldline_core.training.processes import (
     processes,
     wait_for_all,
 )
-from worldline_core.training.stage import clip_batches, input_facts, open_source, validation_function
+from worldline_core.training.stage import input_facts, validation_function
 from worldline_core.training.stage_cost import latent_grid
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
@@ -178,9 +178,9 @@ class DistillationRun:
         sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
         teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
-        micro_steps = settings.trainer.steps * plan.accumulation
-        with clip_batches(self.loader, sampler, self.config.input, self._work(STEPS[0]), micro_steps) as load:
-            return self._train(STEPS[0], settings.trainer, objective, load, info)
+        stop = settings.trainer.steps * plan.accumulation
+        load = self.loader.batches(sampler, self.config.input, self._work(STEPS[0]), stop)
+        return self._train(STEPS[0], settings.trainer, objective, load, info)
 
     def trajectory_regression(self) -> dict[str, float]:
         """Step 2, from step 1's model, on trajectories that this model makes."""
@@ -213,8 +213,9 @@ class DistillationRun:
     def _sampler(self, batch_size: int, seed: int, clips: ClipSampling, plan: BatchPlan) -> ClipSampler:
         """Clips of the training splits."""
         return ClipSampler(
-            self.store, clips, splits=self.config.splits, batch_size=batch_size, seed=seed, plan=plan, rows=self.rows
-        )
+            self.rows, clips, splits=self.config.splits, start_step=self.store.start_step, batch_size=batch_size,
+            seed=seed, plan=plan,
+        )  # fmt: skip
 
     def _work(self, step: str) -> Path:
         """Where a step keeps its training state and its log until it is finished, and where the offline trajectories lie."""
@@ -240,9 +241,9 @@ class DistillationRun:
                 **settings.model_dump(mode="json"),
                 **self.config.model_dump(mode="json", include={"input"}),
             }
-            with clip_batches(self.loader, sampler, reading, folder, 0) as load:
-                make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, load=load)
-                write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
+            load = self.loader.batches(sampler, reading, folder)
+            make = partial(trajectory_shard, config=self.config, teacher=teacher, loader=self.loader, load=load)
+            write_trajectories(folder, -(-settings.clips // per_shard), make, facts)
         if processes()[0] == 0:
             write_bytes_atomic(self.output / STEPS[1] / INDEX, (folder / INDEX).read_bytes())
         wait_for_all()
@@ -296,7 +297,7 @@ class DistillationRun:
                 "config": config.model_dump(mode="json"),
                 "parent": parent.weights_sha256,
                 "stage2": self.stage2_info.weights_sha256,
-                "episodes": named_rows(self.rows),
+                "episodes": [row.identity() for row in self.rows],
             },
             title=step.replace("_", " "),
             models=(model, *(other for _, other in others)),

@@ -25,7 +25,7 @@ from worldline_core.model.tokenizers import tokenizer_outline
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.training.clip_config import ClipSampling, FrameInput
-from worldline_core.training.clip_source import latent_frame_count
+from worldline_core.training.clip_sampler import latent_frame_count
 from worldline_core.training.stage_cost import encoding_cost, frozen_bytes, parameter_counts, trained_cost
 from worldline_core.training.stage_memory import (
     USABLE,

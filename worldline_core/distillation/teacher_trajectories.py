@@ -29,7 +29,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.samplers import VelocityField, integrate
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.trainer import autocast, step_generator
 
 
@@ -124,7 +124,7 @@ def robot_masks(loader: ClipLoader, clips: Sequence[Clip], views: Sequence[str])
     if loader.tracks is None:
         raise ConfigError("Robot masks come from action tracks", next_step="give the tracks to the clip loader")
     cut = [loader.tracks.tracks(clip.episode_id).clip(list(clip.frames)) for clip in clips]
-    return clip_robot_masks(cut, views, loader.store.latent_shape[1:])
+    return clip_robot_masks(cut, views, loader.source.latent_shape[1:])
 
 
 def trajectory_shard(

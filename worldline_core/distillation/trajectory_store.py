@@ -31,7 +31,7 @@ from worldline_core.progress import Progress
 from worldline_core.store.artifact_files import digest_file, read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_source import Clip, ClipBatch
+from worldline_core.training.clip_sampler import Clip, ClipBatch
 from worldline_core.training.processes import BatchPlan, processes, wait_for_all
 
 INDEX = "trajectories.json"
@@ -213,7 +213,7 @@ class TrajectoryLoader:
         # A batch has one shape, so its clips have one length and lack the same views: a group of such clips is drawn by its
         # size, then clips within it.
         kinds = [
-            (clip.num_frames, absent_views(loader.store.row(clip.episode_id).views))
+            (clip.num_frames, absent_views(loader.source.row(clip.episode_id).views))
             for clip in store.clips(range(len(store)))
         ]
         self._kinds = sorted(set(kinds))

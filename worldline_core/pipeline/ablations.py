@@ -90,8 +90,7 @@ def matched_steps(config: PipelineConfig) -> int:
 def tokens_a_step(stage: StageConfig, views: int) -> float:
     """Expected latent frames of one view that an optimiser step is trained on; all of a run have one size."""
     clips = stage.clips
-    weights = clips.length_weights or (1.0,) * len(clips.lengths)
-    latent_frames = sum(w * (1 + (n - 1) // 4) for w, n in zip(weights, clips.lengths, strict=True)) / sum(weights)
+    latent_frames = sum(1 + (length - 1) // 4 for length in clips.lengths) / len(clips.lengths)
     drawn = clips.view_weights or {"joint": 1.0}
     shown = {name: views if name == "joint" else clips.single_view_factor for name in drawn}
     mean_views = sum(weight * shown[name] for name, weight in drawn.items()) / sum(drawn.values())

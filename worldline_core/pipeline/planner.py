@@ -30,7 +30,7 @@ from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.artifact_files import read_json
 from worldline_core.training.clip_config import ClipSampling, FrameInput
-from worldline_core.training.clip_source import latent_frame_count
+from worldline_core.training.clip_sampler import latent_frame_count
 from worldline_core.training.stage1 import is_trained
 from worldline_core.training.stage_cost import encoding_cost, flow_matching_estimate, parameter_counts
 from worldline_core.training.stage_memory import USABLE, ClipShape, Estimate, Spread, fitting_setting
@@ -283,9 +283,7 @@ def typical_lengths(clips: ClipSampling) -> list[tuple[int, float]]:
 
     Costs are at most quadratic in the length, so for many evenly drawn lengths three do (Simpson's rule).
     """
-    lengths, weights = clips.lengths, clips.length_weights
-    if weights is not None or len(lengths) <= 3:
-        shares = weights or (1.0,) * len(lengths)
-        return [(length, share / sum(shares)) for length, share in zip(lengths, shares, strict=True)]
-    ordered = sorted(lengths)
+    ordered = sorted(clips.lengths)
+    if len(ordered) <= 3:
+        return [(length, 1 / len(ordered)) for length in ordered]
     return [(ordered[0], 1 / 6), (ordered[len(ordered) // 2], 4 / 6), (ordered[-1], 1 / 6)]

@@ -16,7 +16,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
-from worldline_core.training.clip_source import latent_frame_count
+from worldline_core.training.clip_sampler import latent_frame_count
 from worldline_core.training.stage_cost import frozen_bytes
 from worldline_core.training.stage_memory import ClipShape
 

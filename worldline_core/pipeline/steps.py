@@ -160,7 +160,7 @@ _STEPS = (
     ),
     Step(
         "encode_latents",
-        2,
+        3,
         "worldline_core.training.encode_latents",
         "encode_latents",
         "training.clip_config.EncodeLatentsConfig",
@@ -179,7 +179,7 @@ _STEPS = (
     ),
     Step(
         "train_tokenizer",
-        2,
+        3,
         "worldline_core.training.train_tokenizer",
         "train_tokenizer",
         "training.training_config.TokenizerConfig",
@@ -189,7 +189,7 @@ _STEPS = (
     ),
     Step(
         "train_teacher",
-        1,
+        2,
         "worldline_core.training.video_teacher",
         "train_teacher",
         "training.training_config.TeacherConfig",
@@ -208,7 +208,7 @@ _STEPS = (
     ),
     Step(
         "train_stage1",
-        1,
+        2,
         "worldline_core.training.stage1",
         "train_stage1",
         "training.training_config.Stage1Config",
@@ -219,7 +219,7 @@ _STEPS = (
     ),
     Step(
         "train_stage2",
-        2,
+        3,
         "worldline_core.training.stage2",
         "train_stage2",
         "training.training_config.Stage2Config",
@@ -230,7 +230,7 @@ _STEPS = (
     ),
     Step(
         "distill",
-        3,
+        4,
         "worldline_core.distillation.distill",
         "distill",
         "distillation.distill_config.DistillConfig",

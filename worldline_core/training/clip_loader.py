@@ -1,140 +1,163 @@
-"""One batch, from the number of its micro-step to tensors.
+"""Batches of clips, from the number of a micro-step to tensors.
 
-`ClipReader` asks the sampler which clips they are and reads them into one array (in this process, or in the processes of
-a `ClipPrefetcher`); `ClipLoader` turns the array into latents and adds action maps and text ids.
+`ClipDataset` holds the clips of every micro-step as they are read; a `torch.utils.data.DataLoader` reads them, ahead of
+training where there are workers; `ClipLoader` turns what was read into latents and adds action maps and text ids.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.actions_config import WristProjection
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks
-from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.errors import ArtifactError, ConfigError, DataError, TrainingError, WorldLineError
 from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic
-from worldline_core.training.clip_config import ReadingConfig
-from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import Clip, ClipBatch, ClipSource
+from worldline_core.training.clip_config import PRIMARY, ReadingConfig
+from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler
+from worldline_core.training.clip_source import ClipSource, ResidentLatents, ResidentTracks
+from worldline_core.training.processes import processes
 
 logger = logging.getLogger(__name__)
 
+START_METHOD = "spawn"
+"""How loader processes start: forked ones would share the threads and CUDA state of this one."""
 _ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
-class SkippedClip:
-    """A clip of micro-step ``index`` that could not be read, and why."""
-
-    index: int
-    clip: Clip
-    reason: str
-
-
-@dataclass(frozen=True)
 class ReadBatch:
-    """Clips as read: ``data`` is (b, v, ...) as the source gives it, valid until the next batch is read.
+    """Clips as read: ``data`` is (b, v, ...) as the source gives it.
 
-    ``batch`` names the clips that are in it, replacements included; ``skipped`` those that were replaced.
+    ``batch`` names the clips that are in it, replacements included; ``skipped`` those that were replaced, with the reason.
     """
 
     batch: ClipBatch
     data: Tensor
-    skipped: tuple[SkippedClip, ...] = ()
+    skipped: tuple[tuple[Clip, str], ...] = ()
+
+    def pin_memory(self) -> ReadBatch:
+        """The same in page-locked memory; the DataLoader calls this."""
+        return replace(self, data=self.data.pin_memory())
 
 
-class ClipReader:
-    """Reads the clips of micro-steps in this process. Pickled into loader processes, it opens its files there.
-
-    Args:
-        views: the model's view slots.
-        config: what to do with a clip that cannot be read.
-    """
+class ClipDataset(Dataset[ReadBatch | WorldLineError]):
+    """The clips of every micro-step. An error is an item like any other: it reaches the training process as it is."""
 
     def __init__(
-        self, source: ClipSource, sampler: ClipSampler, views: tuple[str, ...], config: ReadingConfig | None = None
+        self, source: ClipSource, sampler: ClipSampler, views: tuple[str, ...], reading: ReadingConfig
     ) -> None:
         self.source = source
         self.sampler = sampler
         self.views = views
-        self.config = ReadingConfig() if config is None else config
+        self.reading = reading
 
-    @property
-    def max_bytes(self) -> int:
-        """Size of the largest batch."""
-        clip = int(np.prod(self.source.shape(self.sampler.longest))) * self.source.dtype.itemsize
-        return clip * max(size * len(ClipBatch((), view).slots(self.views)) for view, size in self.sampler.batch_kinds)
+    def __getitem__(self, index: int) -> ReadBatch | WorldLineError:
+        try:
+            wanted = self.sampler.clips(index)
+            data = empty_batch(self.source, wanted, self.views)
+            clips, skipped = list(wanted.clips), list[tuple[Clip, str]]()
+            for place, clip in enumerate(wanted.clips):
+                clips[place] = self._read(index, place, clip, wanted, data.numpy()[place], skipped)
+        except WorldLineError as error:
+            return error
+        return ReadBatch(replace(wanted, clips=tuple(clips)), data, tuple(skipped))
 
-    def read(self, index: int, memory: np.ndarray | None = None) -> ReadBatch:
-        """The clips of micro-step ``index``.
-
-        Args:
-            memory: uint8, `max_bytes` long, that the batch is read into; None for memory of its own.
-
-        Raises:
-            DataError: a clip cannot be read and is not to be skipped, or nothing readable can be found for it.
-            ArtifactError: the source does not hold what is asked of it.
-        """
-        wanted = self.sampler.clips(index)
-        out = self.source.batch_array(wanted, self.views, memory)
-        clips: list[Clip] = []
-        skipped: list[SkippedClip] = []
-        for place, clip in enumerate(wanted.clips):
-            for attempt in range(_ATTEMPTS):
-                try:
-                    self.source.read(clip, self.source.recorded_views(clip, wanted, self.views), out[place])
-                except DataError as error:
-                    if self.config.on_unreadable == "raise":
-                        raise
-                    skipped.append(SkippedClip(index, clip, str(error)))
-                    clip = self.sampler.replacement(index, place, attempt)
-                else:
-                    clips.append(clip)
-                    break
+    def _read(
+        self, index: int, place: int, clip: Clip, batch: ClipBatch, out: np.ndarray, skipped: list[tuple[Clip, str]]
+    ) -> Clip:
+        """The clip that was read into ``out``: the wanted one, or a replacement."""
+        for attempt in range(_ATTEMPTS):
+            try:
+                self.source.read(clip, recorded_views(self.source, clip, batch, self.views), out)
+            except DataError as error:
+                if self.reading.on_unreadable == "raise":
+                    raise
+                skipped.append((clip, str(error)))
+                clip = self.sampler.replacement(index, place, attempt)
             else:
-                raise DataError(
-                    "No readable clip was found.",
-                    where=f"micro-step {index}, clip {place}",
-                    expected=f"one of {_ATTEMPTS} clips that can be read",
-                    got=skipped[-1].reason,
-                    next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
-                )
-        return ReadBatch(ClipBatch(tuple(clips), wanted.view, wanted.absent), torch.from_numpy(out), tuple(skipped))
+                return clip
+        raise DataError(
+            "No readable clip was found.",
+            where=f"micro-step {index}, clip {place}",
+            expected=f"one of {_ATTEMPTS} clips that can be read",
+            got=skipped[-1][1],
+            next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
+        )
 
 
-class SkipLog:
-    """Counts the clips that a run skipped, in a file beside its training state: a continued run goes on counting.
+def read_ahead(
+    dataset: ClipDataset, first: int, stop: int | None, *, pinned: bool = False
+) -> Iterator[ReadBatch | WorldLineError]:
+    """The items of a dataset from ``first`` on, in order, read ahead where the configuration asks for it.
+
+    Args:
+        stop: nothing is read from this micro-step on.
+        pinned: in page-locked memory, which a GPU reads at full speed.
+    """
+    workers = dataset.reading.workers
+    loader = DataLoader(
+        dataset,
+        batch_size=None,
+        sampler=count(first) if stop is None else range(first, max(stop, first + 1)),
+        num_workers=workers,
+        prefetch_factor=dataset.reading.prefetch if workers else None,
+        multiprocessing_context=START_METHOD if workers else None,
+        worker_init_fn=_start_worker,
+        collate_fn=_as_it_is,
+        pin_memory=pinned,
+        generator=torch.Generator(),  # its own: training's random state stays as it is
+    )
+    return iter(loader)
+
+
+def recorded_views(source: ClipSource, clip: Clip, batch: ClipBatch, views: tuple[str, ...]) -> tuple[str, ...]:
+    """The views of a clip of the batch that fill its slots, by the names they have in the recording."""
+    return (source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(views)
+
+
+def empty_batch(source: ClipSource, batch: ClipBatch, views: tuple[str, ...]) -> Tensor:
+    """A tensor (b, v, *shape) for a batch; in a loader process it is in shared memory, so that nothing is copied later."""
+    shape = (len(batch.clips), len(batch.slots(views)), *source.shape(batch.clips[0].num_frames))
+    data = torch.empty(shape, dtype=torch.from_numpy(np.empty(0, source.dtype)).dtype)
+    return data if get_worker_info() is None else data.share_memory_()
+
+
+class SkippedClips:
+    """The clips that a run skipped, in a file beside its training state: a continued run goes on counting.
 
     What was skipped is a function of the micro-step, so a step that is done again after a kill adds nothing.
     """
 
-    def __init__(self, folder: Path, rank: int, limit: int) -> None:
-        self.path = folder / f"skipped_clips-{rank}.jsonl"
+    def __init__(self, folder: Path, limit: int) -> None:
+        self.path = folder / f"skipped_clips-{processes()[0]}.jsonl"
         self.limit = limit
         self._rows = read_json_lines(self.path)
 
-    def add(self, skipped: Sequence[SkippedClip]) -> None:
-        """Write down what was skipped.
+    def add(self, index: int, skipped: Sequence[tuple[Clip, str]]) -> None:
+        """Write down what a micro-step skipped.
 
         Raises:
             DataError: more than ``limit`` clips have been skipped.
         """
-        for item in skipped:
-            row = {"index": item.index, "clip": str(item.clip), "reason": item.reason}
+        for clip, reason in skipped:
+            row = {"index": index, "clip": str(clip), "reason": reason}
             if row not in self._rows:
-                logger.warning("Clip skipped: %s", item.reason)
+                logger.warning("Clip skipped: %s", reason)
                 self._rows.append(row)
                 write_bytes_atomic(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows).encode())
         if len(self._rows) > self.limit:
@@ -157,7 +180,7 @@ class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
 
     ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
-    ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
+    ``frames``: where clips are read as frames, those that the latents are of.
     ``weights``: of the squared error, where some places count more than others (what the task moves).
     """
 
@@ -181,7 +204,7 @@ class ClipLoader:
     """Turns clips into batches.
 
     Args:
-        store: where clips are read from.
+        source: where clips are read from. With resident latents, action tracks are resident, too.
         text: turns instructions into ids; its prompts may name a clip's duration and size.
         tracks: controls; the maps get the width that the tracks were made for.
         wrist_projection: how maps of wrist views are projected; needed with ``tracks``.
@@ -193,7 +216,7 @@ class ClipLoader:
 
     def __init__(
         self,
-        store: ClipSource,
+        source: ClipSource,
         *,
         views: tuple[str, ...],
         tracks: ActionTracks | None = None,
@@ -204,7 +227,7 @@ class ClipLoader:
         action_frames: int = 1,
         device: str = "cpu",
     ) -> None:
-        self.store = store
+        self.source = source
         self.views = views
         self.tracks = tracks
         self.text = text
@@ -214,27 +237,73 @@ class ClipLoader:
         self.action_frames = action_frames
         self.device = device
         self._tracks: dict[str, EpisodeTracks] = {}
+        self._resident: ResidentTracks | None = None
+        # Maps that depend on a clip's start are rendered from the tracks of that clip.
+        if isinstance(source, ResidentLatents) and tracks and wrist_projection == "current_camera" and not native_size:
+            names = [row.episode_id for row in source.rows if row.episode_id in tracks]
+            self._resident = ResidentTracks(tracks, names, views, device)
+
+    def batches(
+        self, sampler: ClipSampler, reading: ReadingConfig, run: Path | None = None, stop: int | None = None
+    ) -> Callable[[int], Batch]:
+        """A function that gives the batch of a micro-step, read ahead by processes where the configuration asks for it.
+
+        Asked for in order, batches are there already; any other order starts reading anew. The function raises DataError
+        and ArtifactError for clips that cannot be read, and TrainingError where a loader process has ended.
+
+        Args:
+            run: folder in which skipped clips are counted; None: they are only named in the log.
+            stop: nothing is read from this micro-step on.
+        """
+        dataset = ClipDataset(self.source, sampler, self.views, reading)
+        skips = None if run is None else SkippedClips(run, reading.max_skipped)
+        pinned = torch.device(self.device).type == "cuda" and not isinstance(self.source, ResidentLatents)
+        ahead: tuple[int, Iterator[ReadBatch | WorldLineError]] | None = None
+
+        def load(index: int) -> Batch:
+            nonlocal ahead
+            if ahead is None or ahead[0] != index or (stop is not None and index >= stop):
+                ahead = (index, read_ahead(dataset, index, stop, pinned=pinned))
+            try:
+                read = next(ahead[1])
+            except RuntimeError as error:
+                raise TrainingError(
+                    "A loader process has ended.",
+                    where=f"micro-step {index}: {'; '.join(map(str, sampler.clips(index).clips))}",
+                    expected="clips",
+                    got=error,
+                    next_step="see its traceback above; if memory ran out, lower input.workers, input.prefetch or the "
+                    "batch",
+                ) from error
+            if isinstance(read, WorldLineError):
+                raise read
+            ahead = (index + 1, ahead[1])
+            if skips is not None:
+                skips.add(index, read.skipped)
+            return self.finish(read)
+
+        return load
 
     def load(self, batch: ClipBatch) -> Batch:
         """Read the clips of one batch in this process, and finish it.
 
         Raises:
-            ArtifactError: if the store or the tracks lack an episode.
+            ArtifactError: if the source or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        out = self.store.batch_array(batch, self.views)
-        for clip, target in zip(batch.clips, out, strict=True):
-            self.store.read(clip, self.store.recorded_views(clip, batch, self.views), target)
-        return self.finish(ReadBatch(batch, torch.from_numpy(out)))
+        data = empty_batch(self.source, batch, self.views)
+        for clip, out in zip(batch.clips, data.numpy(), strict=True):
+            self.source.read(clip, recorded_views(self.source, clip, batch, self.views), out)
+        return self.finish(ReadBatch(batch, data))
 
     def finish(self, read: ReadBatch) -> Batch:
-        """What a model sees of clips that were read, here or in a loader process.
+        """What a model sees of clips that were read.
 
         Raises:
             ArtifactError: if the tracks lack an episode.
         """
         frames = read.data if read.data.dtype == torch.uint8 else None
-        return self.conditioned(read.batch, self.store.latents(read.data, self.device), frames)
+        return self.conditioned(read.batch, self.source.latents(read.data, self.device), frames)
 
     def conditioned(self, batch: ClipBatch, latents: Tensor, frames: Tensor | None = None) -> Batch:
         """Latents of a batch's clips, with the conditions that this loader adds; raises as `finish` does."""
@@ -243,7 +312,7 @@ class ClipLoader:
         ids = mask = None
         if self.text is not None:
             facts = [self.clip_facts(clip) for clip in clips]
-            ids, mask = self.text([self.store.row(clip.episode_id).instruction for clip in clips], facts)
+            ids, mask = self.text([self.source.row(clip.episode_id).instruction for clip in clips], facts)
             ids, mask = ids.to(self.device), mask.to(self.device)
         rates = [self._rate(clip) for clip in clips] if self.frame_rates else None
         fps = None if rates is None else torch.tensor(rates, device=self.device)
@@ -251,7 +320,7 @@ class ClipLoader:
 
     def clip_facts(self, clip: Clip) -> ClipFacts:
         """What a prompt may say about a clip; a stride lowers its rate."""
-        return ClipFacts(clip.num_frames, self._rate(clip), self.store.image_size)
+        return ClipFacts(clip.num_frames, self._rate(clip), self.source.image_size)
 
     def _rate(self, clip: Clip) -> float:
         rate = self.frame_rates.get(clip.episode_id)
@@ -263,16 +332,31 @@ class ClipLoader:
         """Maps at latent resolution (or vectors) of the controls that each latent frame takes (docs/method.md section 2)."""
         if self.tracks is None or self.wrist_projection is None:
             raise ConfigError("Action maps need action tracks and how wrist views are projected", where="ClipLoader")
-        cut = []
-        for clip in clips:
-            frames = [clip.frames[index] for index in control_frames(clip.num_frames, self.action_frames)]
-            if clip.episode_id not in self._tracks:
-                self._tracks[clip.episode_id] = self.tracks.tracks(clip.episode_id)
-            tracks = self._tracks[clip.episode_id]
-            cut.append(tracks.clip(frames, wrist_projection=self.wrist_projection, start=clip.start))
-        if self.native_size is not None:
-            return native_vectors(cut, views, self.native_size).to(self.device)
-        tensors = collate_tracks(cut, views=views).to(self.device)
-        grid_size = self.store.latent_shape[1:]
-        maps = render_action_maps(tensors, cut[0].image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)
+        if self._resident is not None:
+            samples, image_size = self._resident.batch(clips, self.action_frames, views), self._resident.image_size
+        else:
+            cut = [self._clip_tracks(self.tracks, clip) for clip in clips]
+            if self.native_size is not None:
+                return native_vectors(cut, views, self.native_size).to(self.device)
+            samples, image_size = collate_tracks(cut, views=views).to(self.device), cut[0].image_size
+        grid_size = self.source.latent_shape[1:]
+        maps = render_action_maps(samples, image_size, grid_size, sigma_px_ref=self.tracks.sigma_px_ref)
         return stack_controls(maps, self.action_frames)
+
+    def _clip_tracks(self, tracks: ActionTracks, clip: Clip) -> EpisodeTracks:
+        if clip.episode_id not in self._tracks:
+            self._tracks[clip.episode_id] = tracks.tracks(clip.episode_id)
+        frames = [clip.frames[index] for index in control_frames(clip.num_frames, self.action_frames)]
+        projection = self.wrist_projection or "current_camera"
+        return self._tracks[clip.episode_id].clip(frames, wrist_projection=projection, start=clip.start)
+
+
+def _as_it_is[T](item: T) -> T:
+    return item
+
+
+def _start_worker(number: int) -> None:
+    import cv2
+
+    del number
+    cv2.setNumThreads(1)

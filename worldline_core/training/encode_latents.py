@@ -30,7 +30,7 @@ from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
 from worldline_core.training.clip_config import EncodeLatentsConfig
-from worldline_core.training.latent_store import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
+from worldline_core.training.clip_source import DESCRIPTION, INDEX, LatentRow, Layout, clip_key, group_key, single_key
 
 SHARD_FILE = "{:05d}.safetensors"
 _SPAN = 2 * TEMPORAL_FACTOR + 1
@@ -93,24 +93,14 @@ def choose_layout(tokenizer: Encoder, video: UInt8[Tensor, "3 n h w"], config: E
     """``groups`` where a latent frame depends on its own four frames alone, else ``clips``.
 
     Raises:
-        ConfigError: if ``groups`` is asked for but would not be exact with this tokenizer.
+        DataError: the video is too short to tell.
     """
-    if config.layout == "clips":
-        return "clips"
     if video.shape[1] < _SPAN:
         raise DataError("An episode is too short to encode.", expected=f"{_SPAN} frames or more", got=video.shape[1])
     whole = encode_clip(tokenizer, video[:, :_SPAN], config.device)[:, 2]
     later = encode_clip(tokenizer, video[:, TEMPORAL_FACTOR:_SPAN], config.device)[:, 1]
     # One unit of half precision: different batch shapes may round the last bit differently.
-    memoryless = bool(torch.allclose(whole.float(), later.float(), rtol=2e-3, atol=2e-3))
-    if config.layout == "groups" and not memoryless:
-        raise ConfigError(
-            "The tokenizer's latents depend on earlier frames, so cached groups would not be exact.",
-            where="encode_latents.layout",
-            expected="auto or clips",
-            got="groups",
-        )
-    return "groups" if memoryless else "clips"
+    return "groups" if torch.allclose(whole.float(), later.float(), rtol=2e-3, atol=2e-3) else "clips"
 
 
 @contextmanager
@@ -250,7 +240,7 @@ def encode_latents(
     account: list[InputRow] = []
     for number, (members, summary) in enumerate(zip(pieces, summaries, strict=True)):
         for row in (episodes.rows[index] for index in members):
-            rows.append(LatentRow.of(row, _views(row, config), shard=SHARD_FILE.format(number)))
+            rows.append(LatentRow.from_episode(row, _views(row, config), shard=SHARD_FILE.format(number)))
             size = summary["stored_bytes"][row.episode_id]
             account.append(InputRow(episode_id=row.episode_id, source=row.source, status="kept", stored_bytes=size))
     write_account(output, account)

@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_source import Clip
+from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.training_config import RelationalConfig
 from worldline_core.training.video_teacher import VideoTeacher
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -15,18 +14,14 @@ import torch
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
 from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
-from worldline_core.training.clip_loader import Batch, ClipLoader, ClipReader, SkipLog
-from worldline_core.training.clip_prefetcher import ClipPrefetcher
-from worldline_core.training.clip_sampler import ClipSampler
-from worldline_core.training.clip_source import PRIMARY, ClipRow, ClipSource, named_rows, training_rows
+from worldline_core.training.clip_loader import Batch, ClipLoader, SkippedClips
+from worldline_core.training.clip_sampler import ClipRow, ClipSampler
+from worldline_core.training.clip_source import ClipSource, open_source, training_rows
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.frame_source import FrameSource
-from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.processes import BatchPlan, gathered, join_processes, place_model, processes
 from worldline_core.training.trainer import ParameterGroup, TrainingResult, batch_plan, held_out_losses, train
 from worldline_core.training.training_config import StageConfig, TrainerConfig
@@ -97,13 +92,13 @@ class Stage:
         """Which clips every micro-step trains on."""
         trainer = self.config.trainer
         return ClipSampler(
-            self.source,
+            self.rows,
             self.config.clips,
             splits=self.config.splits,
+            start_step=self.source.start_step,
             batch_size=trainer.batch_size,
             seed=trainer.seed,
             plan=self.plan,
-            rows=self.rows,
         )
 
     @cached_property
@@ -133,26 +128,25 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config, trainer = self.config, self.config.trainer
-        micro_steps = trainer.steps * self.plan.accumulation
-        with clip_batches(loader, self.sampler, config.input, self.output / "run", micro_steps) as load:
-            return train(
-                trainer,
-                groups=groups,
-                objective=objective,
-                load=load,
-                validate=validation_function(
-                    loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
-                ),
-                output=self.output,
-                identity={
-                    "config": config.model_dump(mode="json"),
-                    "start": self.start,
-                    "tokenizer": self.source.description["tokenizer"],
-                    "episodes": named_rows(self.rows),
-                },
-                title=self.title,
-                models=(self.model,),
-            )
+        stop = trainer.steps * self.plan.accumulation
+        return train(
+            trainer,
+            groups=groups,
+            objective=objective,
+            load=loader.batches(self.sampler, config.input, self.output / "run", stop),
+            validate=validation_function(
+                loader, config.clips, config.validation_splits, trainer, self.rows, objective, config.input
+            ),
+            output=self.output,
+            identity={
+                "config": config.model_dump(mode="json"),
+                "start": self.start,
+                "tokenizer": self.source.description["tokenizer"],
+                "episodes": [row.identity() for row in self.rows],
+            },
+            title=self.title,
+            models=(self.model,),
+        )
 
     def save(
         self,
@@ -179,7 +173,7 @@ class Stage:
                     "episodes": len(self.training_rows),
                     "sources": dict(sorted(Counter(row.source for row in self.training_rows).items())),
                     "metrics": result.metrics,
-                    **self._input_facts(),
+                    **input_facts(self.config.input, self.source, self.output / "run"),
                     **facts,
                 },
                 state_dict=weights,
@@ -189,12 +183,6 @@ class Stage:
         left_out = {"in other splits": fit - kept, "not fit for this stage, or without latents or tracks": found - fit}
         return {"steps": trainer.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
 
-    def _input_facts(self) -> dict[str, Any]:
-        """How clips were read, for the checkpoint; nothing where they were cached latents in the default order."""
-        micro_steps = self.config.trainer.steps * self.plan.accumulation
-        epochs = {"epochs": self.sampler.epochs(micro_steps)} if self.config.clips.order == "epochs" else {}
-        return epochs | input_facts(self.config.input, self.source, self.output / "run")
-
 
 def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:
     """How clips were read, and how many were skipped by what is written in the folders ``runs``."""
@@ -202,35 +190,8 @@ def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str
     if isinstance(reading, FrameInput):
         facts["input"] = {"kind": reading.kind, "decoder": source.description["decoder"]}
     if reading.on_unreadable == "skip":
-        facts["skipped_clips"] = sum(SkipLog.count(run) for run in runs)
+        facts["skipped_clips"] = sum(SkippedClips.count(run) for run in runs)
     return facts
-
-
-@contextmanager
-def clip_batches(
-    loader: ClipLoader, sampler: ClipSampler, reading: ReadingConfig, run: Path, micro_steps: int
-) -> Iterator[Callable[[int], Batch]]:
-    """Gives a function that reads the batch of a micro-step, in this process or ahead of it in others.
-
-    Args:
-        run: folder in which skipped clips are counted.
-    """
-    skips = SkipLog(run, processes()[0], reading.max_skipped)
-    here = ClipReader(loader.store, sampler, loader.views, reading)
-    reader_of = nullcontext(here)
-    if reading.workers:
-        pinned = torch.device(loader.device).type == "cuda"
-        reader_of = ClipPrefetcher(
-            here, workers=reading.workers, prefetch=reading.prefetch, stop=micro_steps, pinned=pinned
-        )
-    with reader_of as reader:
-
-        def load(index: int) -> Batch:
-            read = reader.read(index)
-            skips.add(read.skipped)
-            return loader.finish(read)
-
-        yield load
 
 
 class ValidatedObjective(Protocol):
@@ -246,15 +207,12 @@ def validation_function(
     trainer: TrainerConfig,
     rows: Sequence[ClipRow],
     objective: ValidatedObjective,
-    reading: ReadingConfig | None = None,
+    reading: ReadingConfig,
 ) -> Callable[[], dict[str, float]] | None:
     """A function that measures the losses on held-out clips: always the same clips, noise and noise levels.
 
     They are of recordings that hold clips of every length and stride that is trained; where there are none, of all, at the
     lengths and strides that fit. None where no clip fits. Both are said in the log.
-
-    Args:
-        reading: what to do with held-out clips that cannot be read (default: stop).
     """
     shortest, longest = ((pick(clips.lengths) - 1) * pick(clips.strides) + 1 for pick in (min, max))
     split_rows = [row for row in rows if row.split in splits and row.num_frames >= shortest]
@@ -276,49 +234,7 @@ def validation_function(
     # Where steps on one view are mixed in, it is still the joint prediction that counts.
     if clips.view_weights is not None and JOINT in clips.view_weights:
         clips = clips.model_copy(update={"view_weights": None})
-    # A few clips stand for all: drawn anew by their weights, they come from many episodes.
-    clips = clips.model_copy(update={"order": "weighted", "hop": None})
-    sampler = ClipSampler(loader.store, clips, splits=splits, batch_size=size, seed=VALIDATION_SEED, rows=held_out)
-    reader = ClipReader(loader.store, sampler, loader.views, reading)
-
-    def load(index: int) -> Batch:
-        read = reader.read(index)
-        for item in read.skipped:
-            logger.warning("Held-out clip skipped: %s", item.reason)
-        return loader.finish(read)
-
+    start_step = loader.source.start_step
+    sampler = ClipSampler(held_out, clips, splits=splits, start_step=start_step, batch_size=size, seed=VALIDATION_SEED)
+    load = loader.batches(sampler, reading.model_copy(update={"workers": 0}), stop=trainer.validation_batches)
     return partial(held_out_losses, trainer, load, objective.validation_losses, VALIDATION_SEED)
-
-
-def open_source(
-    reading: ClipInput,
-    clips: ClipSampling,
-    inputs: Mapping[str, Path],
-    episodes: EpisodeSet,
-    views: Sequence[str],
-    device: str,
-) -> ClipSource:
-    """Cached ``latents``, or frames that ``tokenizer`` encodes on the way.
-
-    Raises:
-        ConfigError: the input that the clips come from is not given.
-    """
-    needed = "tokenizer" if isinstance(reading, FrameInput) else "latents"
-    if needed not in inputs:
-        raise ConfigError(
-            f"Clips from {reading.kind} need the input {needed}.",
-            where="input.kind",
-            expected=f"an input named {needed}",
-            got=", ".join(sorted(inputs)),
-            next_step=f"give --input {needed}=FOLDER, or choose the other kind of input",
-        )
-    if not isinstance(reading, FrameInput):
-        return LatentStore.open(Path(inputs["latents"]))
-    return FrameSource.open(
-        episodes,
-        Path(inputs["tokenizer"]),
-        reading,
-        views=clips.needed_views(views),
-        primary_alone=set(clips.view_weights or {}) == {PRIMARY},
-        device=device,
-    )

@@ -17,8 +17,8 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.training.clip_config import ClipInput, FrameInput
 from worldline_core.training.clip_loader import Batch
+from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.latent_store import LatentStore
 from worldline_core.training.relational import RelationalScales, RelationalTerm, SimilarityMatrices, common_shape
 from worldline_core.training.stage_memory import (
     ClipShape,

@@ -21,7 +21,7 @@ from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.training.clip_config import JOINT, ClipSampling
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.clip_source import Clip, latent_frame_count
+from worldline_core.training.clip_sampler import Clip, latent_frame_count
 from worldline_core.training.training_config import TrainerConfig
 
 USABLE = 0.92

@@ -26,7 +26,7 @@ from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig,
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.store.atomic import write_json_atomic
-from worldline_core.training.frame_source import LoadedView, load_views
+from worldline_core.training.clip_source import LoadedView, load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
 from worldline_core.training.training_config import TokenizerConfig
 

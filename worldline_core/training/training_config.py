@@ -112,10 +112,9 @@ class TrainerConfig(StrictModel):
     validation_batches: int = Field(default=4, ge=0)
     save_every_seconds: float = Field(default=20.0, ge=0)
     save_every_steps: int = Field(default=0, ge=0, description="0: by time only")
-    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
-    global_batch: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
-    sharding: ShardingConfig = Field(default=ShardingConfig(), exclude_if=lambda value: value == ShardingConfig())
-    saving: SavingConfig = Field(default=SavingConfig(), exclude_if=lambda value: value == SavingConfig())
+    global_batch: int | None = Field(default=None, ge=1)
+    sharding: ShardingConfig = ShardingConfig()
+    saving: SavingConfig = SavingConfig()
 
     @model_validator(mode="after")
     def _whole_micro_batches(self) -> Self:
@@ -154,12 +153,11 @@ class StageConfig(StrictModel):
     """
 
     trainer: TrainerConfig
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
+    input: ClipInput = LatentInput()
     clips: ClipSampling = ClipSampling()
     splits: tuple[str, ...] = ("train",)
     validation_splits: tuple[str, ...] = ("validation",)
-    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1, exclude_if=lambda value: value is None)
+    outcomes: tuple[str, ...] | None = Field(default=None, min_length=1)
     sigma: SigmaSampling = Field(default_factory=SigmaSampling)
     weighting: LossWeighting = Field(default_factory=LossWeighting)
 
@@ -190,11 +188,10 @@ class Stage2Config(StageConfig):
     start_from: Literal["stage1", "stage2"] = "stage1"
     action_multiplier: float = Field(default=66.0, gt=0)
     action_dropout: float = Field(default=0.0, ge=0, lt=1)
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
+    action_frames: Literal[1, 4] = 1
     wrist_projection: WristProjection = "current_camera"
     relational: RelationalConfig | None = RelationalConfig()
-    native_size: int | None = Field(default=None, ge=1, exclude_if=lambda value: value is None)
+    native_size: int | None = Field(default=None, ge=1)
 
     @model_validator(mode="after")
     def _one_frame_of_vectors(self) -> Self:
@@ -262,8 +259,7 @@ class TokenizerConfig(StrictModel):
     seed: int = Field(default=0, ge=0)
     checkpoint_every: int = Field(default=500, ge=1)
     bfloat16: bool = True
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    device: str = Field(default="cpu", exclude_if=lambda value: value == "cpu")
+    device: str = "cpu"
 
     @property
     def trainer(self) -> TrainerConfig:

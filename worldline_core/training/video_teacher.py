@@ -26,7 +26,7 @@ from worldline_core.model.checkpoint import described, fill, read_description
 from worldline_core.model.weight_files import read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
-from worldline_core.training.frame_source import LoadedView, load_views
+from worldline_core.training.clip_source import LoadedView, load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, held_out_losses, train
 from worldline_core.training.training_config import BLOCKS, SmallTeacherShape, TeacherConfig
 

@@ -1,0 +1,207 @@
+"""Batches by their micro-step: the same whatever reads them, from any step on, and errors that name clips."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.errors import DataError, TrainingError
+from worldline_core.training.clip_config import ClipSampling, FrameInput, ReadingConfig
+from worldline_core.training.clip_loader import Batch, ClipLoader, SkippedClips
+from worldline_core.training.clip_sampler import Clip, ClipSampler
+from worldline_core.training.clip_source import ClipSource, FrameSource, LatentStore
+
+VIEWS = ("head", "left_wrist", "right_wrist")
+
+
+class Scripted(LatentStore):
+    """A store that does, for some episodes, what a test asks for. Lives in a module so that processes can import it."""
+
+    behaviour: dict[str, str]
+
+    def read(self, clip: Clip, views: tuple[str, ...], out: np.ndarray) -> None:
+        what = self.behaviour.get(clip.episode_id)
+        if what == "slow":
+            time.sleep(0.15)
+        elif what == "damaged":
+            raise DataError("A clip cannot be read: truncated", where=str(clip))
+        elif what == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        super().read(clip, views, out)
+
+
+def scripted(world: Any, behaviour: dict[str, str] | None = None) -> Scripted:
+    plain: Any = LatentStore.open(world.latents)
+    store = Scripted(plain.root, plain.description, plain.rows)
+    store.behaviour = behaviour or {}
+    return store
+
+
+def sampler_of(source: ClipSource, **changes: Any) -> ClipSampler:
+    values = {"lengths": (5, 9, 17), "view_weights": {"joint": 1.0, "primary": 1.0}, "single_view_factor": 2}
+    config = ClipSampling.model_validate(changes or values)
+    return ClipSampler(source.rows, config, splits=["train"], start_step=source.start_step, batch_size=2, seed=9)
+
+
+def same(one: Batch, other: Batch) -> bool:
+    return (one.clips, one.views) == (other.clips, other.views) and torch.equal(one.latents, other.latents)
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    # pytest's importlib mode gives this file a name that a spawned process cannot import: give it one that it can.
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.setattr(Scripted, "__module__", "test_clip_loader")
+    monkeypatch.setitem(sys.modules, "test_clip_loader", sys.modules[__name__])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("forked_loaders")
+def test_batches_do_not_depend_on_who_reads_them_and_when(world: Any) -> None:
+    plain = ClipLoader(scripted(world), views=VIEWS)
+    sampler = sampler_of(plain.source)
+    expected = [plain.load(sampler.clips(index)) for index in range(24)]
+    assert {len(batch.views) for batch in expected} == {1, 3}
+    # Two episodes are slow: processes overtake each other.
+    slow = ClipLoader(scripted(world, {"episode-003": "slow", "episode-006": "slow"}), views=VIEWS)
+    state = torch.get_rng_state()
+    for workers, prefetch in ((0, 2), (1, 2), (2, 1)):
+        load = slow.batches(sampler, ReadingConfig(workers=workers, prefetch=prefetch), stop=24)
+        # In order, back as after a kill, and beyond where reading ahead stops.
+        for index in (*range(20), 5, 6, 7, 20, 21):
+            assert same(load(index), expected[index])
+        assert same(load(30), plain.load(sampler.clips(30)))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("forked_loaders")
+def test_errors_name_their_clips_and_leave_no_process(world: Any) -> None:
+    sampler = sampler_of(scripted(world))
+    first = next(index for index in range(50) if "episode-004" in {c.episode_id for c in sampler.clips(index).clips})
+    for what, kind, message in (
+        ("damaged", DataError, r"cannot be read: truncated[\s\S]*episode-004, frames"),
+        ("die", TrainingError, r"loader process has ended[\s\S]*episode-004[\s\S]*exited unexpectedly"),
+    ):
+        loader = ClipLoader(scripted(world, {"episode-004": what}), views=VIEWS)
+        load = loader.batches(sampler, ReadingConfig(workers=1, prefetch=1))
+        for index in range(first):
+            load(index)
+        with pytest.raises(kind, match=message):
+            load(first)
+        del load
+        deadline = time.monotonic() + 20
+        while multiprocessing.active_children() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_processes_end_with_the_training_process(world: Any, tmp_path: Path) -> None:
+    """Killed with SIGKILL, it cannot close anything: its loader processes notice and end by themselves."""
+    (tmp_path / "source.pickle").write_bytes(pickle.dumps(scripted(world)))
+    code = (
+        "import multiprocessing, pickle, sys, time\n"
+        "from pathlib import Path\n"
+        "from test_clip_loader import VIEWS, sampler_of\n"
+        "from worldline_core.training.clip_config import ReadingConfig\n"
+        "from worldline_core.training.clip_loader import ClipLoader\n"
+        "if __name__ == '__main__':\n"
+        "    source = pickle.loads(Path(sys.argv[1]).read_bytes())\n"
+        "    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(workers=1))\n"
+        "    load(0)\n"
+        "    print(*[process.pid for process in multiprocessing.active_children()], flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    (tmp_path / "main.py").write_text(code)
+    command = [sys.executable, str(tmp_path / "main.py"), str(tmp_path / "source.pickle")]
+    folders = (Path(__file__).parent, Path(__file__).parents[2])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as training:
+        assert training.stdout is not None
+        (number,) = (int(number) for number in training.stdout.readline().split())
+        training.kill()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{number}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{number}").exists()
+
+
+@pytest.mark.gpu
+def test_batches_reach_a_gpu(world: Any) -> None:
+    source = scripted(world)
+    load = ClipLoader(source, views=VIEWS, device="cuda").batches(sampler_of(source), ReadingConfig(workers=1), stop=6)
+    plain = ClipLoader(source, views=VIEWS)
+    for index in range(6):
+        assert torch.equal(load(index).latents.cpu(), plain.load(sampler_of(source).clips(index)).latents)
+
+
+@pytest.mark.parametrize("decoder", ["auto", "pyav"])
+def test_a_damaged_clip_is_named_or_skipped_and_counted(
+    world: Any, tokenizer: Path, tmp_path: Path, decoder: str
+) -> None:
+    shutil.copytree(world.episodes, tmp_path / "set")
+    (video,) = (tmp_path / "set").rglob("*left_wrist*/**/*.mp4")
+    content = video.read_bytes()
+    half = len(content) // 2
+    video.write_bytes(content[:half] + bytes(len(content) - half))
+    episodes = EpisodeSet.open(tmp_path / "set")
+    config = FrameInput.model_validate({"image_size": [32, 32], "decoder": decoder, "on_unreadable": "skip"})
+    source = FrameSource(episodes, tokenizer, config, views=VIEWS)
+    faults: dict[str, str] = {}
+    for row in episodes.rows:
+        out = np.empty((3, *source.shape(17)), np.uint8)
+        try:
+            source.read(Clip(row.episode_id, 0, 17, 1), VIEWS, out)
+        except DataError as error:
+            faults[row.episode_id] = str(error)
+    assert all(f"{name}, frames 0..16, view left_wrist, in" in fault for name, fault in faults.items())
+    assert all(".mp4" in fault for fault in faults.values())
+    good = {row.episode_id for row in episodes.rows if row.split == "train"} - set(faults)
+    assert 0 < len(good) < 6
+    loader, sampler, run = ClipLoader(source, views=VIEWS), sampler_of(source, lengths=(17,)), tmp_path / "run"
+    strict = loader.batches(sampler, config.model_copy(update={"on_unreadable": "raise"}))
+    with pytest.raises(DataError, match="A clip cannot be read"):
+        [strict(index) for index in range(10)]
+    lenient = loader.batches(sampler, config, run)
+    batches = [lenient(index) for index in range(10)]
+    for index, batch in enumerate(batches):
+        assert set(batch.names) <= good
+        wanted = sampler.clips(index).clips
+        assert all(drawn == clip for drawn, clip in zip(batch.clips, wanted, strict=True) if clip.episode_id in good)
+        assert batch.frames is not None
+        out = np.empty((3, *source.shape(17)), np.uint8)
+        source.read(batch.clips[0], VIEWS, out)
+        assert np.array_equal(batch.frames[0], out)
+    skipped = SkippedClips.count(run)
+    assert skipped > 0
+    # Steps that are done again after a kill, and a line that the kill cut short, change no count.
+    again = loader.batches(sampler, config, run)
+    assert all(same(again(index), batch) for index, batch in enumerate(batches))
+    with (run / "skipped_clips-0.jsonl").open("a") as file:
+        file.write('{"index": 3, "cl')
+    assert SkippedClips.count(run) == skipped
+    assert SkippedClips.count(tmp_path / "elsewhere") == 0
+    few = loader.batches(sampler, config.model_copy(update={"max_skipped": skipped - 1}), run)
+    with pytest.raises(DataError, match=rf"at most {skipped - 1} [\s\S]*got: {skipped}"):
+        few(0)
+
+
+def test_where_nothing_can_be_read_skipping_ends(world: Any) -> None:
+    source = scripted(world, {f"episode-{number:03d}": "damaged" for number in range(8)})
+    load = ClipLoader(source, views=VIEWS).batches(sampler_of(source), ReadingConfig(on_unreadable="skip"))
+    with pytest.raises(DataError, match=r"micro-step 0, clip 0[\s\S]*truncated"):
+        load(0)
