@@ -264,8 +264,9 @@ class ClipLoader:
             nonlocal ahead
             if ahead is None or ahead[0] != index or (stop is not None and index >= stop):
                 ahead = (index, read_ahead(dataset, index, stop, pinned=pinned))
+            batches, ahead = ahead[1], None  # after an error nothing holds the loader processes
             try:
-                read = next(ahead[1])
+                read = next(batches)
             except RuntimeError as error:
                 raise TrainingError(
                     "A loader process has ended.",
@@ -276,8 +277,9 @@ class ClipLoader:
                     "batch",
                 ) from error
             if isinstance(read, WorldLineError):
+                del batches
                 raise read
-            ahead = (index + 1, ahead[1])
+            ahead = (index + 1, batches)
             if skips is not None:
                 skips.add(index, read.skipped)
             return self.finish(read)
