@@ -121,16 +121,3 @@ def test_documented_configurations_are_valid(page: str) -> None:
                 wrong = {problem["type"] for problem in error.errors()} - {"missing", "too_short"}
                 if wrong:
                     pytest.fail(str(error))
-
-
-def test_documented_keys_exist() -> None:
-    dotted = [
-        found[0]
-        for text in PAGES.values()
-        for part in quoted(text)
-        if (found := re.match(r"(\w+)(\.(?!(?:py|yaml)\b)\w+)+(?=$|[:=])", part))
-        and found[1] in PipelineConfig.model_fields
-    ]
-    assert len(dotted) >= 15
-    for key in dotted:
-        check_key(PipelineConfig, key)
