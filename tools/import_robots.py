@@ -39,7 +39,7 @@ FACES_PER_BODY = 220
 
 @dataclass
 class Body:
-    """One body of the clean model; ``pieces`` are (vertices (V,3), faces (F,3), rgba (4,)) in the body frame."""
+    """A body of the clean model; ``pieces`` are (vertices (V,3), faces (F,3), rgba (4,)) in the body frame."""
 
     name: str
     pos: np.ndarray
@@ -50,26 +50,16 @@ class Body:
     extra: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Source:
-    package: str
-    wheel_glob: str
-    licence_in_wheel: str
-    licence_name: str
+LICENCES = {"gym-aloha": "Apache-2.0", "robosuite": "MIT"}
 
 
-SOURCES = {
-    "gym-aloha": Source("gym-aloha", "gym_aloha-*.whl", "licenses/LICENSE", "Apache-2.0"),
-    "robosuite": Source("robosuite", "robosuite-*.whl", "licenses/LICENSE", "MIT"),
-}
-
-
-def fetch(source: Source, folder: Path) -> tuple[Path, str, Path]:
-    """Download one wheel without its dependencies, unzip it; returns (folder, version, licence file)."""
-    if not list(folder.glob(source.wheel_glob)):
-        command = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", str(folder), source.package]
+def fetch(package: str, folder: Path) -> tuple[Path, str, Path]:
+    """Downloads one wheel without its dependencies and unzips it; returns folder, version and licence file."""
+    pattern = f"{package.replace('-', '_')}-*.whl"
+    if not list(folder.glob(pattern)):
+        command = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", str(folder), package]
         subprocess.run(command, check=True)
-    wheel = sorted(folder.glob(source.wheel_glob))[-1]
+    wheel = sorted(folder.glob(pattern))[-1]
     target = folder / wheel.stem
     if not target.exists():
         with zipfile.ZipFile(wheel) as archive:
@@ -95,12 +85,9 @@ def extract(model: mujoco.MjModel, root: str, visual_group: int | None) -> dict[
     bodies: dict[str, Body] = {}
     root_id = model.body(root).id
     for body_id in range(model.nbody):
-        ancestors = {body_id}
-        walk = body_id
-        while walk != 0:
-            walk = int(model.body_parentid[walk])
-            ancestors.add(walk)
-        if root_id not in ancestors:
+        # A parent comes before its children.
+        parent = model.body(int(model.body_parentid[body_id])).name
+        if body_id != root_id and parent not in bodies:
             continue
         name = model.body(body_id).name
         body = Body(name, model.body_pos[body_id].copy(), model.body_quat[body_id].copy())
@@ -129,8 +116,7 @@ def extract(model: mujoco.MjModel, root: str, visual_group: int | None) -> dict[
             rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
             body.pieces.append((vertices, model.mesh_face[face_first : face_first + face_count].copy(), rgba.copy()))
         bodies[name] = body
-        parent = model.body(int(model.body_parentid[body_id])).name
-        if parent in bodies and body_id != root_id:
+        if body_id != root_id:
             bodies[parent].children.append(body)
     return bodies
 
@@ -190,7 +176,7 @@ def numbers(values: object) -> str:
     return " ".join(f"{float(v):.9g}" for v in np.asarray(values).reshape(-1))
 
 
-def write_arm(folder: Path, name: str, root: Body, palette: dict[tuple[float, ...], tuple[float, ...]] | None) -> int:
+def write_arm(folder: Path, name: str, root: Body) -> int:
     """Write ``arm.xml`` and its meshes; returns the number of faces."""
     meshes = folder / "meshes"
     shutil.rmtree(meshes, ignore_errors=True)
@@ -215,9 +201,8 @@ def write_arm(folder: Path, name: str, root: Body, palette: dict[tuple[float, ..
             mesh.export(meshes / file)
             total += len(mesh.faces)
             assets.append(f'    <mesh name="{body.name}_{index}" file="{file}"/>')
-            rgb = tuple(colour) if palette is None else palette.get(tuple(colour), tuple(colour))
             lines.append(
-                f'{pad}  <geom type="mesh" mesh="{body.name}_{index}" rgba="{numbers(rgb)} 1" '
+                f'{pad}  <geom type="mesh" mesh="{body.name}_{index}" rgba="{numbers(colour)} 1" '
                 f'contype="0" conaffinity="0" group="1"/>'
             )
         lines.extend(f"{pad}  {line}" for line in body.extra)
@@ -252,16 +237,18 @@ IDENTITY = np.array([1.0, 0, 0, 0])
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-def load_arm_and_hand(package: Path, arm: str, hand: str) -> tuple[dict[str, Body], dict[str, Body]]:
+def load_arm_and_hand(package: Path, arm: str, hand: str) -> tuple[Body, Body, dict[str, Body]]:
+    """Root and tool mount ``ee`` of an arm, without what is mounted there, and the bodies of the hand."""
     assets = package / "robosuite/models/assets"
-    arm_model = mujoco.MjModel.from_xml_path(str(assets / f"robots/{arm}/robot.xml"))
+    arm_bodies = extract(mujoco.MjModel.from_xml_path(str(assets / f"robots/{arm}/robot.xml")), "base", 1)
     # One of the files carries an attribute that newer MuJoCo versions refuse.
     fixed = assets / f"grippers/{hand}.fixed.xml"
     text = (assets / f"grippers/{hand}.xml").read_text()
     fixed.write_text(text.replace('<default class="xarm7_hand" group="1">', '<default class="xarm7_hand">'))
     hand_model = mujoco.MjModel.from_xml_path(str(fixed))
-    first = hand_model.body(1).name
-    return extract(arm_model, "base", 1), extract(hand_model, first, 1)
+    ee = arm_bodies["right_hand"]
+    ee.name, ee.children = "ee", []
+    return arm_bodies["base"], ee, extract(hand_model, hand_model.body(1).name, 1)
 
 
 def viperx(package: Path) -> Body:
@@ -292,15 +279,8 @@ def viperx(package: Path) -> Body:
     return root
 
 
-def parallel_hand(arm: dict[str, Body], hand: dict[str, Body], mount: str) -> tuple[Body, Body]:
-    root, ee = arm["base"], arm[mount]
-    ee.name, ee.children = "ee", []
-    return root, ee
-
-
 def ur5e(package: Path) -> Body:
-    arm, hand = load_arm_and_hand(package, "ur5e", "rethink_gripper")
-    root, ee = parallel_hand(arm, hand, "right_hand")
+    root, ee, hand = load_arm_and_hand(package, "ur5e", "rethink_gripper")
     base = hand["gripper_base"]
     ee.pieces += move_pieces(base, base.pos, base.quat)
     for side, sign, name in (("l", 1.0, "finger_a"), ("r", -1.0, "finger_b")):
@@ -316,8 +296,7 @@ def ur5e(package: Path) -> Body:
 
 
 def xarm7(package: Path) -> Body:
-    arm, hand = load_arm_and_hand(package, "xarm7", "xarm7_gripper")
-    root, ee = parallel_hand(arm, hand, "right_hand")
+    root, ee, hand = load_arm_and_hand(package, "xarm7", "xarm7_gripper")
     base = hand["xarm_gripper_base_link"]
     ee.pieces += move_pieces(base, base.pos, base.quat)
     # The source drives a four-bar linkage; its finger stays parallel, so a slide at the linkage's middle height
@@ -338,8 +317,7 @@ def xarm7(package: Path) -> Body:
 
 
 def panda(package: Path) -> Body:
-    arm, hand = load_arm_and_hand(package, "panda", "panda_gripper")
-    root, ee = parallel_hand(arm, hand, "right_hand")
+    root, ee, hand = load_arm_and_hand(package, "panda", "panda_gripper")
     base = hand["right_gripper"]
     rotation = quat_matrix(base.quat)
     ee.pieces += move_pieces(base, base.pos, base.quat)
@@ -372,16 +350,15 @@ def main() -> None:
     wheels = args.wheels or Path(tempfile.mkdtemp())
     for name in args.only:
         package, build = ARMS[name]
-        source = SOURCES[package]
-        unpacked, version, licence = fetch(source, wheels)
+        unpacked, version, licence = fetch(package, wheels)
         folder = args.output / name
         folder.mkdir(parents=True, exist_ok=True)
-        faces = write_arm(folder, name, build(unpacked), None)
+        faces = write_arm(folder, name, build(unpacked))
         shutil.copyfile(licence, folder / "LICENSE")
-        facts = {"package": package, "version": version, "licence": source.licence_name, "faces": faces}
+        facts = {"package": package, "version": version, "licence": LICENCES[package], "faces": faces}
         (folder / "SOURCE.json").write_text(json.dumps(facts, indent=2) + "\n")
         size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-        print(f"{name}: {faces} faces, {size / 1024:.0f} KB, {source.licence_name} ({package} {version})")
+        print(f"{name}: {faces} faces, {size / 1024:.0f} KB, {LICENCES[package]} ({package} {version})")
 
 
 if __name__ == "__main__":

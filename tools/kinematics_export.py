@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
+from tools.description_import import kinematics_text
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.rendering import OPENCV_AXES, prepare_rendering, wrist_camera_pose
 from worldline_core.recorder.scene_model import SceneModel
@@ -34,50 +34,17 @@ SOURCES = {
 }
 
 
-def _numbers(values: Any) -> str:
-    return " ".join(f"{float(v):.12g}" for v in np.asarray(values).reshape(-1))
-
-
 def kinematics_xml(scene: SceneModel) -> str:
     """MJCF text of bodies, joints and sites of all arms."""
-    model, robot = scene.model, scene.robot
-    prefixes = tuple(f"{arm.name}/" for arm in robot.arms)
-    lines = [f'<mujoco model="{robot.name}">', '  <compiler angle="radian" autolimits="true"/>', "  <worldbody>"]
-
-    def emit(body: int, depth: int) -> None:
-        pad = "  " * depth
-        lines.append(
-            f'{pad}<body name="{model.body(body).name}" pos="{_numbers(model.body_pos[body])}" '
-            f'quat="{_numbers(model.body_quat[body])}">'
-        )
-        # A body needs inertia to be loaded by a simulator; it decides nothing here.
-        lines.append(f'{pad}  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>')
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            kind = "hinge" if model.jnt_type[joint] == 3 else "slide"
-            lines.append(
-                f'{pad}  <joint name="{model.joint(joint).name}" type="{kind}" '
-                f'axis="{_numbers(model.jnt_axis[joint])}" range="{_numbers(model.jnt_range[joint])}"/>'
-            )
-        lines.extend(
-            f'{pad}  <site name="{model.site(site).name}" pos="{_numbers(model.site_pos[site])}" '
-            f'quat="{_numbers(model.site_quat[site])}"/>'
-            for site in range(model.nsite)
-            if model.site_bodyid[site] == body
-        )
-        for child in range(body + 1, model.nbody):
-            if model.body_parentid[child] == body:
-                emit(child, depth + 1)
-        lines.append(f"{pad}</body>")
-
-    for body in range(1, model.nbody):
-        if model.body_parentid[body] == 0 and model.body(body).name.startswith(prefixes):
-            emit(body, 2)
-    return "\n".join([*lines, "  </worldbody>", "</mujoco>", ""])
+    model, prefixes = scene.model, tuple(f"{arm.name}/" for arm in scene.robot.arms)
+    bodies = {body for body in range(1, model.nbody) if model.body(body).name.startswith(prefixes)}
+    names = {model.body(body).name for body in bodies}
+    names |= {model.site(site).name for site in range(model.nsite) if model.site_bodyid[site] in bodies}
+    return kinematics_text(model, scene.robot.name, names)
 
 
 def T_ee_camera(scene: SceneModel, arm: int) -> np.ndarray:  # noqa: N802
-    """(4, 4), OpenCV axes, of an arm's wrist camera in its ``ee`` body."""
+    """Pose (4, 4) of an arm's wrist camera in its ``ee`` body, OpenCV axes."""
     position, rotation = wrist_camera_pose(scene, arm)
     pose = np.eye(4)
     pose[:3, :3] = rotation @ OPENCV_AXES

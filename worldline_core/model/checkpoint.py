@@ -168,7 +168,7 @@ def _checked(content: Mapping[str, Any], *, where: object) -> CheckpointInfo:
             "The checkpoint description is not valid",
             where=where,
             got="; ".join(problems),
-            next_step="train it again with this version; for one of an earlier version, see tools/rewrite_checkpoint.py",
+            next_step="train it again with this version",
         ) from error
 
 
