@@ -31,9 +31,15 @@ import numpy as np
 import torch
 
 from worldline_core import Camera, WorldLine
-from worldline_core.evaluation.planning.closed_loop import GoalPicture, Plan, Planner, Situation, judged
-from worldline_core.evaluation.planning.selectors import MeasuredSelector
-from worldline_core.evaluation.planning.solvers import SOLVERS
+from worldline_core.evaluation.planning.bracket import MeasuredSelector
+from worldline_core.evaluation.planning.closed_loop import (
+    SOLVERS,
+    ClosedLoopPlanner,
+    GoalPicture,
+    Plan,
+    Situation,
+    judged,
+)
 from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.geometry.embodiment import load_embodiment
@@ -165,7 +171,7 @@ class Attempts:
         return np.concatenate(list(rows), axis=1)
 
 
-class RememberingPlanner(Planner):
+class RememberingPlanner(ClosedLoopPlanner):
     """A planner that predicts what another one of the same start has predicted only once."""
 
     def __init__(self, remembered: dict[bytes, float], **options: object) -> None:

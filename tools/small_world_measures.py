@@ -25,7 +25,7 @@ from tools.small_world_memory import Memory, videos
 from tools.small_world_steps import controls_of
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.evaluation.metrics import frame_iou
-from worldline_core.evaluation.planning.selectors import planning_indices
+from worldline_core.evaluation.planning.bracket import planning_indices
 from worldline_core.evaluation.policy.evidence import route
 from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure, score
 from worldline_core.evaluation.segmenters.coloured_things import named_things, own_colour, thing_share

@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 
 from worldline_core.errors import DataError
-from worldline_core.evaluation.planning.bracket import choose, shown_order
-from worldline_core.evaluation.planning.selectors import (
+from worldline_core.evaluation.planning.bracket import (
     CandidateScore,
     CandidateVideo,
     Comparison,
     VLMSelector,
+    choose,
     planning_indices,
+    shown_order,
 )
 
 

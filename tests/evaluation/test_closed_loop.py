@@ -13,16 +13,20 @@ import pytest
 from worldline_core import Camera, WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
+from worldline_core.evaluation.planning.bracket import MeasuredSelector, shown_video
 from worldline_core.evaluation.planning.closed_loop import (
+    SOLVERS,
+    ClosedLoopPlanner,
     GoalPicture,
-    Planner,
+    SearchResult,
+    SearchSpace,
     Situation,
+    coloured_noise,
     drawn_around,
     judged,
     recorded,
+    search,
 )
-from worldline_core.evaluation.planning.selectors import MeasuredSelector, shown_video
-from worldline_core.evaluation.planning.solvers import SOLVERS, Found, Space, coloured_noise, search
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.rollout.robot import CommandedRobot
@@ -36,9 +40,11 @@ def quadratic(sequences: np.ndarray) -> np.ndarray:
     return -np.square(sequences - GOAL).mean(axis=(1, 2))
 
 
-def solved(solver: str, seed: int = 0, candidates: int = 400, kept: np.ndarray = GOAL[None, :0], **options) -> Found:
+def solved(
+    solver: str, seed: int = 0, candidates: int = 400, kept: np.ndarray = GOAL[None, :0], **options
+) -> SearchResult:
     random = np.random.default_rng(seed)
-    space = Space(
+    space = SearchSpace(
         lambda number: coloured_noise(random, (number, *GOAL.shape), 2.0),
         lambda sequences: np.clip(sequences, -1.0, 1.0),
         np.zeros((0, *GOAL.shape)) if kept.shape[1] == 0 else kept,
@@ -47,7 +53,7 @@ def solved(solver: str, seed: int = 0, candidates: int = 400, kept: np.ndarray =
     return search(SOLVERS[solver](space, candidates), options.pop("evaluate", quadratic), batch=16, **options)
 
 
-@pytest.mark.parametrize(("solver", "tolerance"), [("best_of_n", 0.4), ("cem", 0.15), ("icem", 0.15), ("mppi", 0.15)])
+@pytest.mark.parametrize(("solver", "tolerance"), [("best_of_n", 0.4), ("icem", 0.15)])
 def test_each_solver_finds_the_optimum_of_a_quadratic(solver: str, tolerance: float) -> None:
     found = solved(solver)
     assert np.sqrt(-found.scores[0]) < tolerance
@@ -105,9 +111,9 @@ def test_the_first_candidate_is_chosen_unless_another_is_better_by_the_margin() 
 
 def test_a_score_that_is_no_number_is_refused() -> None:
     with pytest.raises(DataError, match="not a finite number"):
-        solved("cem", evaluate=lambda sequences: np.full(len(sequences), np.nan))
+        solved("icem", evaluate=lambda sequences: np.full(len(sequences), np.nan))
     with pytest.raises(DataError, match="not a finite number"):
-        solved("cem", evaluate=lambda sequences: np.zeros((len(sequences), 2)))
+        solved("icem", evaluate=lambda sequences: np.zeros((len(sequences), 2)))
 
 
 def test_noise_has_unit_variance_and_is_smooth_where_asked_for() -> None:
@@ -131,10 +137,12 @@ class Start:
     def now(self) -> dict[str, np.ndarray]:
         return {view: video[0] for view, video in self.frames.items()}
 
-    def planner(self, world: WorldLine, **options: object) -> Planner:
+    def planner(self, world: WorldLine, **options: object) -> ClosedLoopPlanner:
         around = drawn_around(0.02, self.controls[1:])
         usual = {"propose": around, "score": lambda video: 0.0, "solver": "best_of_n", "candidates": 2, "horizon": 1}
-        return Planner(world, self.cameras, embodiment=ROBOT, instruction=self.instruction, **{**usual, **options})  # type: ignore[arg-type]
+        return ClosedLoopPlanner(
+            world, self.cameras, embodiment=ROBOT, instruction=self.instruction, **{**usual, **options}
+        )  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -214,12 +222,11 @@ def test_the_next_choice_begins_at_what_was_really_seen(world: WorldLine, start:
         assert moved > 0.1 or view != "right_wrist"
 
 
-@pytest.mark.parametrize("solver", ["cem", "icem", "mppi"])
-def test_a_planner_stays_within_the_limits_of_the_robot(world: WorldLine, head: Start, solver: str) -> None:
+def test_a_planner_stays_within_the_limits_of_the_robot(world: WorldLine, head: Start) -> None:
     def still(video: Trajectory) -> float:
         return -float(np.abs(np.diff(video.frames["head"][[0, 16]].astype(float), axis=0)).mean())
 
-    planner = head.planner(world, propose=drawn_around(1.5), score=still, solver=solver, candidates=6)
+    planner = head.planner(world, propose=drawn_around(1.5), score=still, solver="icem", candidates=6)
     plan = planner.plan(head.now(), head.controls[0])
     assert plan.score == plan.scores.max() == plan.scores[0]
     assert len(plan.scores) == plan.model_calls == 6
@@ -282,7 +289,7 @@ def test_what_a_planner_cannot_use_is_named(world: WorldLine, head: Start) -> No
         assert planner._past == {}
     with pytest.raises(ConfigError, match="no such solver"):
         head.planner(world, solver="adam")
-    with pytest.raises(ConfigError, match="cannot be run so"):
+    with pytest.raises(ConfigError, match="horizon"):
         head.planner(world, horizon=0)
     with pytest.raises(ConfigError, match="a margin of at least 0"):
         head.planner(world, margin=float("nan"))

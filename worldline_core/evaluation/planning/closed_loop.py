@@ -1,8 +1,9 @@
 """Planning in closed loop: after every executed chunk the next one is chosen anew, from what the cameras see then.
 
-A :class:`Planner` is asked for controls, the robot executes their first chunk, and the planner is asked again with the pictures
-that came of it. Each time it branches a simulation that begins at the last picture, predicts every candidate to the end of the
-horizon, and scores the video of the whole episode: the real pictures so far, then the predicted ones.
+A :class:`ClosedLoopPlanner` branches a simulation that begins at the last picture, predicts every candidate to the end of the horizon,
+and scores the video of the whole episode: the real pictures so far, then the predicted ones. A solver is a generator: it yields
+candidates, receives their scores, and ends when its candidates are used up. The best-scored sequence of all is executed: with a model
+that gives equal controls equal videos, no average of sequences is worth more than one that was scored.
 
 Axis legend: k candidates, n frames, j columns of the embodiment's state, c frames of a chunk (one step of the model).
 """
@@ -10,18 +11,17 @@ Axis legend: k candidates, n frames, j columns of the embodiment's state, c fram
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.evaluation.planning.selectors import Selector, shown_video
-from worldline_core.evaluation.planning.solvers import SOLVERS, Found, Solver, Space, Stopped, coloured_noise, search
+from worldline_core.evaluation.planning.bracket import Selector, shown_video
 from worldline_core.evaluation.recordings import Trajectory, simulated_points
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -32,15 +32,19 @@ from worldline_core.rollout.simulation import Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.training.video_teacher import VideoTeacher
 
+Sequences = Float[np.ndarray, "k n j"]
+Batches = Generator[Sequences, Float[np.ndarray, " k"], None]
+Stopped = Literal["candidates", "time", "certain"]
+
 
 @dataclass(frozen=True)
 class Situation:
-    """What proposals begin at.
+    """Where proposals begin.
 
     Attributes:
         images: by view, ``uint8 (H, W, 3)``: what the cameras see now.
         state: ``(j)``, the last command.
-        frames: commands that a proposal has.
+        frames: commands of a proposal.
         executed: commands that were executed before.
     """
 
@@ -50,22 +54,158 @@ class Situation:
     executed: int
 
 
-Propose = Callable[[Situation, int, np.random.Generator], Float[np.ndarray, "k n j"]]
+Propose = Callable[[Situation, int, np.random.Generator], Sequences]
 """So many sequences of ``situation.frames`` commands each: from a policy, from recordings, or drawn."""
 Score = Callable[[Trajectory], float]
 """How good a video is, the higher the better: real pictures so far, then predicted ones, at the model's size."""
 
 
 @dataclass(frozen=True)
+class SearchSpace:
+    """Sequences that a solver may try.
+
+    Attributes:
+        propose: so many new sequences.
+        limit: the nearest sequences that the robot can execute.
+        kept: ``(m, n, j)``, m >= 0, the rest of an earlier search's sequences, best first.
+    """
+
+    propose: Callable[[int], Sequences]
+    limit: Callable[[Sequences], Sequences]
+    kept: Sequences
+    random: np.random.Generator
+
+    def first(self, count: int, kept: int = 1) -> Sequences:
+        """The best ``kept`` of an earlier search, then new proposals; ``count`` in all."""
+        known = self.kept[: min(kept, count)]
+        fresh = [self.propose(count - len(known))] if count > len(known) else []
+        return self.limit(np.concatenate([known, *fresh]))
+
+
+Solver = Callable[[SearchSpace, int], Batches]
+"""Batches of at most so many candidates together, beginning with :meth:`SearchSpace.first`: a margin favours the very first."""
+
+
+def best_of_n(space: SearchSpace, count: int) -> Batches:
+    """Proposals alone."""
+    yield space.first(count)
+
+
+def icem(space: SearchSpace, count: int) -> Batches:
+    """Cross-entropy method with the improvements of iCEM (Pinneri et al. 2020, section 3).
+
+    Each round is drawn from a normal distribution around the best of the round before, with noise that is correlated in time; half of
+    the elites compete again and are handed on to the next search, rounds shrink, and the mean is a candidate of the last round.
+    """
+    shares = 1.25 ** -np.arange(max(1, min(3, count // 3)), dtype=np.float64)
+    sizes = np.diff(np.round(count * np.cumsum(shares) / shares.sum()).astype(int), prepend=0).tolist()
+    elites = max(2, round(0.3 * sizes[0]))
+    carried = round(0.5 * elites)
+    batch = space.first(sizes[0], kept=max(1, carried))
+    mean = deviation = np.zeros(batch.shape[1:])
+    pool, values = batch[:0], np.empty(0)
+    for number, size in enumerate(sizes):
+        if number:
+            batch = mean + deviation * coloured_noise(space.random, (size, *mean.shape), 2.0)
+            if number == len(sizes) - 1:
+                batch[0] = mean
+            batch = space.limit(batch)
+        scores = yield batch
+        pool, values = np.concatenate((pool, batch)), np.concatenate((values, scores))
+        best = np.argsort(-values, kind="stable")[:elites]
+        smoothed = 0.9 if number else 1.0
+        mean = smoothed * pool[best].mean(axis=0) + (1 - smoothed) * mean
+        deviation = smoothed * pool[best].std(axis=0) + (1 - smoothed) * deviation
+        pool, values = pool[best[:carried]], values[best[:carried]]
+
+
+SOLVERS: dict[str, Solver] = {"best_of_n": best_of_n, "icem": icem}
+
+
+def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], colour: float) -> Sequences:
+    """Normal noise ``(k, n, j)`` of unit variance whose power over the frames falls with frequency to the power ``-colour``."""
+    frames = shape[1]
+    powers = [np.maximum(np.abs(f), 1 / frames) ** -colour for f in (np.fft.rfftfreq(frames), np.fft.fftfreq(frames))]
+    spectrum = np.fft.rfft(random.standard_normal(shape), axis=1) * np.sqrt(powers[0])[:, None]
+    return np.fft.irfft(spectrum, frames, axis=1) / np.sqrt(powers[1].mean())
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Sequences ``(k, n, j)`` and their scores ``(k,)``, the chosen one first, then by falling score; why the search stopped."""
+
+    sequences: Sequences
+    scores: Float[np.ndarray, " k"]
+    stopped: Stopped
+    seconds: float
+
+
+def search(
+    batches: Batches,
+    evaluate: Callable[[Sequences], Float[np.ndarray, " k"]],
+    *,
+    batch: int,
+    seconds: float | None = None,
+    certain: float | None = None,
+    margin: float = 0.0,
+    clock: Callable[[], float] = time.perf_counter,
+) -> SearchResult:
+    """Score a solver's candidates, ``batch`` at a time, until they are used up or one of the limits is reached.
+
+    Args:
+        seconds: no batch begins that would, lasting as long as the longest one so far, end later. The first is always scored.
+        certain: a score that ends the search.
+        margin: the first candidate is chosen unless another scores better by more than this.
+
+    Raises: DataError when a score is not finite.
+    """
+    began, longest = clock(), 0.0
+    sequences: list[np.ndarray] = []
+    scores: list[float] = []
+
+    def result(stopped: Stopped) -> SearchResult:
+        batches.close()
+        ranked = np.array(scores)
+        if ranked.max() <= ranked[0] + margin:
+            ranked[0] = np.inf
+        order = np.argsort(-ranked, kind="stable")
+        return SearchResult(np.concatenate(sequences)[order], np.array(scores)[order], stopped, clock() - began)
+
+    candidates = next(batches)
+    while True:
+        for start in range(0, len(candidates), batch):
+            before = clock()
+            if scores and seconds is not None and before - began + longest > seconds:
+                return result("time")
+            part = candidates[start : start + batch]
+            values = np.asarray(evaluate(part), dtype=np.float64)
+            if values.shape != (len(part),) or not np.isfinite(values).all():
+                raise DataError(
+                    "A score is not a finite number", where=f"candidate {len(scores)} of the search and later ones",
+                    expected=f"{len(part)} finite scores, higher is better", got=values.tolist(),
+                    next_step="let the score function give its lowest score to a video in which it sees nothing",
+                )  # fmt: skip
+            sequences.append(part)
+            scores += values.tolist()
+            longest = max(longest, clock() - before)
+            if certain is not None and values.max() >= certain:
+                return result("certain")
+        try:
+            candidates = batches.send(np.array(scores[-len(candidates) :]))
+        except StopIteration:
+            return result("candidates")
+
+
+@dataclass(frozen=True)
 class Plan:
-    """What to execute, and how it was found.
+    """The next controls, and the search for them.
 
     Attributes:
         controls: ``(c, j)``, the next chunk, within the robot's limits.
         sequence: ``(n, j)``, the whole chosen sequence, of which ``controls`` is the beginning.
-        score: of its video. scores: of all candidates that were scored, the chosen one first, then the better before the worse.
+        score: of its video. scores: of all candidates, the chosen one first, then falling.
         model_calls: steps that the model predicted for this choice, counted for each candidate.
-        seconds: that the search took.
+        seconds: duration of the search.
         stopped: by the number of candidates, by time, or because a score was ``certain``.
     """
 
@@ -78,23 +218,21 @@ class Plan:
     stopped: Stopped
 
 
-class Planner:
+class ClosedLoopPlanner:
     """Chooses the controls of one episode, chunk by chunk.
 
     Args:
         world: the model; a causal one makes chunks of a block, a Stage II model of a clip.
-        cameras: of the views that are given, wrist cameras at their pose of the first call of :meth:`plan` (or with a known
-            mount); they follow the arms by kinematics.
+        cameras: of the given views, wrist cameras at their pose of the first call of :meth:`plan` (or with a known mount); they follow
+            the arms by kinematics.
         embodiment: name or YAML file of the robot, or its kinematics.
-        instruction: what is to be done, for the score.
-        propose, score: where candidates come from, and which is best.
-        solver: ``best_of_n``, ``cem``, ``icem``, ``mppi``, or a function of your own.
+        instruction: the task, for the score.
+        propose, score: source of the candidates, and their order.
+        solver: ``best_of_n``, ``icem``, or a function of your own.
         candidates: sequences scored at each call, at most.
         horizon: chunks that are predicted at each call.
-        batch: candidates that are simulated together; time and certainty are looked at between batches.
-        seconds: for one call; see :func:`~worldline_core.evaluation.planning.solvers.search`.
-        certain: a score from which on nothing better is looked for.
-        margin: what is left of the last choice is carried on unless another candidate scores better by more than this.
+        batch: candidates that are simulated together; time and certainty are checked between batches.
+        seconds, certain, margin: of one call, as of :func:`search`; the margin is in favour of the rest of the last choice.
         seed: of the proposals, and of the model's noise, which all candidates share.
         limits, response: as of ``WorldLine.start``.
 
@@ -128,10 +266,9 @@ class Planner:
         numbers = {"candidates": candidates, "horizon": horizon, "batch": batch, "seconds": seconds or 1}
         if min(numbers.values()) <= 0 or not margin >= 0:
             raise ConfigError(
-                "A planner cannot be run so",
-                expected="positive numbers; a margin of at least 0",
+                "A planner's numbers are out of range", expected="positive numbers; a margin of at least 0",
                 got={**numbers, "margin": margin},
-            )
+            )  # fmt: skip
         known = isinstance(embodiment, ArmKinematics)
         self.kinematics = embodiment if known else ArmKinematics(load_embodiment(embodiment))
         self.world, self.cameras, self.instruction = world, dict(cameras), instruction
@@ -143,21 +280,21 @@ class Planner:
         self._first_state: np.ndarray | None = None
         self._past: dict[str, list[np.ndarray]] = {}
         self._points: np.ndarray | None = None
-        self._found: Found | None = None
+        self._last: SearchResult | None = None
         self._executed = 0
 
     def plan(self, images: Mapping[str, np.ndarray], state: np.ndarray, *, horizon: int | None = None) -> Plan:
         """The next controls.
 
         Args:
-            images: what the cameras saw since the last call, ``uint8 (n, H, W, 3)`` by view, the last picture now; or only
-                now, ``(H, W, 3)``. More pictures show the score more of what happened.
-            state: ``(j)``, the last command that was executed (at the first call the one that belongs to the images).
+            images: what the cameras saw since the last call, ``uint8 (n, H, W, 3)`` by view, the last picture now; or only now,
+                ``(H, W, 3)``. More pictures show the score more of what happened.
+            state: ``(j)``, the last executed command (at the first call the one that belongs to the images).
             horizon: chunks to predict this time, where an episode ends earlier than the planner's horizon.
 
         Raises:
             DataError: images, state or proposals have a wrong shape or are not finite, a score is not finite or its function
-                failed. What the planner knows of the episode is as before the call.
+                failed. The planner's knowledge of the episode is then as before the call.
         """
         seen = {view: np.asarray(video)[None] if np.ndim(video) == 3 else video for view, video in images.items()}
         now = {view: video[-1] for view, video in seen.items()}
@@ -166,29 +303,27 @@ class Planner:
         first_points = simulated_points(simulation, 0) if self._points is None else self._points
         chunk = simulation.frames_per_step
         frames = (horizon or self.horizon) * chunk
-        executed = self._executed + (chunk if self._found is not None else 0)
+        executed = self._executed + (0 if self._last is None else chunk)
         situation = Situation(now, command, frames, executed)
         past = {view: [*self._past.get(view, []), self._shrunk(video[:-1])] for view, video in seen.items()}
-        space = Space(
+        space = SearchSpace(
             lambda count: self._proposed(situation, count),
             lambda sequences: self._executable(command, sequences),
-            self._kept(chunk, frames),
+            self._rest(chunk, frames),
             self._random,
         )
         found = search(
             self._solver(space, self.candidates),
             lambda sequences: self._scores(simulation, sequences, past, first_points),
             batch=self._batch, seconds=self._seconds, certain=self._certain, clock=self._clock,
-            margin=0.0 if self._found is None else self._margin,
+            margin=0.0 if self._last is None else self._margin,
         )  # fmt: skip
         self._first_state = command if self._first_state is None else self._first_state
         self._past = {view: [*past[view], self._shrunk(video[-1:])] for view, video in seen.items()}
-        self._points, self._found, self._executed = first_points, found, executed
+        self._points, self._last, self._executed = first_points, found, executed
         calls = len(found.scores) * frames // chunk
         best = found.sequences[0]
-        return Plan(
-            best[:chunk], best, float(found.scores[0]), found.scores, calls, found.seconds, found.stopped
-        )  # fmt: skip
+        return Plan(best[:chunk], best, float(found.scores[0]), found.scores, calls, found.seconds, found.stopped)
 
     def _begin(self, now: Mapping[str, np.ndarray], command: np.ndarray) -> Simulation:
         """A simulation that begins at these pictures, its cameras where the arms have carried them."""
@@ -209,22 +344,21 @@ class Planner:
             response=self._response,
         )  # fmt: skip
 
-    def _kept(self, chunk: int, frames: int) -> np.ndarray:
+    def _rest(self, chunk: int, frames: int) -> np.ndarray:
         """Sequences of the last search without their executed chunk, the last command held where they end early."""
-        if self._found is None:
+        if self._last is None:
             return np.empty((0, frames, self.kinematics.embodiment.state_size))
-        rows = np.minimum(np.arange(chunk, chunk + frames), self._found.sequences.shape[1] - 1)
-        return self._found.sequences[:, rows]
+        rows = np.minimum(np.arange(chunk, chunk + frames), self._last.sequences.shape[1] - 1)
+        return self._last.sequences[:, rows]
 
     def _proposed(self, situation: Situation, count: int) -> np.ndarray:
         proposed = np.asarray(self.propose(situation, count, self._random), dtype=np.float64)
         wanted = (count, situation.frames, len(situation.state))
         if proposed.shape != wanted or not np.isfinite(proposed).all():
             raise DataError(
-                "Proposals do not fit",
-                expected=f"{wanted}: candidates, frames, columns of the state; finite",
+                "Proposals do not fit", expected=f"{wanted}: candidates, frames, columns of the state; finite",
                 got=f"{proposed.shape}, {int((~np.isfinite(proposed)).sum())} not finite",
-            )
+            )  # fmt: skip
         return proposed
 
     def _executable(self, command: np.ndarray, sequences: np.ndarray) -> np.ndarray:
@@ -255,13 +389,12 @@ class Planner:
             trajectory = Trajectory(self.instruction, frames, branches.fps, np.concatenate(tools))
             try:
                 scores.append(float(self.score(trajectory)))
-            except Exception as error:
+            except Exception as error:  # somebody else's function
                 raise DataError(
                     "The score function of a planner failed",
                     where=f"candidate {number} of a batch of {len(videos)}, a video of {trajectory.num_frames} frames",
-                    expected="a number for every video, higher is better",
-                    got=f"{type(error).__name__}: {error}",
-                ) from error
+                    expected="a number for every video, higher is better", got=f"{type(error).__name__}: {error}",
+                ) from error  # fmt: skip
         return np.array(scores)
 
     def _shrunk(self, video: np.ndarray) -> np.ndarray:
@@ -276,13 +409,12 @@ def drawn_around(deviation: float | np.ndarray, nominal: np.ndarray | None = Non
 
     Args:
         deviation: standard deviation of every column, or ``(j)``, in the state's units.
-        nominal: ``(m, j)`` from the episode's first command after the start on (its last row is held); by default the last
-            command is held.
+        nominal: ``(m, j)`` from the episode's first command after the start on (its last row is held); None holds the last command.
         colour: of the noise over time, 0 white, 2 smooth.
     """
 
     def propose(situation: Situation, count: int, random: np.random.Generator) -> np.ndarray:
-        middle = situation.state[None] if nominal is None else _going_on(nominal, situation)
+        middle = situation.state[None] if nominal is None else _from_here(nominal, situation)
         shape = (count, situation.frames, len(situation.state))
         return middle + deviation * coloured_noise(random, shape, colour)
 
@@ -290,18 +422,17 @@ def drawn_around(deviation: float | np.ndarray, nominal: np.ndarray | None = Non
 
 
 def recorded(controls: Float[np.ndarray, "m n j"]) -> Propose:
-    """Proposals from recorded sequences (row 0 is the first command after the start; the last one is held), drawn without
-    repetition where there are enough; later in the episode, what is left of each.
-    """
+    """Proposals from recorded sequences (row 0 is the first command after the start; the last one is held), drawn without repetition
+    where there are enough; later in the episode, the rest of each."""
 
     def propose(situation: Situation, count: int, random: np.random.Generator) -> np.ndarray:
         order = np.concatenate([random.permutation(len(controls)) for _ in range(-(-count // len(controls)))])
-        return np.stack([_going_on(controls[number], situation) for number in order[:count]])
+        return np.stack([_from_here(controls[number], situation) for number in order[:count]])
 
     return propose
 
 
-def _going_on(rows: np.ndarray, situation: Situation) -> np.ndarray:
+def _from_here(rows: np.ndarray, situation: Situation) -> np.ndarray:
     frames = np.arange(situation.executed, situation.executed + situation.frames)
     return np.asarray(rows)[np.minimum(frames, len(rows) - 1)]
 
@@ -312,8 +443,8 @@ def judged(selector: Selector) -> Score:
 
 
 class GoalPicture:
-    """Score by nearness to a picture of the goal: the mean cosine similarity of video features, cell by cell, of the last
-    picture and the goal's, in -1..1.
+    """Score by nearness to a picture of the goal: mean cosine similarity (-1..1) of video features, cell by cell, of the last picture
+    and the goal's.
 
     Args:
         encoder: features, for example ``load_teacher(Path("artifacts/shipped/models/teacher"))`` or V-JEPA 2.

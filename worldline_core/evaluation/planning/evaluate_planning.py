@@ -1,8 +1,7 @@
 """The step evaluate_planning: is the candidate chosen by its predicted video better than one taken blindly?
 
-Every method's videos of the same banks go through the same brackets. Labels stay sealed: they are opened once all
-choices of all methods are on disk. The recorded videos are chosen from too (method ``true``): that is the selector's
-own ceiling. Reported are success against the number of candidates and the gain over direct execution.
+Every method's videos of the same banks go through the same brackets. Labels stay sealed until all choices of all methods are on disk.
+The recorded videos are chosen from too (method ``true``): that is the selector's own ceiling.
 """
 
 from __future__ import annotations
@@ -23,12 +22,13 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.evaluation.evaluation_config import PlanningConfig
-from worldline_core.evaluation.planning.bracket import choose, shown_order
-from worldline_core.evaluation.planning.selectors import (
+from worldline_core.evaluation.planning.bracket import (
     CandidateVideo,
     MeasuredSelector,
     Selector,
     VLMSelector,
+    choose,
+    shown_order,
     shown_video,
 )
 from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
@@ -116,7 +116,7 @@ def list_banks(rows: list[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
 
 
 def open_selector(config: PlanningConfig, segmenter: Path | None) -> Selector:
-    """The selector that the config names."""
+    """The selector of a config."""
     if config.selector == "measured":
         return MeasuredSelector(open_segmenter(config.segmenter, learned=segmenter, sam3=config.sam3_weights))
     return VLMSelector(open_vlm(config.selector, config.vlm))
@@ -154,7 +154,7 @@ def candidate_loader(
     method: str,
     rows: Sequence[EpisodeRow],
 ) -> Callable[[int], CandidateVideo]:
-    """Gives what is shown of a candidate by its number in the bank: recorded, or predicted by a method. Decoded once.
+    """Loads a candidate's video by its number in the bank, recorded or predicted by a method; each is decoded once.
 
     Raises: ArtifactError when the method has not predicted every candidate.
     """
@@ -208,14 +208,14 @@ def write_results(
     outcomes: Mapping[str, bool],
     output: Path,
 ) -> dict[str, Any]:
-    """Write scores.parquet and summary.json.
+    """Write scores.parquet and summary.json: success against the number of candidates, and the gain over direct execution.
 
-    Direct execution of a policy takes one candidate blindly: its expected success in a bank is the mean over the
-    bank's candidates, the same reference for every budget.
+    Direct execution of a policy takes one candidate blindly: its expected success in a bank is the mean over the bank's candidates, the
+    same reference for every budget.
     """
-    direct = {bank: float(np.mean([outcomes[row.episode_id] for row in rows])) for bank, rows in banks.items()}
-    oracle = {bank: float(any(outcomes[row.episode_id] for row in rows)) for bank, rows in banks.items()}
-    scores: list[Score] = []
+    ends = {bank: [outcomes[row.episode_id] for row in rows] for bank, rows in banks.items()}
+    direct = {bank: float(np.mean(own)) for bank, own in ends.items()}
+    scores = [_score(DIRECT, banks[bank][0], 0, "success", value) for bank, value in direct.items()]
     success: dict[str, dict[int, dict[str, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     malformed: dict[str, int] = defaultdict(int)
     for choice in choices:
@@ -224,7 +224,6 @@ def write_results(
         success[method][budget][bank].append(value)
         malformed[method] += choice["trace"]["malformed_answers"]
         scores.append(_score(method, banks[bank][0], choice["run"], f"success@{budget}", value))
-    scores += [_score(DIRECT, banks[bank][0], 0, "success", value) for bank, value in direct.items()]
     write_scores(output, scores)
 
     def interval(values: Sequence[float]) -> dict[str, Any]:
@@ -237,61 +236,46 @@ def write_results(
         means = {bank: float(np.mean(by_bank[bank])) for bank in sorted(by_bank)}
         over_runs = deviation([float(np.mean(run)) for run in zip(*by_bank.values(), strict=True)])
         spread = {"std_over_banks": deviation(list(means.values())), "std_over_runs": over_runs}
-        return {
-            "success": interval(list(means.values())) | spread,
-            "gain": interval([means[bank] - direct[bank] for bank in means]),
-            "banks": means,
-        }
+        gain = interval([means[bank] - direct[bank] for bank in means])
+        return {"success": interval(list(means.values())) | spread, "gain": gain, "banks": means}
+
+    def by_family(by_budget: Mapping[int, Mapping[str, Sequence[float]]]) -> dict[str, Any]:
+        """Mean success and gain of each task family and budget."""
+        found: dict[str, dict[str, Any]] = defaultdict(dict)
+        for budget, values in sorted(by_budget.items()):
+            for family in sorted({banks[bank][0].task_family for bank in values}):
+                members = [bank for bank in values if banks[bank][0].task_family == family]
+                mean = float(np.mean([np.mean(values[bank]) for bank in members]))
+                gain = mean - float(np.mean([direct[bank] for bank in members]))
+                found[family][str(budget)] = {"success": mean, "gain": gain, "banks": len(members)}
+        return found
 
     methods = {
         method: {
             "budgets": {str(budget): statistics(values) for budget, values in sorted(by_budget.items())},
-            "by_family": _by_family(by_budget, banks, direct),
+            "by_family": by_family(by_budget),
             "malformed_answers": malformed[method],
         }
         for method, by_budget in sorted(success.items())
     }
+    shown = ("scene", "embodiment", "task_family", "instruction")
     summary = {
         "selector": selector,
         "banks": {
-            bank: {
-                "scene": rows[0].scene,
-                "embodiment": rows[0].embodiment,
-                "task_family": rows[0].task_family,
-                "instruction": rows[0].instruction,
-                "candidates": len(rows),
-                "direct_success": direct[bank],
-                "any_success": bool(oracle[bank]),
-            }
+            bank: {name: getattr(rows[0], name) for name in shown}
+            | {"candidates": len(rows), "direct_success": direct[bank], "any_success": any(ends[bank])}
             for bank, rows in banks.items()
         },
         DIRECT: interval(list(direct.values())),
-        "oracle": interval(list(oracle.values())),
+        "oracle": interval([float(any(own)) for own in ends.values()]),
         "methods": methods,
         "interval": "95 % bootstrap over banks",
     }
     write_json_atomic(output / SUMMARY_FILE, summary)
     largest = {
-        method: values["budgets"][max(values["budgets"], key=int)]["success"]["mean"]
-        for method, values in methods.items()
+        name: found["budgets"][max(found["budgets"], key=int)]["success"]["mean"] for name, found in methods.items()
     }
     return {"banks": len(banks), DIRECT: summary[DIRECT]["mean"], "success_at_largest_budget": largest}
-
-
-def _by_family(
-    by_budget: Mapping[int, Mapping[str, Sequence[float]]],
-    banks: Mapping[str, Sequence[EpisodeRow]],
-    direct: Mapping[str, float],
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Mean success and gain of each task family and budget."""
-    families: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
-    for budget, values in sorted(by_budget.items()):
-        for family in sorted({banks[bank][0].task_family for bank in values}):
-            members = [bank for bank in values if banks[bank][0].task_family == family]
-            mean = float(np.mean([np.mean(values[bank]) for bank in members]))
-            gain = mean - float(np.mean([direct[bank] for bank in members]))
-            families[family][str(budget)] = {"success": mean, "gain": gain, "banks": len(members)}
-    return dict(families)
 
 
 def _score(method: str, row: EpisodeRow, run: int, metric: str, value: float) -> Score:
