@@ -79,11 +79,6 @@ def build_parser() -> argparse.ArgumentParser:
         "artifact", type=Path, nargs="*", help="only these, shipped ones too (default: all of the store)"
     )
     verify.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="the store (default: artifacts)")
-    verify.add_argument(
-        "--set-aside",
-        action="store_true",
-        help="move what is damaged to damaged/, so that the next run builds it again",
-    )
     verify.add_argument("--json", action="store_true", help="print JSON")
     verify.set_defaults(run=_verify)
     add_plan_command(commands)
@@ -239,18 +234,20 @@ def _inspect(arguments: argparse.Namespace) -> None:
 
 
 def _verify(arguments: argparse.Namespace) -> None:
-    from worldline_core.store.verification import check_artifacts, finished_artifacts
+    from worldline_core.store.artifact_files import check_artifacts, finished_artifacts, how_to_rebuild
 
-    folders = arguments.artifact or finished_artifacts(arguments.artifacts)
-    checked = check_artifacts(folders, set_damaged_aside=arguments.set_aside)
-    damaged = sum(bool(found.damage) for found in checked)
+    checked = check_artifacts(arguments.artifact or finished_artifacts(arguments.artifacts))
+    damaged = sum(map(bool, checked.values()))
     if arguments.json:
         import json
-        from dataclasses import asdict
 
-        print(json.dumps([asdict(found) for found in checked], default=str, indent=1))
+        print(json.dumps([{"artifact": str(folder), "damage": damage} for folder, damage in checked.items()], indent=1))
     else:
-        print(*checked, f"{len(checked)} artifacts, {damaged} damaged", sep="\n")
+        for folder, damage in checked.items():
+            print(f"{'damaged' if damage else 'whole'}  {folder}", *damage, sep="\n  ")
+            if damage:
+                print(f"  next step: {how_to_rebuild(folder)}")
+        print(f"{len(checked)} artifacts, {damaged} damaged")
     raise SystemExit(1 if damaged else 0)
 
 

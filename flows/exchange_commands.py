@@ -110,7 +110,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _push(arguments: argparse.Namespace) -> None:
-    from worldline_core.publishing.publish import push
+    from worldline_core.publishing import push
 
     pushed = push(
         arguments.artifact,
@@ -119,11 +119,11 @@ def _push(arguments: argparse.Namespace) -> None:
         allow_restricted=arguments.allow_restricted,
         title=arguments.title,
     )
-    print(f"{pushed.location}  {pushed.files} files  {pushed.num_bytes / 2**20:.1f} MiB")
+    print(f"{arguments.where}  {pushed.files} files  {pushed.num_bytes / 2**20:.1f} MiB")
 
 
 def _pull(arguments: argparse.Namespace) -> None:
-    from worldline_core.publishing.publish import pull
+    from worldline_core.publishing import pull
 
     pulled = pull(arguments.where, arguments.folder)
     print(f"{arguments.folder}  {pulled.files} files  {pulled.num_bytes / 2**20:.1f} MiB")

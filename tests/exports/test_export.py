@@ -19,7 +19,7 @@ from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.exports.export import export
-from worldline_core.publishing.content import set_files
+from worldline_core.publishing import set_files
 from worldline_core.report.inspect_pictures import write_pictures as inspect
 
 FRAMES = 20

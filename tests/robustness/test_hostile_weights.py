@@ -23,8 +23,7 @@ from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_inf
 from worldline_core.model.tokenizers import load_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.publishing.content import check_manifest
-from worldline_core.store.artifact_files import read_json, read_json_lines
+from worldline_core.store.artifact_files import read_json, read_json_lines, read_manifest
 from worldline_core.training.clip_source import LatentStore
 from worldline_core.training.video_teacher import load_teacher
 
@@ -256,7 +255,7 @@ def test_small_descriptions_that_are_none_are_named(tmp_path: Path, content: byt
     for name in ("config.json", "manifest.json", "store.json"):
         (tmp_path / name).write_bytes(content)
     pq.write_table(pa.table({"episode_id": ["a"]}), tmp_path / "index.parquet")
-    for read in (load_teacher, LatentStore.open, load_tokenizer, lambda folder: check_manifest(folder, "a store")):
+    for read in (load_teacher, LatentStore.open, load_tokenizer, read_manifest):
         with pytest.raises(ArtifactError) as caught:
             read(tmp_path)
         assert str(tmp_path) in str(caught.value)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
+import stat
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +25,7 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import find_files, inside, local_file, parse_location
 from worldline_core.scale.account import read_account
 from worldline_core.scale.mapping import RunnerConfig, SerialMapper
+from worldline_core.store import remote
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.store.remote import RemoteCache, UnreachableInputError, list_files, process_cache
 from worldline_core.store.store import ArtifactStore
@@ -140,20 +144,36 @@ def test_metadata_cannot_lead_out_of_the_location(relative: str) -> None:
     assert str(inside(root, "videos/x.mp4")).endswith("set/videos/x.mp4")
 
 
-def test_copies_stay_within_their_bound(tmp_path: Path, store: ObjectStore) -> None:
+def test_copies_stay_within_their_bound_in_a_private_folder(tmp_path: Path, store: ObjectStore) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
     for number in range(6):
         (folder / f"{number}.bin").write_bytes(bytes([number]) * 1000)
     root = parse_location(store.upload(folder, "bound"))
-    cache = RemoteCache(tmp_path / "cache", max_bytes=2500)
+    cache = RemoteCache(max_bytes=2500)
+    assert stat.S_IMODE(cache.folder.stat().st_mode) == 0o700
     for number in (0, 1, 0, 2, 3, 0, 4, 5):
         copy = cache.fetch(root / f"{number}.bin")
         assert copy.read_bytes() == bytes([number]) * 1000
         assert sum(path.stat().st_size for path in cache.folder.rglob("*") if path.is_file()) <= 2500
-    assert cache.fetched_bytes == 7000  # 0 was asked for three times: once it was still there
+    asked = [path for method, path in store.requests if method == "GET" and "/bound/" in path]
+    assert len(asked) == 7  # 0 was asked for three times: once it was still there
     cache.clear()
-    assert not cache.folder.exists()
+    assert list(cache.folder.iterdir()) == []
+
+
+def test_caches_of_killed_processes_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    alive, dead, young = RemoteCache(), tmp_path / "worldline-remote-dead", tmp_path / "worldline-remote-young"
+    (tmp_path / "worldline-remote-link").symlink_to(tmp_path.parent, target_is_directory=True)
+    for folder in (dead, young):
+        folder.mkdir()
+        (folder / "copy").touch()
+    for folder in (alive.folder, dead):
+        os.utime(folder, (0, 0))
+    remote._remove_leftovers()
+    assert {path.name for path in tmp_path.iterdir()} == {alive.folder.name, young.name, "worldline-remote-link"}
+    assert tmp_path.parent.is_dir()
 
 
 def test_a_cut_download_is_noticed(tmp_path: Path, store: ObjectStore, monkeypatch: pytest.MonkeyPatch) -> None:

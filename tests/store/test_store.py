@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ from safetensors import safe_open
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.pipeline.steps import get_step
-from worldline_core.store import verification
+from worldline_core.store import store as store_module
 from worldline_core.store.artifact_files import digest_folder, digest_value, folder_files
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
-from worldline_core.store.store import ArtifactStore, alone_in
+from worldline_core.store.store import ArtifactStore, folder_lock
 
 
 class CountConfig(StrictModel):
@@ -52,36 +53,13 @@ def test_second_run_is_cached(tmp_path: Path) -> None:
     assert digest_folder(second.path) == second.digest
 
 
-LEFT = {"missing_view": 1, "other_split": 1}
-
-
-@pytest.mark.parametrize(
-    ("metrics", "said"),
-    [
-        (
-            {"found": 5, "kept": 3, "quarantined": 2, "reasons": {"static": 2}},
-            "; found 5, kept 3, quarantined 2 (2 static)",
-        ),
-        ({"found": 5, "kept": 3, "left_out": LEFT}, "; found 5, kept 3, left out 2 (1 missing_view, 1 other_split)"),
-        (
-            {"found": 2, "kept": 2, "quarantined": 0, "reasons": {}, "splits": {"test": 2}},
-            "; found 2, kept 2, quarantined 0; all in split test, so nothing is trained on them "
-            "(curate.sources[].split, curate.splits)",
-        ),
-        ({"splits": {"test": 2, "train": 1}}, ""),
-    ],
-)
-def test_a_step_says_what_became_of_its_episodes_and_where(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, metrics: dict[str, Any], said: str
-) -> None:
-    def keep(config: CountConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-        return metrics
-
+def test_a_step_logs_its_counts_and_folder(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    metrics = {"found": 5, "kept": 3, "reasons": {"static": 2}, "splits": {}, "psnr": 3.5, "by_view": {"head": 1.5}}
     with caplog.at_level("INFO", "worldline_core"):
-        folder = ArtifactStore(tmp_path).run("keep", 1, keep, CountConfig(), {}).path
-        ArtifactStore(tmp_path).run("keep", 1, keep, CountConfig(), {})
-    assert caplog.messages[-2].endswith(f"done in 0 s{said}; {folder}")
-    assert caplog.messages[-1].endswith(f"cached{said}; {folder}")
+        for _ in range(2):
+            folder = ArtifactStore(tmp_path).run("keep", 1, lambda *_: metrics, CountConfig(), {}).path
+    assert caplog.messages[-2].endswith(f"done in 0 s; found 5; kept 3; reasons: 2 static; {folder}")
+    assert caplog.messages[-1].endswith(f"cached; found 5; kept 3; reasons: 2 static; {folder}")
 
 
 @pytest.mark.parametrize("change", ["config", "version", "step", "input"])
@@ -107,8 +85,8 @@ class JudgedConfig(CountConfig):
 
 def test_weights_count_with_their_content_and_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
-    digest = verification.digest_file
-    monkeypatch.setattr(verification, "digest_file", lambda path: read.append(path.name) or digest(path))
+    digest = store_module.digest_file
+    monkeypatch.setattr(store_module, "digest_file", lambda path: read.append(path.name) or digest(path))
     store, blobs, folder = ArtifactStore(tmp_path / "store"), tmp_path / "blobs", tmp_path / "weights"
     config = JudgedConfig(weights=folder)
     absent = store.key("judge", 1, config, {})
@@ -313,24 +291,78 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
     from worldline_core.exports.export import export
     from worldline_core.shipped import shipped_folder
 
-    with alone_in(tmp_path / "out", "exporting"):
-        with pytest.raises(ArtifactError, match="Another command is exporting into this folder"):
-            export(shipped_folder() / "recordings", tmp_path / "out", ["mcap"])
-        assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
-    with alone_in(tmp_path / "out", "exporting"):
-        pass
-    assert list((tmp_path / "out").iterdir()) == []
+    with folder_lock(tmp_path / "out"), pytest.raises(ArtifactError, match="Another command writes into this folder"):
+        export(shipped_folder() / "recordings", tmp_path / "out", ["mcap"])
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["run"]
 
 
 def test_two_recordings_do_not_write_into_one_folder(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
     from worldline_core.recorder.record import record_with_manifest
 
-    def never(config: CountConfig, output: Path) -> dict[str, Any]:
-        raise AssertionError("it waits for the other one's end")
+    with folder_lock(tmp_path), pytest.raises(ArtifactError, match="Another command writes into this folder"):
+        record_with_manifest("record_episodes", lambda config, output: {}, CountConfig(), tmp_path)
 
-    with (
-        alone_in(tmp_path, "recording"),
-        pytest.raises(ArtifactError, match="Another command is recording into this folder"),
-    ):
-        record_with_manifest("record_episodes", never, CountConfig(), tmp_path)
+
+def make_lock_a_folder(store: Path, key: str) -> None:
+    (store / "count" / f".{key}.lock").mkdir(parents=True)
+
+
+def make_partial_a_file(store: Path, key: str) -> None:
+    (store / "count").mkdir(parents=True)
+    (store / "count" / f"{key}.partial").touch()
+
+
+def make_artifact_a_file(store: Path, key: str) -> None:
+    (store / "count").mkdir(parents=True)
+    (store / "count" / key).touch()
+
+
+def make_step_a_file(store: Path, key: str) -> None:
+    store.mkdir()
+    (store / "count").touch()
+
+
+def make_step_a_link(store: Path, key: str) -> None:
+    store.mkdir()
+    (store.parent / "disk").mkdir()
+    (store / "count").symlink_to(store.parent / "disk", target_is_directory=True)
+
+
+@pytest.mark.parametrize(
+    "make", [make_lock_a_folder, make_partial_a_file, make_artifact_a_file, make_step_a_file, make_step_a_link]
+)
+def test_an_odd_store_ends_in_one_message(tmp_path: Path, make: Callable[[Path, str], None]) -> None:
+    store = ArtifactStore(tmp_path / "store")
+    make(store.root, store.key("count", 1, CountConfig(), {}))
+    with pytest.raises(ArtifactError, match=r"cannot be written|link out of the store"):
+        store.run("count", 1, count, CountConfig(), {})
+
+
+def test_a_read_only_store_serves_finished_artifacts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "weights").write_bytes(b"one")
+    config = JudgedConfig(weights=tmp_path / "weights")
+    first = ArtifactStore(tmp_path / "store").run("count", 1, count, config, {})
+    (tmp_path / "store" / ".weights.json").unlink()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(store_module, "write_json_atomic", refuse)
+    store = ArtifactStore(tmp_path / "store")
+    assert store.run("count", 1, count, config, {}).path == first.path
+    with pytest.raises(ArtifactError, match=r"cannot be written[\s\S]*Read-only file system"):
+        store.run("count", 2, count, config, {})
+
+
+def test_a_manifest_without_rights_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = ArtifactStore(tmp_path)
+    artifact = store.run("count", 1, count, CountConfig(), {})
+
+    def refuse(*_: object, **__: object) -> str:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(ArtifactError, match=r"manifest\.json[\s\S]*Permission denied"):
+        store.find("count", artifact.key)

@@ -17,10 +17,9 @@ from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import Node, plan, run_node
 from worldline_core.scale.mapping import RunnerConfig
-from worldline_core.store import verification
-from worldline_core.store.artifact_files import folder_files, write_manifest
+from worldline_core.store import artifact_files
+from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
-from worldline_core.store.verification import VerifyMode, check_artifacts, find_damage
 
 KINDS = ("curate", "filter", "render_actions", "encode_latents", "rollout.copy_first_frame", "train_stage1")
 
@@ -38,7 +37,7 @@ def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict
 
 def next_step(store: Path, folder: Path, mode: VerifyMode = "full") -> Artifact:
     """A step that reads an artifact, in a process that has read nothing yet."""
-    verification._digests.clear()
+    artifact_files._digests.clear()
     return ArtifactStore(store, mode).run("next", 1, write, WriteConfig(), {"episodes": folder})
 
 
@@ -89,7 +88,7 @@ def test_a_flipped_byte_is_named_before_it_is_used(run: dict[str, Path], kind: s
                 with pytest.raises(ArtifactError, match="damaged") as error:
                     next_step(tmp_path, folder)
                 assert path.relative_to(folder).as_posix() in str(error.value)
-                assert f"worldline verify {folder} --set-aside" in str(error.value)
+                assert f"delete {folder}" in str(error.value)
                 assert f"worldline task {folder.parent.name}" in str(error.value)
     assert not next_step(tmp_path, folder).cached
 
@@ -101,7 +100,7 @@ def test_the_videos_that_a_filtered_set_shares_are_compared_too(run: dict[str, P
 
 
 def test_verify_goes_on_after_a_damaged_index(run: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    verification._digests.clear()
+    artifact_files._digests.clear()
     index = run["filter"] / "index.parquet"
     with flipped(index, index.stat().st_size - 9, 7), pytest.raises(SystemExit, match="1"):
         main(["verify", "--artifacts", str(run["filter"].parents[1])])
@@ -121,17 +120,17 @@ def test_files_that_are_missing_added_or_of_another_size_are_named(artifact: Pat
     (artifact / "two").write_text("abcd")
     (artifact / "run").mkdir()
     (artifact / "run" / "log").write_text("belongs to no digest")
-    with pytest.raises(ArtifactError, match="below/three: nothing instead of a file") as error:
+    with pytest.raises(ArtifactError, match="below/three: missing") as error:
         next_step(tmp_path, artifact)
-    assert "new: a file instead of nothing" in str(error.value)
-    assert "two: 4 bytes instead of 3 bytes" in str(error.value)
+    assert "new: not listed" in str(error.value)
+    assert "two: 4 bytes instead of 3" in str(error.value)
     assert "one:" not in str(error.value)
 
 
 def test_fast_reads_only_what_was_changed_after_the_manifest(artifact: Path, tmp_path: Path) -> None:
-    verification._digests.clear()
+    artifact_files._digests.clear()
     assert not find_damage(artifact, "fast")
-    assert not verification._digests
+    assert not artifact_files._digests
     (artifact / "one").write_text("abd")
     os.utime(artifact / "one", ns=(0, (artifact / "manifest.json").stat().st_mtime_ns + 1))
     with pytest.raises(ArtifactError, match="one: sha256"):
@@ -146,18 +145,9 @@ def test_fast_reads_only_what_was_changed_after_the_manifest(artifact: Path, tmp
 def test_a_process_reads_each_file_once(artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     next_step(tmp_path, artifact)
     read: list[Path] = []
-    monkeypatch.setattr(verification, "digest_file", lambda path: read.append(path) or "")
+    monkeypatch.setattr(artifact_files, "digest_file", lambda path: read.append(path) or "")
     assert not find_damage(artifact)
     assert not read
-
-
-def test_an_artifact_of_an_earlier_version_is_compared_as_a_whole(artifact: Path, tmp_path: Path) -> None:
-    manifest = json.loads((artifact / "manifest.json").read_text())
-    del manifest["files"], manifest["manifest_sha256"]
-    (artifact / "manifest.json").write_text(json.dumps(manifest))
-    assert not find_damage(artifact)
-    with flipped(artifact / "two", 1, 1), pytest.raises(ArtifactError, match="one of its files: digest"):
-        next_step(tmp_path, artifact)
 
 
 def test_how_inputs_are_compared_is_read_from_the_runner() -> None:
@@ -168,11 +158,10 @@ def test_how_inputs_are_compared_is_read_from_the_runner() -> None:
     assert found == {"off", "fast", "full"}
 
 
-def test_verify_names_what_is_damaged_and_sets_it_aside(
+def test_verify_names_damaged_files_and_how_to_rebuild(
     artifact: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = next_step(tmp_path, artifact).path
-    digest = json.loads((artifact / "manifest.json").read_text())["digest"]
     command = ["verify", "--artifacts", str(tmp_path)]
     with pytest.raises(SystemExit, match="0"):
         main(command)
@@ -180,32 +169,27 @@ def test_verify_names_what_is_damaged_and_sets_it_aside(
     (artifact / "two").write_text("abd")
     with pytest.raises(SystemExit, match="1"):
         main(command)
-    assert "two: " in (printed := capsys.readouterr().out)
+    assert f"delete {artifact}" in (printed := capsys.readouterr().out)
     assert f"whole  {other}" in printed
     with pytest.raises(SystemExit, match="1"):
-        main([*command, "--set-aside", "--json"])
-    [found] = [entry for entry in json.loads(capsys.readouterr().out) if entry["damage"]]
-    assert (found["artifact"], found["damage"][0]["file"]) == (str(artifact), "two")
-    assert (Path(found["set_aside"]) / "two").read_text() == "abd"
-    rebuilt = ArtifactStore(tmp_path).run("write", 1, write, WriteConfig(), {})
-    assert (rebuilt.path, rebuilt.digest, rebuilt.cached) == (artifact, digest, False)
-    with pytest.raises(SystemExit, match="0"):
-        main([*command, str(artifact)])
-
-
-def test_only_artifacts_of_a_store_are_set_aside(tmp_path: Path) -> None:
-    (folder := tmp_path / "recordings").mkdir()
-    (folder / "one").write_text("abc")
-    write_manifest(folder, {"step": "record_episodes"})
-    (folder / "one").write_text("abd")
-    with pytest.raises(ArtifactError, match=r"Only an artifact of a store[\s\S]*git checkout"):
-        check_artifacts([folder], set_damaged_aside=True)
+        main([*command, "--json"])
+    [damaged] = [entry for entry in json.loads(capsys.readouterr().out) if entry["damage"]]
+    assert damaged["artifact"] == str(artifact)
+    assert damaged["damage"][0].startswith("two: sha256")
     with pytest.raises(ArtifactError, match="Not a finished artifact"):
         check_artifacts([tmp_path])
+
+
+def test_recordings_outside_of_a_store_are_not_to_be_deleted(tmp_path: Path) -> None:
+    (tmp_path / "one").write_text("abc")
+    write_manifest(tmp_path, {"step": "record_episodes"})
+    (tmp_path / "one").write_text("abd")
+    with pytest.raises(ArtifactError, match=r"one: sha256[\s\S]*git checkout"):
+        next_step(tmp_path / "store", tmp_path)
 
 
 def test_shipped_files_are_those_of_their_manifests(project_root: Path) -> None:
     shipped = project_root / "artifacts" / "shipped"
     folders = [shipped / "recordings", shipped / "banks", *sorted((shipped / "models").iterdir())]
-    damaged = [str(found) for found in check_artifacts(folders) if found.damage]
+    damaged = [folder for folder, damage in check_artifacts(folders).items() if damage]
     assert not damaged, "changed on purpose? python -m tools.state_files FOLDER..."

@@ -19,7 +19,7 @@ from einops import rearrange
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, NoAnswerError, Part, Text, Video, VisionLanguageModel
-from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
+from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
 from worldline_core.untrusted_text import cut, without_secret
 
 MAX_ANSWER_BYTES = 1 << 20

@@ -29,7 +29,7 @@ from worldline_core.pictures import png_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import kind_of, linked_folder
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
-from worldline_core.store.store import alone_in
+from worldline_core.store.store import folder_lock
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ def export(
         raise ConfigError(
             "Predictions are not chosen by outcome", where=artifact, got=outcome, next_step="name episodes"
         )
-    with alone_in(output, "exporting"):
+    with folder_lock(output):
         if kind == "EpisodeSet":
             return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids, outcome)
         return _export_rollouts(artifact, output, formats, episode_ids, episodes)

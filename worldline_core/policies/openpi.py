@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import DataError, UnavailableError
+from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
-from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
 
 
 class OpenpiPolicy(MessageSocket):

@@ -32,7 +32,7 @@ from worldline_core.recorder.things import TASKS
 from worldline_core.scale.process_end import end_with_pool
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
-from worldline_core.store.store import alone_in, describe_environment
+from worldline_core.store.store import describe_environment, folder_lock
 
 Embodiment = Literal[
     "viperx_graphite",
@@ -332,7 +332,7 @@ def record_with_manifest[C: StrictModel](
         ArtifactError: another command is recording into it.
         WorldLineError: what ``run`` raises.
     """
-    with alone_in(output, "recording"):
+    with folder_lock(output):
         return _recorded(step, run, config, output)
 
 

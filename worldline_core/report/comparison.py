@@ -90,7 +90,7 @@ def collect_metrics(inputs: Mapping[str, Path]) -> dict[str, Interval]:
                 where=path,
                 expected="by group or method the mean, low, high and count of each metric",
                 got=str(error),
-                next_step=f"worldline verify {folder} --set-aside, then the same command writes it again",
+                next_step=f"delete {folder}, then the same command writes it again",
             ) from error
     return found
 

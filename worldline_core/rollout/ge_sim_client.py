@@ -23,7 +23,7 @@ import numpy as np
 from worldline_core.data.guards.images import decode_image
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.store.http_exchange import NoAnswer, Unreachable, exchange
+from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
 from worldline_core.untrusted_text import cut
 
 CHUNK = 25

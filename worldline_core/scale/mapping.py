@@ -26,8 +26,8 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError, WorldLineError
 from worldline_core.progress import Progress
 from worldline_core.scale.account import InputRow, crash_evidence, portable_message, write_shard_account
+from worldline_core.store.artifact_files import VerifyMode
 from worldline_core.store.remote import UnreachableInputError, first_line, is_transient, retry_pauses, with_retries
-from worldline_core.store.verification import VerifyMode
 
 logger = logging.getLogger(__name__)
 
@@ -174,7 +174,7 @@ def reading_input(where: object) -> Iterator[None]:
             raise
         raise ArtifactError(
             "An input of this step is missing or damaged", where=where, got=f"{type(error).__name__}: {error}",
-            next_step="worldline verify says which files; --set-aside lets the step that wrote them build them again",
+            next_step="worldline verify names the damaged artifact and how to rebuild it",
         ) from error  # fmt: skip
 
 

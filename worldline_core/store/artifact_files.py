@@ -1,13 +1,20 @@
-"""The files of artifacts: their digests, what kind they are, and JSON and Parquet read with errors that name the file."""
+"""Files of artifacts: reading them, and comparing them with the sizes and digests in their manifest.
+
+A disk, a copy or a person that changes a byte changes what the next step computes, mostly without an error. Every
+manifest therefore lists the size and digest of each file, and a step's inputs are compared with it before they are read.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import os
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
 from worldline_core.errors import ArtifactError
 from worldline_core.store.atomic import write_json_atomic
@@ -15,24 +22,33 @@ from worldline_core.store.atomic import write_json_atomic
 if TYPE_CHECKING:
     import pyarrow as pa
 
+logger = logging.getLogger(__name__)
+
 JsonObject = dict[str, Any]
 MANIFEST_NAME = "manifest.json"
 KEY_LENGTH = 16
 VOLATILE_FOLDER = "run"
 """Not part of an artifact's content: timings, logs, resume state, recordings with wall-clock stamps."""
+VerifyMode = Literal["full", "fast", "off"]
+"""full: the digest of every file, once a process. fast: sizes, and the digests of files changed after the manifest was
+written. off: nothing."""
+
+_LARGE_BYTES = 1 << 30
+_digests: dict[tuple[Path, int, int], str] = {}
+"""Digests computed by this process, by path, size and modification time."""
 
 
 def read_json(path: Path) -> JsonObject:
     """A JSON object from a file; an absent file is an empty object.
 
     Raises:
-        ArtifactError: the file is not a JSON object.
+        ArtifactError: the file cannot be read or is not a JSON object.
     """
     if not path.is_file():
         return {}
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ArtifactError(
             "A JSON file is damaged", where=path, got=str(error), next_step="rebuild the artifact"
         ) from error
@@ -42,11 +58,13 @@ def read_json(path: Path) -> JsonObject:
 
 
 def read_json_lines(path: Path, *, atomic: bool = False) -> list[JsonObject]:
-    """The objects of a `.jsonl` file; none of an absent one. A last line that a kill cut short is left out, but of a file
-    that is written as a whole (``atomic``).
+    """The objects of a `.jsonl` file; an absent file has none.
+
+    Args:
+        atomic: the file is always written as a whole; otherwise a last line cut short by a kill is left out.
 
     Raises:
-        ArtifactError: a line before the last is not a JSON object.
+        ArtifactError: another line is not a JSON object.
     """
     if not path.is_file():
         return []
@@ -66,7 +84,7 @@ def read_json_lines(path: Path, *, atomic: bool = False) -> list[JsonObject]:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | None:
-    """A Parquet table, or some of its columns; None where there is no file.
+    """A Parquet table, or some of its columns; None for an absent file.
 
     Raises:
         ArtifactError: the file cannot be read.
@@ -85,9 +103,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table | N
 
 
 def read_rows(path: Path) -> list[JsonObject]:
-    """The rows of a Parquet table as objects; no file means no rows."""
-    found = read_table(path)
-    return [] if found is None else found.to_pylist()
+    """The rows of a Parquet table as objects; an absent file has none."""
+    table = read_table(path)
+    return [] if table is None else table.to_pylist()
 
 
 def row_schema(row: type) -> pa.Schema:
@@ -103,19 +121,16 @@ def row_schema(row: type) -> pa.Schema:
 
 
 def kind_of(folder: Path) -> str:
-    """The kind of an artifact, told by its files.
+    """The kind of an artifact, recognized by its files.
 
     Raises:
-        ArtifactError: the folder is not there, or is of no known kind.
+        ArtifactError: the folder is missing or of no known kind.
     """
     if not folder.is_dir():
         raise ArtifactError("No such artifact folder", where=folder, next_step="give the folder of a finished artifact")
-    if (folder / "scores.parquet").is_file():
-        return "Scores"
-    if (folder / "checkpoint.json").is_file():
-        return "Checkpoint"
-    if (folder / "index.html").is_file():
-        return "Report"
+    for name, kind in (("scores.parquet", "Scores"), ("checkpoint.json", "Checkpoint"), ("index.html", "Report")):
+        if (folder / name).is_file():
+            return kind
     index = read_table(folder / "index.parquet")
     columns = set() if index is None else set(index.column_names)
     for kind, needed in (
@@ -137,11 +152,11 @@ def kind_of(folder: Path) -> str:
 
 
 def linked_folder(folder: Path, name: str) -> Path | None:
-    """The folder of an input that an artifact's manifest names, where it is still there.
+    """The folder of an input named in an artifact's manifest, or None when it is gone.
 
     Manifests name inputs relative to the root of the artifacts, two folders up.
     """
-    inputs = read_json(folder / "manifest.json").get("inputs")
+    inputs = read_json(folder / MANIFEST_NAME).get("inputs")
     entry = inputs.get(name) if isinstance(inputs, dict) else None
     if not isinstance(entry, dict) or not isinstance(entry.get("path"), str):
         return None
@@ -162,7 +177,7 @@ def digest_file(path: Path) -> str:
 
 
 def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
-    """The files that make up a folder's content, sorted: without the manifest and the volatile folder, or everything.
+    """The files of a folder's content, sorted: all but the manifest and the volatile folder, or ``everything``.
 
     Raises:
         ArtifactError: a symbolic link leads out of the folder.
@@ -181,10 +196,10 @@ def folder_files(folder: Path, *, everything: bool = False) -> list[Path]:
 
 
 def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonObject]:
-    """Relative name -> `size` [bytes] and `sha256` of every file of a folder's content, as a manifest states them.
+    """`size` [bytes] and `sha256` of every file of a folder's content by relative name, as a manifest lists them.
 
     Raises:
-        ArtifactError: a file that the folder lists is gone when it is read, as where somebody still writes to it.
+        ArtifactError: a listed file is gone when it is read, because something still writes to the folder.
     """
     try:
         return {
@@ -201,7 +216,7 @@ def content_files(folder: Path, *, everything: bool = False) -> dict[str, JsonOb
 
 
 def digest_listed(files: Mapping[str, JsonObject]) -> str:
-    """SHA-256 over the names and digests of listed files: the digest of the artifact that they make up."""
+    """SHA-256 over the names and digests of listed files: the digest of the artifact they make up."""
     return digest_value([[name, files[name]["sha256"]] for name in sorted(files, key=lambda name: name.split("/"))])
 
 
@@ -209,24 +224,28 @@ def digest_folder(folder: Path, *, everything: bool = False) -> str:
     """SHA-256 over the relative names and bytes of a folder's content.
 
     Args:
-        everything: its manifest and volatile folder too, which of a folder that is no artifact are its owner's.
+        everything: include the manifest and the volatile folder, which belong to the owner of a folder that is no artifact.
     """
     return digest_listed(content_files(folder, everything=everything))
 
 
+def is_stored(folder: Path) -> bool:
+    """Whether a folder has the name of a store's artifact: its key."""
+    return re.fullmatch(rf"[0-9a-f]{{{KEY_LENGTH}}}", folder.name) is not None
+
+
 def is_artifact(folder: Path) -> bool:
-    """Whether a folder has the manifest of a finished artifact, damaged or not, and not another file of that name."""
+    """Whether a folder has the manifest of a finished artifact, damaged or not, rather than an unrelated manifest.json."""
     path = folder / MANIFEST_NAME
     if not path.is_file():
         return False
-    text = path.read_bytes()
-    return is_stored(folder) or all(f'"{key}"'.encode() in text for key in ("digest", "step"))
+    return is_stored(folder) or all(key in path.read_bytes() for key in (b'"digest"', b'"step"'))
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> str:
-    """Finish an artifact: write its manifest, with the facts of the step, and return the digest of its content.
+    """Finish an artifact: write its manifest with the facts of the step, and return the digest of its content.
 
-    `files` states every file, `digest` the whole content, `manifest_sha256` all that the manifest says besides.
+    `files` lists every file; `digest` covers the whole content, `manifest_sha256` everything else in the manifest.
     """
     files = content_files(folder)
     content = json.loads(json.dumps({**facts, "digest": digest_listed(files), "files": files}, allow_nan=False))
@@ -238,7 +257,7 @@ def read_manifest(folder: Path) -> JsonObject:
     """The manifest of a finished artifact; an empty object where there is none.
 
     Raises:
-        ArtifactError: it is damaged. One that lists no files (of an earlier version) has nothing to be compared with.
+        ArtifactError: it is damaged.
     """
     path = folder / MANIFEST_NAME
     try:
@@ -246,9 +265,7 @@ def read_manifest(folder: Path) -> JsonObject:
     except ArtifactError as error:
         raise ArtifactError(error.what, where=path, got=error.got, next_step=how_to_rebuild(folder)) from error
     stated = manifest.pop("manifest_sha256", None)
-    if stated is None and "files" not in manifest:
-        return manifest
-    if stated != (found := digest_value(manifest)):
+    if manifest and stated != (found := digest_value(manifest)):
         raise ArtifactError(
             "A manifest is damaged",
             where=path,
@@ -259,19 +276,123 @@ def read_manifest(folder: Path) -> JsonObject:
     return manifest
 
 
-def is_stored(folder: Path) -> bool:
-    """Whether a folder has the name of a store's artifact: its key."""
-    return re.fullmatch(rf"[0-9a-f]{{{KEY_LENGTH}}}", folder.name) is not None
-
-
 def how_to_rebuild(folder: Path) -> str:
-    """What to do about a damaged artifact."""
+    """The next step for the owner of a damaged artifact."""
     if is_stored(folder):
         return (
-            f"worldline verify {folder} --set-aside, and then the command that made it"
+            f"delete {folder}, then run the command that made it"
             f" (worldline task {folder.parent.name}, or the whole pipeline)"
         )
     return (
         "bring it back from where it came (git checkout, pip install --force-reinstall, worldline pull), or, where the"
         f" change is meant, delete its {MANIFEST_NAME}"
     )
+
+
+def find_damage(folder: Path, mode: VerifyMode = "full") -> list[str]:
+    """The differences between an artifact's files and its manifest; a folder without a manifest of ours has none."""
+    if mode == "off" or not is_artifact(folder):
+        return []
+    try:
+        stated = read_manifest(folder)["files"]
+    except ArtifactError as error:
+        return [f"{MANIFEST_NAME}: {error.got}"]
+    present = {path.relative_to(folder).as_posix(): path for path in folder_files(folder)}
+    damage = [f"{name}: missing" for name in sorted(stated.keys() - present.keys())]
+    damage += [f"{name}: not listed" for name in sorted(present.keys() - stated.keys())]
+    written = (folder / MANIFEST_NAME).stat().st_mtime_ns
+    reading: dict[str, tuple[Path, int, int]] = {}
+    for name in sorted(stated.keys() & present.keys()):
+        facts = present[name].stat()
+        if facts.st_size != stated[name]["size"]:
+            damage.append(f"{name}: {facts.st_size} bytes instead of {stated[name]['size']}")
+        elif mode == "full" or facts.st_mtime_ns > written:
+            reading[name] = (present[name], facts.st_size, facts.st_mtime_ns)
+    new = [key for key in reading.values() if key not in _digests]
+    if (total := sum(size for _, size, _ in new)) > _LARGE_BYTES:
+        logger.info("comparing %d files (%.1f GB) with their digests", len(new), total / 1e9)
+    with ThreadPoolExecutor() as pool:  # hashing releases the GIL
+        _digests.update(zip(new, pool.map(_digest_or_error, [path for path, _, _ in new]), strict=True))
+    for name, key in reading.items():
+        if _digests[key] != stated[name]["sha256"]:
+            damage.append(f"{name}: sha256 {_digests[key][:16]} instead of {stated[name]['sha256'][:16]}")
+    return damage
+
+
+def _digest_or_error(path: Path) -> str:
+    try:
+        return digest_file(path)
+    except OSError as error:
+        return f"({error.strerror})"
+
+
+def _shared_datasets(folder: Path) -> list[Path]:
+    """The datasets of other artifacts that an EpisodeSet shares: a filtered set has no videos of its own."""
+    index = read_table(folder / "index.parquet")
+    if index is None or "dataset" not in index.column_names:
+        return []
+    shared = [name for name in index.column("dataset").unique().to_pylist() if ".." in PurePosixPath(name).parts]
+    return [Path(os.path.normpath(folder / name)) for name in shared]
+
+
+def linked_artifacts(folder: Path) -> list[Path]:
+    """The artifacts whose datasets an EpisodeSet shares."""
+    places = _shared_datasets(folder)
+    owners = [next((above for above in place.parents if (above / MANIFEST_NAME).is_file()), None) for place in places]
+    return list(dict.fromkeys(owner for owner in owners if owner is not None))
+
+
+def verify_artifact(folder: Path, mode: VerifyMode = "full", what: str = "Artifact") -> None:
+    """Compare an artifact, and those whose datasets it shares, with their manifests.
+
+    Raises:
+        ArtifactError: files differ from what was written, or shared datasets are missing.
+    """
+    _verify_alone(folder, mode, what)
+    if missing := [place for place in _shared_datasets(folder) if not place.is_dir()]:
+        raise ArtifactError(
+            f"{what} shares recordings that are missing",
+            where=folder,
+            expected=", ".join(map(str, missing[:3])),
+            got="no such folder",
+            next_step=how_to_rebuild(missing[0].parents[1]),
+        )
+    for artifact in linked_artifacts(folder):
+        _verify_alone(artifact, mode, what)
+
+
+def _verify_alone(folder: Path, mode: VerifyMode, what: str) -> None:
+    if damage := find_damage(folder, mode):
+        more = f"; and {len(damage) - 5} more" if len(damage) > 5 else ""
+        raise ArtifactError(
+            f"{what} is damaged: files differ from what was written",
+            where=folder,
+            expected=f"the files of its {MANIFEST_NAME}",
+            got="; ".join(damage[:5]) + more,
+            next_step=how_to_rebuild(folder),
+        )
+
+
+def check_artifacts(folders: Sequence[Path]) -> dict[Path, list[str]]:
+    """The damage of finished artifacts, and of those whose datasets they share, by folder.
+
+    Raises:
+        ArtifactError: a folder has no manifest.
+    """
+    for folder in folders:
+        if not (folder / MANIFEST_NAME).is_file():
+            raise ArtifactError("Not a finished artifact", where=folder, expected=MANIFEST_NAME, got="no such file")
+    waiting, checked = list(folders), dict[Path, list[str]]()
+    while waiting:
+        folder = waiting.pop(0)
+        if folder in checked:
+            continue
+        checked[folder] = find_damage(folder)
+        if not checked[folder]:
+            waiting += linked_artifacts(folder)
+    return checked
+
+
+def finished_artifacts(root: Path) -> list[Path]:
+    """The finished artifacts of the store below a folder."""
+    return sorted(path.parent for path in root.glob(f"*/*/{MANIFEST_NAME}") if is_stored(path.parent))

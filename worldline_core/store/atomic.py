@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it is flushed to disk and renamed, on an error removed.
 
-    The temporary name keeps the suffix, because encoders choose the container by it.
+    Its name is unique among processes and hosts and keeps the suffix, by which encoders choose the container.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as stream:
@@ -47,7 +48,7 @@ def write_arrays_atomic(path: Path, arrays: Mapping[str, np.ndarray], metadata: 
     import numpy as np
     from safetensors.numpy import save
 
-    # `save` copies memory as it lies: the values of a transposed view would be read back in another order.
+    # `save` copies raw memory: a transposed view would be read back in another order.
     ordered = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
     write_bytes_atomic(path, save(ordered, metadata))
 

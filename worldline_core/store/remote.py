@@ -1,14 +1,16 @@
-"""Files of object stores: listed, and copied to this machine when they are read, within a bound.
+"""Files in object stores: listed, and copied to this machine when they are read, within a size bound.
 
 Locations are `universal_pathlib` paths; credentials and endpoints come from the environment of the store's own library
-(`AWS_*`, or fsspec's `FSSPEC_<PROTOCOL>_<OPTION>`), never from a configuration that ends up in a manifest. Only
-transient faults are retried: those of a network or of a busy store, not of the data.
+(`AWS_*`, or fsspec's `FSSPEC_<PROTOCOL>_<OPTION>`), never from a config that ends up in a manifest. Only transient
+errors are retried: those of a network or a busy store, not of the data.
 """
 
 from __future__ import annotations
 
 import atexit
 import errno
+import fcntl
+import functools
 import logging
 import os
 import shutil
@@ -17,6 +19,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
@@ -35,35 +38,29 @@ ATTEMPTS = 5
 FIRST_PAUSE_SECONDS = 0.2
 
 _TRANSIENT_ERRNOS = frozenset(
-    getattr(errno, name)
-    for name in (
-        "EIO", "EREMOTEIO", "ESTALE", "EAGAIN", "EBUSY", "ETIMEDOUT", "ENETDOWN", "ENETUNREACH", "ENETRESET",
-        "EHOSTDOWN", "EHOSTUNREACH",
-    )
-    if hasattr(errno, name)
+    {
+        errno.EIO, getattr(errno, "EREMOTEIO", errno.EIO), errno.ESTALE, errno.EAGAIN, errno.EBUSY, errno.ETIMEDOUT,
+        errno.ENETDOWN, errno.ENETUNREACH, errno.ENETRESET, errno.EHOSTDOWN, errno.EHOSTUNREACH,
+    }
 )  # fmt: skip
-"""What a network file system or s3fs (its translation of 5xx answers) reports when it should be asked again."""
+"""Reported by a network file system, and by s3fs for answers of status 5xx."""
 _TRANSIENT_CLASSES = frozenset(
     {
-        ("botocore.exceptions", "HTTPClientError"),  # connections refused, closed, timed out
-        ("botocore.exceptions", "ResponseStreamingError"),
-        ("botocore.exceptions", "IncompleteReadError"),
-        ("botocore.parsers", "ResponseParserError"),  # an answer cut short
-        ("aiohttp.client_exceptions", "ClientConnectionError"),
-        ("aiohttp.client_exceptions", "ClientPayloadError"),
-        ("http.client", "IncompleteRead"),
-        ("httpx", "TransportError"),
+        "botocore.exceptions.HTTPClientError", "botocore.exceptions.ResponseStreamingError",
+        "botocore.exceptions.IncompleteReadError", "botocore.parsers.ResponseParserError",
+        "aiohttp.client_exceptions.ClientConnectionError", "aiohttp.client_exceptions.ClientPayloadError",
+        "http.client.IncompleteRead", "httpx.TransportError",
     }
-)
-"""By name, so that the libraries of a store that is not used need not be installed."""
+)  # fmt: skip
+"""By name, so that the library of an unused store need not be installed."""
 
 
 class UnreachableInputError(UnavailableError):
-    """A store did not answer although it was asked several times; what lies there may well be good, so it is not quarantined."""
+    """A store did not answer several attempts. Its content may be good, so nothing is quarantined for it."""
 
 
 def is_transient(error: BaseException | None) -> bool:
-    """Whether asking again may help: the error, or one that caused it, comes from a network or a busy store."""
+    """Whether another attempt may help: the error, or one of its causes, comes from a network or a busy store."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -71,19 +68,16 @@ def is_transient(error: BaseException | None) -> bool:
             return True
         if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
             return True
-        if _busy_answer(error) or any((c.__module__, c.__name__) in _TRANSIENT_CLASSES for c in type(error).__mro__):
+        if any(f"{kind.__module__}.{kind.__name__}" in _TRANSIENT_CLASSES for kind in type(error).__mro__):
+            return True
+        response = getattr(error, "response", None)  # of botocore (a mapping), aiohttp and the hub
+        status = getattr(error, "status", getattr(response, "status_code", None))
+        if isinstance(response, dict):
+            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+        if isinstance(status, int) and (status >= 500 or status == 429):
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _busy_answer(error: BaseException) -> bool:
-    """botocore's ClientError, aiohttp's ClientResponseError and the hub's errors with a status of 5xx or 429."""
-    response = getattr(error, "response", None)
-    status = getattr(error, "status", getattr(response, "status_code", None))
-    if isinstance(response, dict):
-        status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-    return isinstance(status, int) and (status >= 500 or status == 429)
 
 
 def retry_pauses(retries: int, first_seconds: float) -> list[float]:
@@ -128,8 +122,6 @@ if TYPE_CHECKING:
     type AnyPath = Path
 else:
     AnyPath = Path | UPath
-DEFAULT_CACHE_BYTES = 8 << 30
-_FOLDER_PREFIX = "worldline-remote-"
 
 
 def parse_location(text: str | Path | UPath) -> AnyPath:
@@ -158,7 +150,7 @@ def parse_location(text: str | Path | UPath) -> AnyPath:
 
 
 def is_remote(path: AnyPath) -> bool:
-    """Whether a path lies in an object store."""
+    """Whether a path names a location in an object store."""
     return not isinstance(path, Path)
 
 
@@ -179,7 +171,7 @@ def file_system(path: AnyPath) -> Any:
 
 
 def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
-    """Every file below `root`: relative name -> what the store says about it, sorted by name.
+    """The store's description of every file below `root` by relative name, sorted.
 
     Raises: UnreachableInputError when the store does not answer.
     """
@@ -191,42 +183,39 @@ def list_files(root: AnyPath) -> dict[str, dict[str, Any]]:
 
 
 def _find(fs: Any, base: str) -> dict[str, dict[str, Any]]:
-    lists_all = getattr(type(fs), "_find", AsyncFileSystem._find) is not AsyncFileSystem._find
-    if lists_all or (not isinstance(fs, AsyncFileSystem) and type(fs).find is not AbstractFileSystem.find):
-        return fs.find(base, detail=True)
-    # fsspec's own walk leaves out the folders that it could not list, below the first one even when told not to.
+    own: Any = type(fs)._find if isinstance(fs, AsyncFileSystem) else type(fs).find
+    if own not in (AsyncFileSystem._find, AbstractFileSystem.find):
+        return cast("dict[str, dict[str, Any]]", fs.find(base, detail=True))
+    # fsspec's own walk silently omits the folders it could not list: `on_error` does not reach folders further down.
     found: dict[str, dict[str, Any]] = {}
     folders = [base]
-    try:
-        while folders:
-            folder = folders.pop()
-            for about in fs.ls(folder, detail=True):
-                name = about["name"].rstrip("/")
-                if about["type"] != "directory":
-                    found[name] = about
-                elif name != folder.rstrip("/"):
-                    folders.append(name)
-    except FileNotFoundError:
-        if _kind_at(fs, base) is not None:
-            raise  # it vanished meanwhile
+    while folders:
+        folder = folders.pop()
+        try:
+            listing = fs.ls(folder, detail=True)
+        except FileNotFoundError:
+            if folder != base:
+                raise
+            return {}
+        for about in listing:
+            name = about["name"].rstrip("/")
+            if about["type"] != "directory":
+                found[name] = about
+            elif name != folder.rstrip("/"):
+                folders.append(name)
     return found
 
 
 def remote_kind(path: AnyPath) -> str | None:
-    """What is at a location: "file", "directory", or None for nothing.
+    """The kind of a location: "file", "directory", or None for nothing.
 
-    fsspec's `isfile` takes an answer that did not come for a no; then an optional file would be left out silently.
+    fsspec's `isfile` returns False when the store did not answer, which would silently leave out an optional file.
 
-    Raises: PermissionError where the store does not say; UnreachableInputError when it does not answer.
+    Raises: PermissionError where the store refuses; UnreachableInputError when it does not answer.
     """
     fs = file_system(path)
-    return with_retries(lambda: _kind_at(fs, fs._strip_protocol(str(path))), str(path))
-
-
-def _kind_at(fs: Any, name: str) -> str | None:
-    """`remote_kind` of a name in a file system, asked once."""
     try:
-        return fs.info(name)["type"]
+        return with_retries(lambda: fs.info(str(path))["type"], str(path))
     except FileNotFoundError:
         return None
 
@@ -234,11 +223,11 @@ def _kind_at(fs: Any, name: str) -> str | None:
 _CHANGE_MARKS = (
     "ETag", "etag", "checksum", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created",
 )  # fmt: skip
-"""Attributes by which stores tell that a file's content changed; the first one present is taken."""
+"""Attributes that change with a file's content, by store; the first one present is used."""
 
 
 def remote_digest(root: AnyPath) -> str:
-    """Digest of what a store lists below `root`: names, sizes and the mark of each file's content.
+    """Digest of a store's listing below `root`: names, sizes and the change mark of each file.
 
     Raises: ArtifactError when nothing is there; UnreachableInputError when the store does not answer.
     """
@@ -251,24 +240,27 @@ def remote_digest(root: AnyPath) -> str:
     return digest_value(entries)
 
 
-class RemoteCache:
-    """Copies of remote files below one folder, the least recently read removed first.
+_FOLDER_PREFIX = "worldline-remote-"
 
-    A copy may be removed as soon as the next file is fetched: open what `fetch` returns at once, and ask again later.
-    A single file larger than the bound is kept alone.
+
+class RemoteCache:
+    """Copies of remote files in a private folder of this process, the least recently read removed first.
+
+    A copy may be removed as soon as the next file is fetched: open the result of `fetch` at once, and ask again later.
+    A single file larger than the bound is kept alone. (fsspec's caches have no size bound.)
     """
 
-    def __init__(self, folder: Path, max_bytes: int = DEFAULT_CACHE_BYTES) -> None:
-        self.folder = folder
+    def __init__(self, max_bytes: int = 8 << 30) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix=_FOLDER_PREFIX))  # of mode 0700, with an unpredictable name
         self.max_bytes = max_bytes
-        self.fetched_bytes = 0
+        self._alive = os.open(self.folder, os.O_RDONLY)  # its lock shows other processes that this one is alive
+        fcntl.flock(self._alive, fcntl.LOCK_SH | fcntl.LOCK_NB)
         self._sizes: OrderedDict[Path, int] = OrderedDict()
         self._lock = threading.Lock()
 
     def place(self, path: AnyPath) -> Path:
-        """Where the copy of a remote file lies: the store's own names, so that messages can be made portable."""
-        fs = file_system(path)
-        parts = PurePosixPath(fs._strip_protocol(str(path))).parts
+        """The path of a remote file's copy, which repeats the store's own names, so that messages can be made portable."""
+        parts = PurePosixPath(file_system(path)._strip_protocol(str(path))).parts
         return self.folder.joinpath(
             cast("UPath", path).protocol, *(part for part in parts if part not in ("/", "..", "."))
         )
@@ -284,60 +276,60 @@ class RemoteCache:
         """
         with self._lock:
             copy = self.place(path)
-            if copy in self._sizes:
-                self._sizes.move_to_end(copy)
-                return copy
-            fs = file_system(path)
-            size = with_retries(lambda: self._download(fs, path, copy), str(path))
-            self.fetched_bytes += size
-            self._sizes[copy] = size
+            if copy not in self._sizes:
+                self._sizes[copy] = with_retries(lambda: _download(path, copy), str(path))
+            self._sizes.move_to_end(copy)
             while sum(self._sizes.values()) > self.max_bytes and len(self._sizes) > 1:
                 oldest, _ = self._sizes.popitem(last=False)
                 oldest.unlink(missing_ok=True)
             return copy
 
-    def _download(self, fs: Any, path: AnyPath, copy: Path) -> int:
-        about = fs.info(str(path))
-        if about.get("type") != "file":
-            raise FileNotFoundError(errno.ENOENT, "Not a file", str(path))
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        temporary = copy.with_name(f".{copy.name}.tmp")
-        try:
-            fs.get_file(str(path), str(temporary))
-            size = temporary.stat().st_size
-            if about.get("size") is not None and size != about["size"]:
-                fs.invalidate_cache()
-                raise OSError(errno.EIO, f"download ended after {size} of {about['size']} bytes", str(path))
-            temporary.replace(copy)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return size
-
     def clear(self) -> None:
         """Remove all copies."""
         with self._lock:
             self._sizes.clear()
-            shutil.rmtree(self.folder, ignore_errors=True)
+            for entry in self.folder.iterdir():
+                shutil.rmtree(entry, ignore_errors=True)
 
 
-_process_cache: RemoteCache | None = None
+def _download(path: AnyPath, copy: Path) -> int:
+    fs = file_system(path)
+    about = fs.info(str(path))
+    if about.get("type") != "file":
+        raise FileNotFoundError(errno.ENOENT, "Not a file", str(path))
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    fs.get_file(str(path), str(copy))
+    size = copy.stat().st_size
+    if about.get("size") not in (None, size):
+        fs.invalidate_cache()
+        raise OSError(errno.EIO, f"download ended after {size} of {about['size']} bytes", str(path))
+    return size
 
 
 def process_cache() -> RemoteCache:
-    """The cache of this process, below the machine's folder for temporary files; removed when the process ends."""
-    global _process_cache
-    if _process_cache is None or _process_cache.folder.name != f"{_FOLDER_PREFIX}{os.getpid()}":
-        temporary = Path(tempfile.gettempdir())
-        _remove_leftovers(temporary)
-        _process_cache = RemoteCache(temporary / f"{_FOLDER_PREFIX}{os.getpid()}")
-        _process_cache.clear()  # of an earlier process with this number
-        atexit.register(_process_cache.clear)
-    return _process_cache
+    """The cache of this process, removed when the process ends; its folder is in the one for temporary files (TMPDIR)."""
+    return _cache_of(os.getpid())
 
 
-def _remove_leftovers(temporary: Path) -> None:
-    """Caches of this user's processes that were killed."""
-    for folder in temporary.glob(f"{_FOLDER_PREFIX}*"):
-        number = folder.name.removeprefix(_FOLDER_PREFIX)
-        if number.isdigit() and not Path(f"/proc/{number}").exists() and Path("/proc/self").exists():
-            shutil.rmtree(folder, ignore_errors=True)
+@functools.cache
+def _cache_of(process: int) -> RemoteCache:
+    _remove_leftovers()
+    cache = RemoteCache()
+    # Not by a fork, which would remove the folder of its parent.
+    atexit.register(lambda: process == os.getpid() and shutil.rmtree(cache.folder, ignore_errors=True))
+    return cache
+
+
+def _remove_leftovers() -> None:
+    """Remove the caches of this user's processes that were killed, on this host or in containers that share its folder."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
+        with suppress(OSError):
+            facts = folder.lstat()
+            if facts.st_uid != os.getuid() or time.time() - facts.st_mtime < 60:  # the lock is taken after the folder
+                continue
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(descriptor)

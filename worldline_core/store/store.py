@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,18 +31,21 @@ from worldline_core.store.artifact_files import (
     KEY_LENGTH,
     MANIFEST_NAME,
     VOLATILE_FOLDER,
+    VerifyMode,
+    digest_file,
     digest_folder,
+    digest_listed,
     digest_value,
     how_to_rebuild,
     is_artifact,
     is_stored,
     read_json,
     read_manifest,
+    verify_artifact,
     write_manifest,
 )
-from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic
+from worldline_core.store.atomic import remove_unfinished, write_bytes_atomic, write_json_atomic
 from worldline_core.store.remote import is_remote, remote_digest
-from worldline_core.store.verification import VerifyMode, verify_inputs, weights_digests
 
 logger = logging.getLogger(__name__)
 
@@ -54,77 +57,88 @@ StepFunction = Callable[[Any, Mapping[str, Path], Path], dict[str, Any]]
 
 
 @contextmanager
-def exclusive_lock(path: Path) -> Iterator[None]:
-    """Hold an advisory lock on ``path`` (``flock``: the kernel frees it when the process ends, also after kill -9)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+def _changing(path: Path) -> Iterator[None]:
+    """Turn an error of the file system into one message about the store."""
     try:
+        yield
+    except OSError as error:
+        raise ArtifactError(
+            "A store's folder cannot be written",
+            where=path,
+            expected="a folder with write permission and room on its disk",
+            got=error.strerror,
+            next_step="correct its rights or remove what is in the way, or choose another folder",
+        ) from error
+
+
+@contextmanager
+def _lock_file(path: Path) -> Iterator[int]:
+    """Open a lock file. ``flock`` ends with the process, also after kill -9."""
+    with _changing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def exclusive_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold the lock on ``path``, waiting for another process to release it.
+
+    Raises:
+        ArtifactError: another process holds the lock and ``wait`` is false.
+    """
+    with _lock_file(path) as descriptor:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except BlockingIOError as error:
+            if not wait:
+                raise ArtifactError(
+                    "Another command writes into this folder",
+                    where=path.parent,
+                    next_step="wait for it, or choose another folder",
+                ) from error
             logger.warning("waiting for another process that works on %s", path.stem)
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager
 def helper_lock(folder: Path) -> Iterator[None]:
-    """Held by a process that writes into a step's folder on behalf of the one that holds its lock: if that one is killed,
-    who takes the work over waits for this one to end."""
-    path = folder / VOLATILE_FOLDER / _WRITERS
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
+    """Lock held by a process that writes into a step's folder on behalf of the step's owner.
+
+    If the owner is killed, the next one waits for its helpers to end.
+    """
+    with _lock_file(folder / VOLATILE_FOLDER / _WRITERS) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_SH)
         yield
-    finally:
-        os.close(descriptor)
 
 
-@contextmanager
-def alone_in(folder: Path, doing: str) -> Iterator[None]:
-    """Within the context no other command of this project writes into a folder of a user's own choice.
+def folder_lock(folder: Path) -> AbstractContextManager[None]:
+    """Keep other commands of this project out of a folder that the user chose.
 
-    Raises: ArtifactError when another one does.
+    Raises:
+        ArtifactError: another command writes into it.
     """
-    (folder / VOLATILE_FOLDER).mkdir(parents=True, exist_ok=True)
-    path = folder / VOLATILE_FOLDER / ".lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ArtifactError(
-                f"Another command is {doing} into this folder",
-                where=folder,
-                next_step="wait for it, or choose another one",
-            ) from error
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
-            with suppress(OSError):  # others have something in there
-                path.parent.rmdir()
-    finally:
-        os.close(descriptor)
+    return exclusive_lock(folder / VOLATILE_FOLDER / ".lock", wait=False)
 
 
-def is_helper() -> bool:
+def _is_helper() -> bool:
     """Whether torchrun started this process as another than the first."""
     return int(os.environ.get("WORLD_SIZE", "1")) > 1 and int(os.environ.get("RANK", "0")) > 0
 
 
 def _launch() -> bytes:
-    """Names the launch that this process belongs to: the same in all of its processes."""
+    """An identity shared by all processes of one launch."""
     names = ("TORCHELASTIC_RUN_ID", "MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE")
     return " ".join(os.environ.get(name, "") for name in names).encode()
 
 
 @contextmanager
-def announced(path: Path) -> Iterator[None]:
-    """Within the context, helpers of this launch may work; without helpers nothing is written."""
+def _announced(path: Path) -> Iterator[None]:
+    """Let helpers of this launch work inside of the context; without helpers nothing is written."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
         return
@@ -135,13 +149,7 @@ def announced(path: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-def is_announced(path: Path) -> bool:
-    """Whether the first process of this launch has begun. If it fails instead, torchrun ends this one."""
-    return path.is_file() and path.read_bytes() == _launch()
-
-
-def wait_until[T](finished: Callable[[], T | None]) -> T:
-    """Return what ``finished`` finds, once it finds something."""
+def _wait_until[T](finished: Callable[[], T | None]) -> T:
     while (found := finished()) is None:
         time.sleep(_POLL_SECONDS)
     return found
@@ -162,10 +170,10 @@ class Artifact:
 
 
 class ArtifactStore:
-    """The artifacts below one root folder (``artifacts/`` unless told otherwise).
+    """The artifacts below one root folder (``artifacts/`` by default).
 
     Args:
-        verify: how the files of a step's inputs are compared with their manifests before the step reads them.
+        verify: how a step's inputs are compared with their manifests before the step reads them.
     """
 
     def __init__(self, root: Path, verify: VerifyMode = "full") -> None:
@@ -174,9 +182,9 @@ class ArtifactStore:
 
     def key(self, step: str, version: int, config: StrictModel, inputs: Mapping[str, str]) -> str:
         """Content key of a step. ``inputs`` maps an input's name to the digest of its content."""
-        made = cache_relevant_config(config.model_dump(mode="json"))
-        identity = {"step": step, "version": version, "config": made, "inputs": dict(inputs)}
-        if weights := weights_digests(config.weights_read(), self.root / ".weights.json"):
+        relevant = cache_relevant_config(config.model_dump(mode="json"))
+        identity = {"step": step, "version": version, "config": relevant, "inputs": dict(inputs)}
+        if weights := _weights_digests(config.weights_read(), self.root / ".weights.json"):
             identity |= {"weights": weights}
         return digest_value(identity)[:KEY_LENGTH]
 
@@ -193,11 +201,11 @@ class ArtifactStore:
     def input_digest(self, path: Path) -> str:
         """Digest of an input: read from the manifest of an artifact, computed for any other folder.
 
-        Of a location in an object store the listing counts (names, sizes, and the store's own digests or times of
-        change): its files are not read twice.
+        For a location in an object store it is the digest of the listing (names, sizes, and the store's own digests or
+        modification times), so that files are not read twice.
 
         Raises:
-            ArtifactError: the folder does not exist; what lies outside of a store is not what its manifest states.
+            ArtifactError: the folder does not exist; an artifact outside of a store differs from its manifest.
             UnreachableInputError: the store does not answer.
         """
         if is_remote(path):
@@ -211,7 +219,7 @@ class ArtifactStore:
         if not is_artifact(path):
             return digest_folder(path, everything=True)
         if not is_stored(path) and self.verify != "off":
-            verify_inputs({"of this step": path}, "fast")  # recordings and models, which their owner may change
+            verify_artifact(path, "fast", "An input")  # recordings and models, which their owner may change
         return str(read_manifest(path)["digest"])
 
     def run(
@@ -222,50 +230,64 @@ class ArtifactStore:
         config: StrictModel,
         inputs: Mapping[str, Path],
         *,
-        seeds: Mapping[str, int] | None = None,
         distributed: bool = False,
     ) -> Artifact:
-        """Return the artifact of a step, working only for what is not there yet.
+        """Return the artifact of a step, working only for what is missing.
 
         Args:
-            distributed: the step shares its work among the processes of torchrun. Of any other step the first process
-                does all the work.
+            distributed: the step shares its work among the processes of torchrun; otherwise the first process does it all.
 
         Raises:
-            ArtifactError: files of an input are not those that were written.
-            WorldLineError: whatever the step raises; its unfinished work stays in ``<key>.partial/``.
+            ArtifactError: an input differs from its manifest, or the store cannot be written.
+            WorldLineError: an error of the step; its unfinished work stays in ``<key>.partial/``.
         """
         digests = {name: self.input_digest(path) for name, path in sorted(inputs.items())}
         key = self.key(step, version, config, digests)
         if (found := self.find(step, key)) is not None:
-            logger.info("%s %s: cached%s", step, key, _account(found.path))
+            logger.info("%s %s: cached%s; %s", step, key, _counts(read_manifest(found.path)["metrics"]), found.path)
             return found
         folder = self.root / step / key
+        if not folder.parent.resolve().is_relative_to(self.root):
+            raise ArtifactError(
+                "A step's folder is a link out of the store",
+                where=folder.parent,
+                got=folder.parent.resolve(),
+                next_step="link the whole store instead: manifests name inputs by paths relative to it",
+            )
         partial = folder.with_name(f"{key}.partial")
         sources = {name: path if is_remote(path) else path.resolve() for name, path in inputs.items()}
-        announcement = self.root / step / f".{key}.workers"
-        if is_helper():
-            wait_until(lambda: self.find(step, key) or is_announced(announcement) or None)
+        announcement = folder.with_name(f".{key}.workers")
+        if _is_helper():
+            _wait_until(
+                lambda: (
+                    self.find(step, key)
+                    or (announcement.is_file() and announcement.read_bytes() == _launch())
+                    or None  # if the first process fails instead, torchrun ends this one
+                )
+            )
             if distributed and self.find(step, key) is None:
                 with helper_lock(partial):
                     function(config, sources, partial)
-            return wait_until(lambda: self.find(step, key))
-        with exclusive_lock(self.root / step / f".{key}.lock"):
+            return _wait_until(lambda: self.find(step, key))
+        with exclusive_lock(folder.with_name(f".{key}.lock")):
             if (found := self.find(step, key)) is not None:
                 return found
-            verify_inputs(sources, self.verify)
-            if folder.exists():
-                # A folder without a manifest is not an artifact: someone deleted the manifest, or copied half of it.
-                shutil.rmtree(folder)
-            resumed = partial.exists()
-            partial.mkdir(parents=True, exist_ok=True)
+            for name, path in sources.items():
+                if not is_remote(path):
+                    verify_artifact(path, self.verify, f"Input {name}")
+            with _changing(partial):
+                if folder.exists():
+                    # Not an artifact without its manifest: somebody deleted the manifest, or copied half of the folder.
+                    shutil.rmtree(folder)
+                resumed = partial.exists()
+                partial.mkdir(parents=True, exist_ok=True)
             if (writers := partial / VOLATILE_FOLDER / _WRITERS).exists():
-                with exclusive_lock(writers):  # until workers of a killed command have ended
+                with exclusive_lock(writers):  # until helpers of a killed command have ended
                     pass
             remove_unfinished(partial)
             logger.info("%s %s: %s", step, key, "continuing" if resumed else "working")
             started = time.time()
-            with announced(announcement):
+            with _announced(announcement):
                 metrics = function(config, sources, partial)
             facts = {
                 "step": step,
@@ -275,7 +297,7 @@ class ArtifactStore:
                 "inputs": {
                     name: {"path": _portable(path, self.root), "digest": digests[name]} for name, path in inputs.items()
                 },
-                "seeds": dict(seeds) if seeds is not None else _seeds(config.model_dump(mode="json")),
+                "seeds": _seeds(config.model_dump(mode="json")),
                 "metrics": metrics,
                 "environment": {
                     **describe_environment(),
@@ -287,24 +309,17 @@ class ArtifactStore:
             }
             digest = write_manifest(partial, facts)
             partial.replace(folder)
-            logger.info("%s %s: done in %.0f s%s", step, key, facts["wall_seconds"], _account(folder))
+            logger.info("%s %s: done in %.0f s%s; %s", step, key, facts["wall_seconds"], _counts(metrics), folder)
         return Artifact(step, folder, digest, cached=False)
 
 
-def _account(folder: Path) -> str:
-    """What became of a step's episodes, where it says so, and where its result lies."""
-    metrics = read_manifest(folder).get("metrics", {})
-    parts: list[str] = []
-    if {"found", "kept"} <= metrics.keys():
-        lost, reasons = "quarantined", metrics.get("reasons", metrics.get("quarantine_reasons", {}))
-        if "left_out" in metrics:
-            lost, reasons = "left out", metrics["left_out"]
-        named = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
-        account = f"found {metrics['found']}, kept {metrics['kept']}, {lost} {metrics['found'] - metrics['kept']}"
-        parts.append(f"{account} ({named})" if named else account)
-    if metrics.get("splits", {}).keys() == {"test"}:
-        parts.append("all in split test, so nothing is trained on them (curate.sources[].split, curate.splits)")
-    return "; ".join(["", *parts, str(folder)])
+def _counts(metrics: Mapping[str, Any]) -> str:
+    """The counts among a step's metrics, for a log line."""
+    parts = [f"; {name} {value}" for name, value in metrics.items() if type(value) is int]
+    for name, values in metrics.items():
+        if isinstance(values, Mapping) and values and all(type(value) is int for value in values.values()):
+            parts.append(f"; {name}: " + ", ".join(f"{value} {of}" for of, value in values.items()))
+    return "".join(parts)
 
 
 def _portable(path: Path, root: Path) -> str:
@@ -320,6 +335,32 @@ def _seeds(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         elif name in ("seed", "seeds"):
             seeds[f"{prefix}{name}"] = value
     return seeds
+
+
+def _weights_digests(places: Mapping[str, Path | None], cache: Path) -> dict[str, str]:
+    """Digests of weight files, or of the files in a folder, by name; missing ones are left out.
+
+    Files of the same size and modification time are not read again: weights have gigabytes. Folders of the Hugging Face
+    hub's cache consist of links; its hidden files are notes.
+    """
+    digests = dict[str, str]()
+    for name, place in places.items():
+        if place is None or not place.exists():
+            continue
+        known = read_json(cache)
+        files: dict[str, dict[str, str]] = {}
+        for path in sorted(path for path in [place, *place.rglob("*")] if path.is_file()):
+            relative, facts = path.relative_to(place), path.stat()
+            if any(part.startswith(".") for part in relative.parts):
+                continue
+            key = f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
+            if key not in known:
+                known[key] = digest_file(path)
+                with suppress(OSError):  # a read-only store
+                    write_json_atomic(cache, known)
+            files[relative.as_posix()] = {"sha256": known[key]}
+        digests[name] = digest_listed(files)
+    return digests
 
 
 def describe_environment() -> dict[str, Any]:

@@ -71,6 +71,8 @@ def curate(
     write_source_table(output, config, [[e.identity for e in episodes] for episodes in listed], rows, rejected)
     write_source_weights(output, rows, config.sampling)
     check_account(output, len(identities), {row.episode_id for row in rows}, {row.episode_id for row in rejected})
+    if {row.split for row in rows} == {"test"}:
+        logger.warning("All episodes are in split test; training needs others (curate.sources[].split, curate.splits)")
     return {
         "found": len(identities),
         "kept": len(rows),

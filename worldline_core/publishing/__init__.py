@@ -1,1 +1,0 @@
-"""Pushing and pulling finished sets: the Hugging Face hub, folders, object stores."""
