@@ -3,8 +3,7 @@
     python benchmarks/calibration.py mistakes [--splits test,ood_test] [--every 1] [--imperfect] [--without-mounts]
     python benchmarks/calibration.py cameras [--every 2] [--seeds 0,1] [--imperfect]
 
-Both take `--agibot FOLDER --agibot-urdf FILE` (AgiBot's published samples). Recordings with an injected defect
-(injected_defects.json) are left out.
+Recordings with an injected defect (injected_defects.json) are left out.
 
 - `mistakes`: every usual mistake, one at a time. Quaternion, Euler, pose unit and tool offset are injected into the same
   episodes rewritten as tool poses by forward kinematics. `--without-mounts` withholds the wrist cameras' stated mounts;
@@ -34,12 +33,11 @@ from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagno
 from worldline_core.calibration.motion_fit import PARAMETERS, moved_camera
 from worldline_core.calibration.observation import Observation, observe, small_gray
 from worldline_core.calibration.reading import read
-from worldline_core.calibration.residual import KINDS, combined, consistent_text, estimate_residuals, standing_out
+from worldline_core.calibration.residual import KINDS, combined, estimate_residuals, standing_out
 from worldline_core.calibration.source_diagnosis import diagnose_set
-from worldline_core.data.episodes.conventions import RecordedConventions, applicable, apply_conventions
+from worldline_core.data.episodes.conventions import RecordedConventions, applicable
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.sources.agibot_gesim import AgibotGesimSource, AgibotGesimSourceConfig
 from worldline_core.filters.filter_config import FilterDoctorConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -64,7 +62,7 @@ class Healthy:
     joints: Episode
     poses: Episode
     gray: dict[str, np.ndarray]
-    kinematics: ArmKinematics | None
+    kinematics: ArmKinematics
 
 
 def as_tool_poses(episode: Episode, kinematics: ArmKinematics) -> Episode:
@@ -141,34 +139,14 @@ def healthy(root: Path, splits: set[str], every: int, disturb: bool) -> Iterator
         yield Healthy(episode, as_tool_poses(episode, robot), gray, robot)
 
 
-def agibot(root: Path, description: Path) -> Iterator[Healthy]:
-    """AgiBot's published samples below a folder: few pictures, tool poses recorded; those of v1 without their own lag.
-
-    v2 comes with joints, whose kinematics (`description`: its URDF) say what the wrist cameras follow.
-    """
-    source = AgibotGesimSource(AgibotGesimSourceConfig(path=root, fps=30), root)
-    kinematics = ArmKinematics(load_embodiment("agibot_g1", description))
-    for name in source.episode_ids():
-        loaded = source.load(name)
-        gray = {view: small_gray(loaded.frames(view)) for view in loaded.views}
-        episode, joints = loaded.episode, loaded.episode.state_kind == "joints"
-        if not joints:
-            episode = apply_conventions(episode, RecordedConventions(camera_lag_frames=2))
-        yield Healthy(episode, episode, gray, kinematics if joints else None)
-
-
 def observable(name: str, episode: Healthy, diagnosis: Diagnosis, config: CalibrationDoctorConfig) -> bool:
     """True if a recording holds anything that this mistake would make recognisably wrong."""
-    kinematics, state = episode.kinematics, episode.joints.state_kind
     if name == "image_lag_frames":
         return min(len(images) for images in episode.gray.values()) > config.min_image_pairs
-    if name == "tool_offset_z_m":  # joints beside the recorded poses, or a wrist camera whose mount is stated
-        mounted = kinematics is not None and any(arm.wrist_camera is not None for arm in kinematics.embodiment.arms)
-        return mounted or (kinematics is not None and state == "joints" and episode.poses is episode.joints)
+    if name == "tool_offset_z_m":  # a wrist camera whose mount is stated
+        return any(arm.wrist_camera is not None for arm in episode.kinematics.embodiment.arms)
     if name == "gripper":  # moves, before a camera or against an object
         return any(term.startswith(("fingers", "stopped")) for term in diagnosis.none.evidence)
-    if name == "angle_unit" and kinematics is None:
-        return bool((np.abs(np.degrees(episode.joints.state)) > 4 * np.pi).any())
     return True
 
 
@@ -194,8 +172,7 @@ def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, Reco
         ("gripper", episode.joints, RecordedConventions(gripper="inverted")),
     ]
     for name, base, conventions in cases:
-        repeated = name == "none (tool poses)" and episode.poses is episode.joints
-        if not repeated and all(applicable(base, field) for field in conventions.departures):
+        if all(applicable(base, field) for field in conventions.departures):
             yield name, base, conventions
 
 
@@ -231,9 +208,7 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
                 continue
             images = corrupted_image_frames(base.num_frames, conventions)
             gray = {view: values[images] for view, values in episode.gray.items()}
-            kinematics = episode.kinematics
-            if kinematics is not None and arguments.without_mounts:
-                kinematics = without_mounts(kinematics)
+            kinematics = without_mounts(episode.kinematics) if arguments.without_mounts else episode.kinematics
             start = time.process_time()
             diagnosis = diagnose(corrupt(base, conventions), gray, kinematics, config)
             spent, count = spent + time.process_time() - start, count + 1
@@ -245,8 +220,6 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
             correct[name].append(right(name, conventions, found, diagnosis.best.conventions))
             if found == name and name.endswith("lag_frames"):
                 lag_errors[name].append(getattr(diagnosis.best.conventions, name) - getattr(conventions, name))
-            if arguments.verbose and not correct[name][-1]:
-                explain(name, conventions, diagnosis)
             if arguments.typical and name.startswith("none"):
                 collect_typical(name, diagnosis, healthy_values)
             if not (conventions.departures and conventions.departures[0] in NUMBERED):
@@ -275,14 +248,6 @@ def collect_typical(name: str, diagnosis: Diagnosis, values: dict[str, list[floa
         for measure in ("flow_agreement", "motion_overlap", "finger_flow"):
             if getattr(view, measure) is not None:
                 values[kind + measure].append(getattr(view, measure))
-
-
-def explain(name: str, conventions: RecordedConventions, diagnosis: Diagnosis) -> None:
-    print(f"MISSED {name} {conventions.config_lines()} in {diagnosis.episode_id}: {diagnosis.verdict}")
-    shown = {e.mistake: e for e in reversed(diagnosis.ranked)}
-    for explanation in [*diagnosis.ranked[:3], *(e for k, e in shown.items() if k in (name, "none"))]:
-        terms = {k: round(v, 1) for k, v in explanation.evidence.items() if abs(v) > 2}
-        print(f"    {explanation.score:8.1f} {explanation.conventions.config_lines()} {terms}")
 
 
 def report(
@@ -397,7 +362,7 @@ def exchanged_wrist_videos(items: Sequence[Healthy]) -> tuple[str, ...]:
     """Row of exchanged wrist videos, examined as the filter does."""
     found = []
     for item in items:
-        views = [arm.camera_view for arm in item.kinematics.embodiment.arms] if item.kinematics is not None else []
+        views = [arm.camera_view for arm in item.kinematics.embodiment.arms]
         if len(views) == 2:
             gray = item.gray | {one: item.gray[two] for one, two in (views, views[::-1])}
             found.append(diagnose(item.joints, gray, item.kinematics, FilterDoctorConfig()))
@@ -418,19 +383,6 @@ def row(name: str, tally: Tally) -> tuple[str, ...]:
     )
 
 
-def turned_heads(items: Iterator[Healthy]) -> None:
-    """AgiBot's samples as published, and with the head camera turned by five degrees."""
-    config = CalibrationDoctorConfig()
-    for item in items:
-        theta = np.zeros(PARAMETERS)
-        theta[1] = np.radians(5)
-        head = moved_camera(item.joints.cameras["head"], theta)
-        turned = replace(item.joints, cameras={**item.joints.cameras, "head": head})
-        for name, episode in (("as published", item.joints), ("head turned by 5 deg", turned)):
-            found = diagnose(episode, item.gray, item.kinematics, config)
-            print(f"AgiBot {episode.episode_id}, {name}: {found.verdict}; {consistent_text(found.residuals)}")
-
-
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("what", choices=("mistakes", "cameras"))
@@ -438,22 +390,16 @@ def main() -> None:
     parser.add_argument("--splits", default="test,ood_test")
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--imperfect", action="store_true", help="disturb the healthy calibration by millimetres first")
-    parser.add_argument("--agibot", type=Path, help="folder of AgiBot (GE-Sim) samples")
-    parser.add_argument("--agibot-urdf", type=Path, help="kinematic description of the AgiBot G1")
     parser.add_argument("--seeds", default="0,1", help="cameras: directions of the errors")
     parser.add_argument("--mistakes", default="", help="mistakes: these only, comma-separated")
     parser.add_argument("--without-mounts", action="store_true", help="mistakes: without stated wrist camera mounts")
     parser.add_argument("--typical", action="store_true", help="mistakes: print what healthy episodes reach")
-    parser.add_argument("--verbose", action="store_true", help="mistakes: explain the missed ones")
     arguments = parser.parse_args()
     shipped = healthy(arguments.recordings, set(arguments.splits.split(",")), arguments.every, arguments.imperfect)
-    samples = None if arguments.agibot is None else agibot(arguments.agibot, arguments.agibot_urdf)
     if arguments.what == "mistakes":
-        measure_mistakes(shipped if samples is None else samples, arguments)
+        measure_mistakes(shipped, arguments)
         return
     measure_cameras(list(shipped), [int(seed) for seed in arguments.seeds.split(",")])
-    if samples is not None:
-        turned_heads(samples)
 
 
 if __name__ == "__main__":

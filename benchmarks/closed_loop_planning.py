@@ -21,7 +21,6 @@ Candidates that several arms score are predicted once. Needs the extra `sim`.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,6 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.harness import command_line
 from worldline_core import Camera, WorldLine
 from worldline_core.evaluation.planning.bracket import MeasuredSelector
 from worldline_core.evaluation.planning.closed_loop import (
@@ -323,7 +323,7 @@ def table(attempts: list[dict]) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--model", type=Path, default=SHIPPED / "models" / "causal")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS)

@@ -56,9 +56,7 @@ from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
 from worldline_core.scale.mapping import Shard, TakeOutcome, do_shard
-from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.store.store import ArtifactStore
 
 SIZE, FPS, TURNS = (480, 640), 30.0, 3
@@ -404,31 +402,6 @@ def measure_cost(counts: Sequence[int]) -> Iterator[tuple[int, str, float, str, 
             yield count, name, seconds, f"{right} of {len(copy_of)}", len(found) - right
 
 
-def draw(root: Path, path: Path, first: str, second: str) -> None:
-    """Draws an episode, a copy of it, and a different episode that looks alike, with what the search compares."""
-    episodes = EpisodeSet.open(root)
-    chosen = [episodes.position(name) for name in (first, second)]
-    loaded = [(episodes.episode(i), {v: episodes.frames(i, v) for v in episodes.rows[i].views}) for i in chosen]
-    name = "3/4, crf 28, brighter, 2 + 1 frames cut"
-    shown = [loaded[0], CHANGES[name](*loaded[0]), loaded[1]]
-    prints = [printed(*each) for each in shown]
-    rows: list[SheetRow] = []
-    titles = ("an episode", f"a copy of it: {name}", "another episode: the same start, another run of the controller")
-    for title, (_, frames), seen in zip(titles, shown, prints, strict=True):
-        images = frames["head"]
-        note = "head view"
-        if seen is not prints[0]:
-            strict = find_near_duplicates([prints[0], seen], NearDuplicateConfig())
-            share = np.mean(prints[0].motion == seen.motion)
-            bits = np.mean(
-                [np.bitwise_count(v.frames ^ prints[0].views[k].frames).mean() for k, v in seen.views.items()]
-            )
-            note = f"share of common state cells: {share:.2f};  differing bits of 64: {bits:.1f};  "
-            note += "near duplicate, taken out" if strict else "kept"
-        rows.append(SheetRow(title, images[evenly_spaced(len(images), 6)], note))
-    write_bytes_atomic(path, jpeg_bytes(contact_sheet(rows, tile_height=128)))
-
-
 # Long lists
 
 INFO = {
@@ -534,7 +507,6 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=0, help="speed: also mapped over this many processes")
     parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="duplicates: recordings to copy")
     parser.add_argument("--scale", type=int, default=100_000, help="duplicates: most synthetic fingerprints")
-    parser.add_argument("--picture", type=Path, help="duplicates: draw a copy and a look-alike instead of measuring")
     parser.add_argument("--read", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     banks = RECORDINGS.with_name("banks")
@@ -550,8 +522,6 @@ def main() -> None:
     elif arguments.what == "lists":
         rows = measure_lists(arguments.episodes or 1_000_000)
         print_table(("list", "episodes", "listed in s", "us to look one up", "MB"), rows)
-    elif arguments.picture is not None:
-        draw(banks, arguments.picture, "bank_lift_viperx-007", "bank_lift_viperx-029")
     else:
         measure_copies(arguments.recordings)
         columns = ("different episodes", "count", "pairs", "taken for duplicates with states", "from images alone")

@@ -14,7 +14,6 @@ judge's score, the same within banks with its 95 % interval over banks, and the 
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections import defaultdict
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import pyarrow.parquet as pq
 import torch
 from tqdm import tqdm
 
+from benchmarks.harness import command_line
 from worldline_core.actions.action_maps import latent_frame_indices
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.data.episodes.episode import Episode
@@ -129,7 +129,7 @@ def interval(values: list[float]) -> str | None:
 
 def main() -> None:
     """Judge every chosen recording; print a table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = command_line(__doc__)
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--tokenizer", type=Path)
     parser.add_argument("--rollouts", type=Path)

@@ -14,14 +14,12 @@ too), which hardly depends on what else the machine does; the ratio by the clock
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -30,6 +28,7 @@ import cv2
 import numpy as np
 from worldline_core.training.frame_source import FrameSource
 
+from benchmarks.harness import command_line, print_table
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.video.frame_decoder import torchcodec_fault
@@ -221,39 +220,33 @@ def measure(case: dict[str, Any], episodes: EpisodeSet, decoder: str, processes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = command_line(__doc__)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", choices=sorted(CASES))
     parser.add_argument("--decoder", choices=["torchcodec", "pyav"], help="one decoder instead of both")
-    parser.add_argument("--json", type=Path, help="write the figures here as well")
     arguments = parser.parse_args()
     decoders = ["pyav"] if torchcodec_fault() else ["torchcodec", "pyav"]
     decoders = [arguments.decoder] if arguments.decoder else decoders
-    results: dict[str, list[dict[str, Any]]] = {}
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for name, case in CASES.items():
+            if arguments.only not in (None, name):
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                episodes = write_recordings(Path(folder) / "set", case)
+                for decoder in decoders:
+                    found = measure(case, episodes, decoder, arguments.processes, arguments.rounds)
+                    cells = [
+                        f"{found[f'{kind}_frames_per_processor_second']:.0f} ({found[f'{kind}_frames_per_second']:.0f})"
+                        for kind in ("raw", "loader", "whole_clips")
+                    ]
+                    yield name, found["decoder"], *cells, f"{found['ratio']:.2f} ({found['ratio_by_the_clock']:.2f})"
+
     print(
         f"{arguments.processes} processes; frames per second of processor time (by the clock), all processes together"
     )
-    print(f"{'':9} {'decoder':32} {'raw':>15} {'loader':>15} {'ratio':>14} {'whole clips':>15}")
-    for name, case in CASES.items():
-        if arguments.only not in (None, name):
-            continue
-        with tempfile.TemporaryDirectory() as folder:
-            episodes = write_recordings(Path(folder) / "set", case)
-            for decoder in decoders:
-                found = measure(case, episodes, decoder, arguments.processes, arguments.rounds)
-                results.setdefault(name, []).append(found)
-                cells = [
-                    f"{found[f'{kind}_frames_per_processor_second']:7.0f} ({found[f'{kind}_frames_per_second']:5.0f})"
-                    for kind in ("raw", "loader", "whole_clips")
-                ]
-                ratio = f"{found['ratio']:.2f} ({found['ratio_by_the_clock']:.2f})"
-                print(
-                    f"{name:9} {found['decoder']:32} {cells[0]:>15} {cells[1]:>15} {ratio:>14} {cells[2]:>15}",
-                    flush=True,
-                )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=1))
+    print_table(("", "decoder", "raw", "loader", "whole clips", "loader over raw"), rows())
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
+from benchmarks.harness import command_line
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.environment.environment import WorldLineVectorEnv
 from worldline_core.environment.episodes import judge_of
@@ -243,7 +244,7 @@ def printed(attempts: Sequence[dict[str, Any]], found: dict[str, Any], parts: di
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument(
         "--recordings", type=Path, required=True, help="of one robot, by `worldline record` with policies"
     )

@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 from einops import rearrange
 
+from benchmarks.harness import command_line
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.patch_tokenizer import PatchTokenizer
@@ -94,14 +95,13 @@ def measure(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--tokenizer", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--blocks", type=int, default=50)
     parser.add_argument("--recent-blocks", type=int, help="by default as the checkpoint says, or 3")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--output", type=Path, help="also write the figures here, as JSON")
     options = parser.parse_args()
     spec = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=3, sigmas=CAUSAL_SIGMAS)
     if options.checkpoint is None:
@@ -116,10 +116,7 @@ def main() -> None:
     if isinstance(tokenizer, torch.nn.Module):
         tokenizer.to(options.device).eval().requires_grad_(False)
     figures = measure(model.to(options.device).eval(), spec, tokenizer, options)
-    text = json.dumps(figures, indent=1)
-    print(text)
-    if options.output is not None:
-        options.output.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":
