@@ -345,7 +345,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "array linked by a detour": (linked_twice, "path_traversal"),
     "array gathered from another file": (virtual, "path_traversal"),
     "array stored out of the file": (external_storage, "path_traversal"),
-    "array of terabytes": (huge, "too_large"),
+    "array that was never written": (huge, "unreadable"),
 }
 
 

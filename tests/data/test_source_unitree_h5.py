@@ -215,7 +215,7 @@ FAULTS: dict[str, tuple[Write, Callable[[Path], None], str]] = {
     "an image less": (write_hdf5, edited(IMAGES, lambda v: v[1:]), "length_mismatch"),
     "grey images": (write_hdf5, edited(IMAGES, lambda v: v[..., 0]), "unreadable"),
     "images of floats": (write_hdf5, edited(IMAGES, lambda v: v / 255), "unreadable"),
-    "huge images": (write_hdf5, huge, "too_large"),
+    "images that were never written": (write_hdf5, huge, "unreadable"),
 }
 
 

@@ -57,11 +57,11 @@ def test_every_layout_is_damaged(sources: dict[str, SourceConfig]) -> None:
 def test_an_error_that_is_not_ours_is_found(sources: dict[str, SourceConfig], monkeypatch: pytest.MonkeyPatch) -> None:
     """The search itself: a reader that stumbles over a missing key is caught at it."""
 
-    def careless(config: SourceConfig, root: Path) -> None:
+    def careless(_limits: object, _read: object, _config: SourceConfig, root: Path) -> None:
         for path in root.rglob("*.json"):
             _ = json.loads(path.read_text())["fps"]
 
-    monkeypatch.setattr(mutations, "read_everything", careless)
+    monkeypatch.setattr(mutations, "read_limited", careless)
     config = sources["lerobot_v21"]
     found = list(attack(config, config.path, 60, seed=0))
     assert {error.error.split(":")[0] for error in found} & {"KeyError", "TypeError", "JSONDecodeError"}

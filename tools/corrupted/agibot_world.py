@@ -14,7 +14,7 @@ import numpy as np
 from tools.corrupted import files
 from tools.corrupted.content import FPS, NUM_FRAMES, gripper_motion, joint_motion, pictures
 from tools.corrupted.labels import Kind, Label
-from worldline_core.data.guards.hdf5 import require_h5py
+from worldline_core.data.sources.hdf5 import require_h5py
 from worldline_core.data.video.encoder import encode_video
 
 _CAMERAS = ("head", "hand_left", "hand_right")
@@ -141,7 +141,7 @@ KINDS = (
     Kind("arrays_linked_out", _on_file(files.link_out), ("path_traversal",)),
     Kind("dataset_missing", _on_arrays(_no_dataset), ("missing_column",)),
     Kind("dataset_linked_out", _on_arrays(_external_link), ("path_traversal",)),
-    Kind("dataset_huge", _on_arrays(_huge), ("too_large", "unreadable")),
+    Kind("dataset_huge", _on_arrays(_huge), ("out_of_memory", "unreadable")),
     Kind("dataset_of_other_length", _on_arrays(_other_length), ("length_mismatch",)),
     Kind("dexterous_hands", _on_arrays(_hands), ("invalid_gripper",)),
     Kind("values_not_finite", _on_arrays(_not_finite), ("nan_state",)),

@@ -135,8 +135,7 @@ KINDS = (
     Kind("video_missing", _on_video(files.missing), ("missing_file",)),
     Kind("video_pipe", _on_video(files.pipe), ("special_file", "missing_file")),
     Kind("video_linked_out", _on_video(files.link_out), ("path_traversal",)),
-    Kind("video_claims_pixels", _on_video(files.claim_pixels), ("too_large",)),
-    Kind("video_claims_frames", _on_video(files.claim_frames), ("too_large",)),
+    Kind("video_claims_frames", _on_video(files.claim_frames), ("too_large", "truncated_video", "out_of_memory")),
     Kind("video_other_rate", _video_of_other_rate, ("wrong_fps",)),
     Kind("video_too_long", _video_of_other_length, ("length_mismatch",)),
     Kind("table_truncated", _on_table(files.truncate), ("unreadable",)),
@@ -182,7 +181,7 @@ _PICTURES: tuple[tuple[str, PictureDefect, tuple[str, ...]], ...] = (
 )
 
 
-KIND_COUNT = len(KINDS) + len(_PICTURES) + 4
+KIND_COUNT = len(KINDS) + len(_PICTURES) + 5
 """How many recordings `write` adds for each of `each`."""
 
 
@@ -231,6 +230,9 @@ def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> t
         if number % 2:
             _copy(bases[number % _BASES], dataset.add("listed_twice", "curate", ("duplicate_id",)))
             dataset.list_again()
+        sound = dataset.add("video_claims_pixels", "kept")  # the stream itself says how large its pictures are
+        _write_episode(sound, random, NUM_FRAMES)
+        files.claim_pixels(sound.video(random), random)
         for name, change, reasons in _PICTURES:
             _write_episode(dataset.add(name, "filter", reasons), random, NUM_FRAMES, change)
         _write_episode(dataset.add("still", "filter", ("static",)), random, NUM_FRAMES, _frozen, still=True)

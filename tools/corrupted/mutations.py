@@ -6,7 +6,6 @@ Whatever the damage, reading ends in an episode or in an error of this project; 
 from __future__ import annotations
 
 import json
-import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
 from worldline_core.data.sources.open import SourceConfig, open_source
 from worldline_core.errors import WorldLineError
 
+LIMITS = ReaderLimits(memory_gb=2, seconds=10)
 Mutation = Callable[[bytes, np.random.Generator], bytes]
 _ODD_VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1, 3, 10**6, 2**63, -(2**70), 1e308, 0.5, float("nan"), float("inf"), "", "x", "../../x", "\x00", "1",
@@ -143,16 +144,11 @@ def attack(config: SourceConfig, root: Path, cases: int, seed: int) -> Iterator[
         ways = mutations_of(path)
         path.write_bytes(ways[int(random.integers(len(ways)))](content, random))
         try:
-            read_everything(config, root)
+            read_limited(LIMITS, read_everything, config, root)
         except WorldLineError:
             pass  # named: what, where, expected, got
         except Exception as error:  # noqa: BLE001 - finding these is what this is for
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            yield Unexpected(
-                str(path.relative_to(root)),
-                case,
-                f"{type(error).__name__}: {error}"[:300],
-                f"{frame.filename}:{frame.lineno}",
-            )
+            trace = getattr(error, "__notes__", [""])[-1]
+            yield Unexpected(str(path.relative_to(root)), case, f"{type(error).__name__}: {error}"[:300], trace)
         finally:
             path.write_bytes(content)

@@ -15,7 +15,7 @@ from tools.corrupted import agibot_world, droid_annotation, lerobot_v21, mcap
 from tools.corrupted.content import FPS, HEIGHT, WIDTH, gripper_motion, joint_motion, pictures
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.guards.hdf5 import require_h5py
+from worldline_core.data.sources.hdf5 import require_h5py
 from worldline_core.data.video.encoder import encode_video
 
 _LENGTH = 4

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from worldline_core.data.guards.images import decode_image
+from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.http_exchange import NoAnswer, Unreachable, exchange

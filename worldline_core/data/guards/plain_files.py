@@ -1,30 +1,29 @@
-"""Text, JSON, NumPy and Parquet files that are not to be trusted: bounded in size, and every fault is named.
+"""Text, JSON, NumPy, Parquet and image files of others: every fault becomes a rejection with its reason.
 
-JSON may repeat no key; NaN and infinities are read as what they are: recorders write them, and the checks of values say
-where they stand. A .npy file must hold what its header declares. Of Parquet tables rows and bytes are bounded.
+JSON may repeat no key. NaN and infinities are read as they are: recorders write them, and the checks of values name the
+frame. A file that asks for more memory than there is is the business of `reader_process`.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import math
-import tokenize
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.lib import format as npy
+from PIL import Image
 from pydantic import BaseModel, ValidationError
 
 from worldline_core.data.guards.rejection import (
-    MAX_ARRAY_BYTES,
-    MAX_ROWS,
-    MAX_TABLE_BYTES,
+    MAX_PIXELS,
     MAX_TEXT_BYTES,
     RejectedInputError,
+    check_image_size,
     too_large,
     unreadable,
 )
@@ -115,49 +114,31 @@ def validated[M: BaseModel](model: type[M], content: Any, where: object, what: s
         ) from error
 
 
-_NPY_FAULTS = (ValueError, TypeError, SyntaxError, EOFError, OSError, OverflowError, tokenize.TokenError)
-
-
 def read_npy(path: AnyPath) -> np.ndarray:
-    """The array of a .npy file; never unpickles.
+    """Array of a .npy file; never unpickles.
 
-    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable (damaged, of objects, or cut off).
+    Raises: RejectedInputError: missing_file, special_file, out_of_memory, unreadable (damaged, of objects, or cut off).
     """
     file = regular_file(path)
-    with unreadable("Array cannot be read", path, _NPY_FAULTS), file.open("rb") as stream:
-        size = file.stat().st_size
-        version = npy.read_magic(stream)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"format version {version}")
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, fortran_order, dtype = read_header(stream)
-        if dtype.hasobject:
-            raise ValueError("an array of Python objects")
-        declared = math.prod(shape) * dtype.itemsize
-        if declared > MAX_ARRAY_BYTES:
-            raise too_large("Array is too large", where=path, limit=MAX_ARRAY_BYTES, got=declared, unit="bytes")
-        if declared != size - stream.tell():
-            raise ValueError(f"{size - stream.tell()} bytes of data where the header declares {declared}")
-        values = np.frombuffer(stream.read(declared), dtype=dtype)
-        return values.reshape(shape, order="F" if fortran_order else "C").copy()
+    # Damaged headers: SyntaxError, TokenError (an Exception only), OverflowError, ...
+    with unreadable("Array cannot be read", path, (Exception,)), file.open("rb") as stream:
+        values = np.load(stream, allow_pickle=False)
+        if not isinstance(values, np.ndarray):
+            raise ValueError("an archive of arrays")
+        return values
 
 
-# A dictionary of long texts unpacks to far more than the footer says. No text is longer than its column chunk, so tables
-# with texts are read in batches of so many rows that no batch exceeds the limit by much.
-_BATCH_BYTES = 256 << 20
-_BATCH_ROWS = (64, 65_536)
-_FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError, MemoryError)
-"""ArrowException covers ArrowInvalid, ArrowNotImplementedError and ArrowMemoryError of a header that asks for too much."""
+_PARQUET_FAULTS = (pa.ArrowException, OSError, ValueError, TypeError, OverflowError)
 
 
 def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
-    """A Parquet file as a table.
+    """Table of a Parquet file.
 
-    Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), too_large, unreadable.
+    Raises: RejectedInputError: missing_file, special_file, missing_column (the message names it), out_of_memory, unreadable.
     """
     local = regular_file(path)
     # No memory map: where somebody shortens the file meanwhile, a map ends in a signal instead of an error.
-    with unreadable("Parquet file cannot be read", path, _FAULTS), pq.ParquetFile(local, memory_map=False) as file:
+    with unreadable("Parquet file cannot be read", path, _PARQUET_FAULTS), pq.ParquetFile(local) as file:
         names = file.schema_arrow.names
         missing = [column for column in columns or () if column not in names]
         if missing:
@@ -168,9 +149,7 @@ def read_table(path: AnyPath, columns: Sequence[str] | None = None) -> pa.Table:
                 expected=", ".join(missing),
                 got="columns " + ", ".join(names),
             )
-        wanted = None if columns is None else list(columns)
-        _check_size(file, wanted, path)
-        return _read(file, wanted, path)
+        return file.read(columns=None if columns is None else list(columns), use_threads=False)
 
 
 def column_names(path: AnyPath) -> list[str]:
@@ -179,53 +158,82 @@ def column_names(path: AnyPath) -> list[str]:
     Raises: RejectedInputError: missing_file, special_file, unreadable.
     """
     local = regular_file(path)
-    with unreadable("Parquet file cannot be read", path, _FAULTS):
+    with unreadable("Parquet file cannot be read", path, _PARQUET_FAULTS):
         return list(pq.read_schema(local, memory_map=False).names)
 
 
-def _check_size(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> None:
-    """By the footer: 8 bytes per value, which is what Arrow takes for numbers, or as many as a value of fixed length has."""
-    footer = file.metadata
-    if footer.num_rows > MAX_ROWS:
-        raise too_large("Table has too many rows", where=path, limit=MAX_ROWS, got=footer.num_rows, unit="rows")
-    size = sum(max(count, 0) * max(width, 8) for count, width, _ in _chunks(file, columns))
-    if size > MAX_TABLE_BYTES:
-        raise too_large("Table has too many values", where=path, limit=MAX_TABLE_BYTES, got=size, unit="bytes")
+_END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
+_LAST_BYTES = 256
+_SCAN = b"\xff\xda"
+_MAX_SCANS = 100
+_MAX_IMAGE_BYTES = 4 * MAX_PIXELS
+"""An encoded image is never much larger than its pixels."""
 
 
-def _chunks(file: pq.ParquetFile, columns: list[str] | None) -> Iterator[tuple[int, int, int]]:
-    """(values, bytes of each where all have as many, bytes once decompressed) of the column chunks, as the footer has them."""
-    footer = file.metadata
-    for group in range(footer.num_row_groups):
-        row_group = footer.row_group(group)
-        for number in range(row_group.num_columns):
-            column = row_group.column(number)
-            if columns is None or column.path_in_schema.split(".")[0] in columns:
-                fixed = column.physical_type == "FIXED_LEN_BYTE_ARRAY"
-                width = file.schema.column(number).length if fixed else 0
-                yield column.num_values, width, column.total_uncompressed_size
+def image_size(content: bytes, where: object) -> tuple[int, int]:
+    """(height, width) that a PNG or JPEG file states, without decoding it.
+
+    Raises: RejectedInputError: too_large; unreadable for another format, a header that breaks off, an animation, an image
+        without its end.
+    """
+    try:
+        with Image.open(io.BytesIO(content), formats=tuple(_END_MARKS)) as image:
+            (width, height), kind = image.size, "PNG" if image.format == "PNG" else "JPEG"
+            animated = kind == "PNG" and getattr(image, "is_animated", False)
+    except Image.DecompressionBombError as error:
+        raise too_large("Image has too many pixels", where=where, limit=MAX_PIXELS, got=str(error)) from error
+    except Exception as error:
+        raise RejectedInputError(
+            "unreadable",
+            "Image is of no known format, or its header is damaged",
+            where=where,
+            expected="PNG (not animated) or JPEG",
+            got=f"{len(content)} bytes that begin with {content[:8].hex() or 'nothing'}",
+        ) from error
+    check_image_size(width, height, where)
+    # The decoder fills what is missing with grey and says nothing. Recorders pad with zeros, cameras add some bytes.
+    if animated or _END_MARKS[kind] not in content.rstrip(b"\0")[-_LAST_BYTES:]:
+        raise RejectedInputError(
+            "unreadable",
+            "Image is animated" if animated else "Image breaks off",
+            where=where,
+            expected="one whole picture with the end mark of its format",
+            got=f"{len(content)} bytes that end with {content[-8:].hex()}",
+        )
+    return height, width
 
 
-def _read(file: pq.ParquetFile, columns: list[str] | None, path: AnyPath) -> pa.Table:
-    fields = [field for field in file.schema_arrow if columns is None or field.name in columns]
-    if not any(_holds_text(field.type) for field in fields):
-        return file.read(columns=columns, use_threads=False)
-    batches, total = [], 0
-    longest = max((size for *_, size in _chunks(file, columns)), default=1)
-    rows = min(max(_BATCH_BYTES // max(longest, 1), _BATCH_ROWS[0]), _BATCH_ROWS[1])
-    for batch in file.iter_batches(rows, columns=columns, use_threads=False):
-        total += batch.nbytes
-        if total > MAX_TABLE_BYTES:
-            raise too_large("Table is too large", where=path, limit=MAX_TABLE_BYTES, got=total, unit="bytes")
-        batches.append(batch)
-    schema = file.schema_arrow
-    if columns is not None:
-        schema = pa.schema([schema.field(name) for name in columns], metadata=schema.metadata)
-    return pa.Table.from_batches([batch.select(schema.names) for batch in batches], schema)
+def decode_image(content: bytes, where: object, *, channels: str = "rgb") -> np.ndarray:
+    """uint8 (H, W, 3) of a PNG or JPEG file.
+
+    Args:
+        channels: "rgb", or "bgr" for OpenCV's order.
+
+    Raises: RejectedInputError: too_large by its header, unreadable.
+    """
+    height, width = image_size(content, where)
+    # Every scan of a progressive JPEG goes over the whole picture, however little it says; usual files have ten.
+    if content.startswith(b"\xff\xd8") and (scans := content.count(_SCAN)) > _MAX_SCANS:
+        raise too_large("Image has too many scans", where=where, limit=_MAX_SCANS, got=scans)
+    with unreadable("Image cannot be decoded", where, (cv2.error,)):
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if image is None or image.shape[:2] not in ((height, width), (width, height)):  # EXIF may turn a JPEG
+        raise RejectedInputError(
+            "unreadable",
+            "Image cannot be decoded",
+            where=where,
+            expected=f"{width}x{height} as its header says",
+            got="nothing" if image is None else f"{image.shape[1]}x{image.shape[0]}",
+        )
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if channels == "rgb" else image
 
 
-def _holds_text(kind: pa.DataType) -> bool:
-    if pa.types.is_nested(kind):
-        return any(_holds_text(kind.field(number).type) for number in range(kind.num_fields))
-    text = (pa.types.is_string, pa.types.is_binary, pa.types.is_large_string, pa.types.is_large_binary)
-    return any(is_kind(kind) for is_kind in text)
+def read_image(path: AnyPath) -> np.ndarray:
+    """uint8 (H, W, 3) RGB of a PNG or JPEG file.
+
+    Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
+    """
+    file = regular_file(path, "Image", max_bytes=_MAX_IMAGE_BYTES)
+    with unreadable("Image cannot be read", path, (OSError,)):
+        content = file.read_bytes()
+    return decode_image(content, path)

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
@@ -214,4 +215,5 @@ def _answer(limits: ReaderLimits, function: Callable[..., Any], arguments: tuple
         )
         return rejected, None
     except Exception as error:  # noqa: BLE001 - raised again by the process that waits
+        error.add_note("".join(traceback.format_tb(error.__traceback__)))  # which pickling loses
         return error, None

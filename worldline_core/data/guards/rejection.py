@@ -1,8 +1,4 @@
-"""Why an input is refused: the reasons, as codes that are counted in the quarantine, and how much it may declare.
-
-A header of some bytes can claim 30,000 x 30,000 pixels, 10^9 frames or 10^12 numbers. Readers compare what a file declares
-with these limits before they decode or allocate; none of them stands in the way of a real recording.
-"""
+"""Reasons to refuse an input, as codes that the quarantine counts, and the checks of meaning that all readers share."""
 
 from __future__ import annotations
 
@@ -64,12 +60,6 @@ MAX_PIXELS = 40_000_000
 """One image; 8K video has 33 million pixels."""
 MAX_FRAMES = 4_000_000
 """One video file: 18 hours at 60 Hz. LeRobot joins episodes into files of some 100 MB, far below."""
-MAX_ROWS = 50_000_000
-"""One table."""
-MAX_TABLE_BYTES = 4 << 30
-"""One table in memory."""
-MAX_ARRAY_BYTES = 1 << 30
-"""One array: an hour at 30 Hz of 100 float64 columns is 0.1 GB."""
 MAX_TEXT_BYTES = 512 << 20
 """One JSON or JSON lines file; 10^6 episodes of LeRobot v2.1 are about 150 MB."""
 MAX_CHUNK_BYTES = 256 << 20
@@ -144,16 +134,16 @@ def unreadable(what: str, where: object, faults: tuple[type[Exception], ...]) ->
         ) from error
 
 
-def too_large(what: str, *, where: object, limit: int, got: int, unit: str) -> RejectedInputError:
+def too_large(what: str, *, where: object, limit: int, got: int | str, unit: str = "") -> RejectedInputError:
     """The rejection of something that declares more than a limit."""
     return RejectedInputError(
         "too_large",
         what,
         where=where,
-        expected=f"at most {limit:,} {unit}",
-        got=f"{got:,} {unit}",
+        expected=f"at most {limit:,} {unit}".rstrip(),
+        got=f"{got:,} {unit}".rstrip() if isinstance(got, int) else got,
         next_step="the file is damaged or hostile; if it is neither, cut the recording into shorter ones",
-        evidence={"declared": int(got), "limit": int(limit), "unit": unit},
+        evidence={"declared": got, "limit": limit, "unit": unit},
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from av.video.codeccontext import VideoCodecContext
 
 from worldline_core.data.episodes.episode import CameraTrack
-from worldline_core.data.guards.images import decode_image
+from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.mcap.messages import EncodedImage, Kind, RawImage

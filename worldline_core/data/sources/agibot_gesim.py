@@ -28,8 +28,7 @@ from worldline_core.data.episodes.source import (
     LoadedEpisode,
     joint_names,
 )
-from worldline_core.data.guards.images import read_image
-from worldline_core.data.guards.plain_files import read_npy, read_text
+from worldline_core.data.guards.plain_files import read_image, read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_finite, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw

@@ -31,7 +31,6 @@ from worldline_core.data.episodes.source import (
     LoadedEpisode,
     sorted_views,
 )
-from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_rate
 from worldline_core.data.guards.source_paths import AnyPath, find_folders, inside
@@ -42,6 +41,7 @@ from worldline_core.data.sources.agibot_gesim import (
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
+from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
 

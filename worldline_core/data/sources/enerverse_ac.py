@@ -32,8 +32,7 @@ from worldline_core.data.episodes.source import (
     LensConfig,
     LoadedEpisode,
 )
-from worldline_core.data.guards.hdf5 import open_hdf5
-from worldline_core.data.guards.images import read_image
+from worldline_core.data.guards.plain_files import read_image
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file
 from worldline_core.data.sources.agibot_gesim import (
@@ -54,6 +53,7 @@ from worldline_core.data.sources.agibot_world import (
     timed_video_size,
     two_grippers,
 )
+from worldline_core.data.sources.hdf5 import open_hdf5
 from worldline_core.data.sources.ids import file_ids
 from worldline_core.data.video.clip import VideoClip
 

@@ -33,9 +33,9 @@ from worldline_core.data.episodes.source import (
     LoadedEpisode,
     joint_names,
 )
-from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
+from worldline_core.data.sources.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.sources.ids import file_ids, printable
 from worldline_core.data.sources.video_folder import caption_table
 

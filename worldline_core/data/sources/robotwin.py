@@ -26,11 +26,10 @@ from worldline_core.data.episodes.source import (
     LoadedEpisode,
     joint_names,
 )
-from worldline_core.data.guards.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
-from worldline_core.data.guards.images import image_size
-from worldline_core.data.guards.plain_files import read_json
+from worldline_core.data.guards.plain_files import image_size, read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.sources.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
 from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 

@@ -33,10 +33,10 @@ from worldline_core.data.episodes.source import (
     LoadedEpisode,
     joint_names,
 )
-from worldline_core.data.guards.hdf5 import Hdf5File, open_hdf5, raw_images, require_h5py
 from worldline_core.data.guards.plain_files import expect_layout, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5, raw_images, require_h5py
 from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.data.video.clip import VideoClip, video_size
 

@@ -18,7 +18,7 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 
-from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size
+from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import AnyPath, local_file
 from worldline_core.data.video.header import check_video_header, undecodable
 
@@ -131,9 +131,14 @@ def open_video(path: AnyPath) -> Iterator[tuple[InputContainer, VideoStream]]:
             if stream.codec_context is None:  # the type stubs know no such stream
                 raise undecodable(path, "a codec that this FFmpeg does not know")
             check_image_size(stream.width, stream.height, str(path))
+            claimed, size = stream.frames, file.stat().st_size
+            if claimed > size:
+                raise too_large("Video claims more frames than it has bytes", where=path, limit=size, got=claimed)
             stream.codec_context.options = _BOUNDED
             stream.thread_type = "NONE"  # small pictures decode faster than threads start
             yield container, stream
+    except av.error.MemoryError:
+        raise  # for the process that limits it
     except av.error.FFmpegError as error:
         raise undecodable(path, error) from error
 

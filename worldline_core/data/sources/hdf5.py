@@ -1,40 +1,35 @@
-"""Reading arrays of HDF5 files that are not to be trusted: every fault is the rejection of an episode.
+"""Arrays and images of HDF5 files that others wrote: every fault is the rejection of an episode.
 
-A file may point outside of itself (external links, external storage, virtual datasets) or declare a huge array in a few
-bytes; both are refused before anything is read.
-
-Views of such a recording are stored as one encoded image per frame, or as pixels.
+A file may point outside of itself (links, external storage, virtual datasets), which is refused. Views of such a recording
+are stored as one encoded image per frame, or as pixels.
 """
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from worldline_core.data.guards.hdf5_heap import check_entries
-from worldline_core.data.guards.images import decode_image
+from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import (
-    MAX_ARRAY_BYTES,
-    MAX_FRAMES,
+    Reason,
     RejectedInputError,
     check_finite,
     check_image_size,
     check_shape,
-    too_large,
     unreadable,
 )
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import UnavailableError, installing
 
-_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
-_MAX_TEXT = 1 << 20
-# Encoded images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
+_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
+_MAX_COLUMNS = 1000
+# Images are read a block at a time: a compressed chunk is unpacked once, and little is in memory.
 _BLOCK_IMAGES = 16
 _BLOCK_BYTES = 64 << 20
 
@@ -56,10 +51,9 @@ def require_h5py() -> Any:
 class Hdf5File:
     """An open file; made by `open_hdf5`."""
 
-    def __init__(self, path: AnyPath, local: Path, handle: Any) -> None:
+    def __init__(self, path: AnyPath, handle: Any) -> None:
         self._h5py = require_h5py()
         self._path = path
-        self._local = local
         self._handle = handle
 
     def names(self, group: str) -> list[str]:
@@ -101,12 +95,14 @@ class Hdf5File:
             shape: wanted sizes; None for any (but not 0).
 
         Raises: RejectedInputError: missing_column (no such dataset), length_mismatch (another shape), nan_state (values
-            that are not finite), unreadable (damaged, not numeric, or too large), path_traversal.
+            that are not finite), unreadable (damaged, not numeric, or never written), out_of_memory, path_traversal.
         """
         dataset = self._dataset(key)
         if dataset.dtype.kind not in "fiu":
             raise self._rejected("unreadable", "Dataset is not numeric", key, "numbers", dataset.dtype)
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, shape)
+        if math.prod(dataset.shape[1:]) > _MAX_COLUMNS:
+            raise self._rejected("too_large", "Dataset has too many columns", key, _MAX_COLUMNS, dataset.shape)
         with self._reading(key):
             values = np.asarray(dataset[()], dtype=np.float64)
         check_finite(key, values, self._path)
@@ -136,7 +132,7 @@ class Hdf5File:
     def text(self, key: str) -> str | None:
         """A text stored as a dataset of one entry; None where there is none.
 
-        Raises: RejectedInputError: unreadable (no text), too_large, path_traversal.
+        Raises: RejectedInputError: unreadable (no text), out_of_memory, path_traversal.
         """
         if not self.has(key):
             return None
@@ -144,15 +140,13 @@ class Hdf5File:
         if dataset.size != 1:
             raise self._rejected("unreadable", "Dataset is no single text", key, "one entry", dataset.shape)
         with self._reading(key):
-            if dataset.dtype.kind == "O" and (dataset.chunks is None or dataset.ndim == 1):
-                check_entries(dataset, 0, 1, self._local, f"{self._path}, {key}")
             value = dataset[()] if dataset.shape == () else dataset[(0,) * dataset.ndim]
         return self._as_text(value, key)
 
     def attribute(self, group: str, name: str) -> str | None:
         """An attribute of a group ("/" for the file's own) as text; None where there is none.
 
-        Raises: RejectedInputError: unreadable, too_large, path_traversal.
+        Raises: RejectedInputError: unreadable, out_of_memory, path_traversal.
         """
         with self._reading(f"{group}, attribute {name}"):
             node = self._handle if group == "/" else self._node(group)
@@ -166,19 +160,14 @@ class Hdf5File:
             value = value.decode("utf-8", "replace")
         if not isinstance(value, str | int | float | np.number | np.bool_):
             raise self._rejected("unreadable", "Entry is no text", where, "a text or a number", type(value).__name__)
-        text = str(value)
-        if len(text) > _MAX_TEXT:
-            raise too_large(
-                "Text is too long", where=f"{self._path}, {where}", limit=_MAX_TEXT, got=len(text), unit="letters"
-            )
-        return text
+        return str(value)
 
     def image_files(self, key: str, length: int) -> Iterator[bytes]:
         """A dataset (length,) of encoded images, as bytes each, a few in memory at a time.
 
-        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, too_large, path_traversal.
+        Raises: RejectedInputError: missing_column, length_mismatch, unreadable, out_of_memory, path_traversal.
         """
-        dataset = self._dataset(key, whole=False)
+        dataset = self._dataset(key)
         fixed = dataset.dtype.kind == "S"
         variable = self._h5py.check_vlen_dtype(dataset.dtype) == np.dtype(np.uint8)
         if dataset.ndim != 1 or not (fixed or variable):
@@ -186,31 +175,28 @@ class Hdf5File:
                 "unreadable", "Images are not stored as encoded bytes", key, "(N,) byte strings", dataset.dtype
             )
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, (length,))
-        rows = dataset.chunks[0] if dataset.chunks else _BLOCK_IMAGES
-        rows = max(1, min(rows, _BLOCK_BYTES // max(dataset.dtype.itemsize, 1)))
-        for start in range(0, length, rows):
-            with self._reading(key):
-                if variable:
-                    check_entries(dataset, start, min(start + rows, length), self._local, f"{self._path}, {key}")
-                block = [bytes(item) for item in dataset[start : start + rows]]
-            yield from block
+        return map(bytes, self._rows(dataset, key))
 
     def pixels(self, key: str, length: int) -> Iterator[np.ndarray]:
         """A dataset (length, H, W, 3) of uint8 pixels, as images (H, W, 3) with their channels as stored.
 
         Raises: RejectedInputError: missing_column, length_mismatch, unreadable, too_large, path_traversal.
         """
-        dataset = self._dataset(key, whole=False)
+        dataset = self._dataset(key)
         if dataset.dtype != np.uint8 or dataset.ndim != 4 or dataset.shape[-1] != 3:
             got = f"{dataset.shape} of {dataset.dtype}"
             raise self._rejected("unreadable", "Images are not stored as pixels", key, "(N, H, W, 3) of uint8", got)
         check_shape("Dataset", f"{self._path}, {key}", dataset.shape, (length, None, None, 3))
         check_image_size(dataset.shape[2], dataset.shape[1], f"{self._path}, {key}")
+        return self._rows(dataset, key)
+
+    def _rows(self, dataset: Any, key: str) -> Iterator[Any]:
+        row_bytes = dataset.dtype.itemsize * math.prod(dataset.shape[1:])
         rows = dataset.chunks[0] if dataset.chunks else _BLOCK_IMAGES
-        rows = max(1, min(rows, _BLOCK_BYTES // int(np.prod(dataset.shape[1:]))))
-        for start in range(0, length, rows):
+        rows = max(1, min(rows, _BLOCK_BYTES // max(row_bytes, 1)))
+        for start in range(0, len(dataset), rows):
             with self._reading(key):
-                block = np.asarray(dataset[start : start + rows])
+                block = dataset[start : start + rows]
             yield from block
 
     def _node(self, key: str) -> Any:
@@ -224,8 +210,8 @@ class Hdf5File:
             node = node[part]
         return node
 
-    def _dataset(self, key: str, *, whole: bool = True) -> Any:
-        """The dataset at `key`; with `whole` it is small enough to be read at once."""
+    def _dataset(self, key: str) -> Any:
+        """The dataset at `key`, written as a whole: HDF5 makes up what was not."""
         with self._reading(key):
             node = self._node(key)
             if not isinstance(node, self._h5py.Dataset):
@@ -235,21 +221,15 @@ class Hdf5File:
                 raise self._rejected(
                     "path_traversal", "Dataset lies in other files", key, "data in this file", "external storage"
                 )
-            # A chunk is unpacked as a whole, whatever little of it is wanted.
-            chunk = int(np.prod(node.chunks or (), dtype=np.float64)) * node.dtype.itemsize if node.chunks else 0
-            # Whole datasets become float64, whatever they are stored as.
-            largest = max(int(node.size) * max(node.dtype.itemsize, 8) if whole else 0, chunk)
-            where = f"{self._path}, {key}"
-            if largest > MAX_ARRAY_BYTES:
-                raise too_large("Dataset is too large", where=where, limit=MAX_ARRAY_BYTES, got=largest, unit="bytes")
-            count = node.shape[0] if node.shape else 1
-            if not whole and count > MAX_FRAMES:
-                raise too_large(
-                    "Dataset claims too many images", where=where, limit=MAX_FRAMES, got=count, unit="images"
-                )
+            wanted, found = 1, int(node.id.get_storage_size() > 0)
+            if node.chunks:
+                wanted = math.prod(-(-size // chunk) for size, chunk in zip(node.shape, node.chunks, strict=True))
+                found = node.id.get_num_chunks()
+            if node.size and found < wanted:
+                raise self._rejected("unreadable", "Dataset was not written", key, f"{wanted} chunks", f"{found}")
             return node
 
-    def _rejected(self, reason: Any, what: str, key: str, expected: object, got: object) -> RejectedInputError:
+    def _rejected(self, reason: Reason, what: str, key: str, expected: object, got: object) -> RejectedInputError:
         return RejectedInputError(reason, what, where=f"{self._path}, {key}", expected=expected, got=got)
 
     def _reading(self, key: str) -> AbstractContextManager[None]:
@@ -267,7 +247,7 @@ def open_hdf5(path: AnyPath) -> Iterator[Hdf5File]:
     with unreadable("HDF5 file cannot be opened", path, _DAMAGED):
         handle = h5py.File(local, "r", locking=False)
     with handle:
-        yield Hdf5File(path, local, handle)
+        yield Hdf5File(path, handle)
 
 
 Channels = Literal["as_written", "standard"]

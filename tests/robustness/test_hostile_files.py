@@ -1,0 +1,272 @@
+"""Files of others that claim too much, break off or are something else; and sound ones that look unusual."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+h5py = pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+
+from tools.corrupted.attacks import ATTACKS, Attack, ending, jpeg_of_scans
+from tools.corrupted.one_of_each import write_one_of_each
+from worldline_core.data.guards.plain_files import (
+    column_names,
+    decode_image,
+    image_size,
+    read_image,
+    read_json,
+    read_json_lines,
+    read_npy,
+    read_table,
+)
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.data.sources.hdf5 import open_hdf5
+from worldline_core.data.video.clip import VideoClip, read_clip
+
+PICTURE = np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    return write_one_of_each(tmp_path_factory.mktemp("layouts"))
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=[f"{attack.layout}: {attack.name}" for attack in ATTACKS])
+def test_an_attack_ends_in_time_in_a_recording_or_its_true_reason(
+    sources: dict[str, dict[str, Any]], tmp_path: Path, attack: Attack
+) -> None:
+    assert ending(attack, sources[attack.layout], tmp_path / "attacked") in attack.endings
+
+
+@pytest.mark.parametrize("array", [np.arange(12.0).reshape(3, 4), np.zeros((2, 3), order="F"), np.array(5)])
+def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path, array: np.ndarray) -> None:
+    np.save(tmp_path / "a.npy", array)
+    read = read_npy(tmp_path / "a.npy")
+    assert np.array_equal(read, array)
+    assert (read.shape, read.dtype) == (array.shape, array.dtype)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"PK\x03\x04",
+        b"\x93NUMPY\x01\x00\xff\xff{",
+        b"\x93NUMPY\x09\x00",
+        b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16,
+        b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f8', 'fortran_order': False, 'shape': (8,), }".ljust(128) + bytes(63),
+    ],
+)
+def test_damaged_arrays_are_unreadable(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "b.npy").write_bytes(content)
+    with pytest.raises(RejectedInputError, match=r"b\.npy") as caught:
+        read_npy(tmp_path / "b.npy")
+    assert caught.value.reason == "unreadable"
+
+
+def test_an_array_of_objects_is_not_unpickled(tmp_path: Path) -> None:
+    class Harm:
+        def __reduce__(self) -> tuple[object, ...]:
+            return Path.touch, (tmp_path / "harmed",)
+
+    np.save(tmp_path / "a.npy", np.array([Harm()], dtype=object), allow_pickle=True)
+    with pytest.raises(RejectedInputError, match=r"a\.npy"):
+        read_npy(tmp_path / "a.npy")
+    assert not (tmp_path / "harmed").exists()
+    np.load(tmp_path / "a.npy", allow_pickle=True)
+    assert (tmp_path / "harmed").exists(), "the file would do harm if it were unpickled"
+
+
+def test_tables_come_whole_or_by_column(tmp_path: Path) -> None:
+    table = pa.table({"a": [1, 2, 3], "b": ["x", None, "z"], "c": [[1.0], [2.0], [3.0]], "d": [["p"], [], ["q", "r"]]})
+    pq.write_table(table, tmp_path / "t.parquet", row_group_size=2)
+    assert read_table(tmp_path / "t.parquet").equals(table)
+    assert read_table(tmp_path / "t.parquet", ["d", "a"]).select(["d", "a"]).equals(table.select(["d", "a"]))
+    assert column_names(tmp_path / "t.parquet") == ["a", "b", "c", "d"]
+    with pytest.raises(RejectedInputError, match=r"t\.parquet") as caught:
+        read_table(tmp_path / "t.parquet", ["a", "e"])
+    assert caught.value.reason == "missing_column"
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (b'{"a": 1, "a": 2}', "'a' is given twice"),
+        (b"[" * 500_000, "recursion"),
+        (b'{"a":' * 500_000, "recursion"),
+        (b"[" + b"9" * 5_000 + b"]", "4300"),
+        (b'{"a": "\xff\xfe"}', "0xff"),
+        (b'{"a": 1', "char 7"),
+        (b"", "char 0"),
+    ],
+)
+def test_json_that_is_wrong_in_some_way(tmp_path: Path, content: bytes, what: str) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(RejectedInputError, match=what) as caught:
+        read_json(tmp_path / "a.json")
+    assert caught.value.reason == "unreadable"
+
+
+def test_json_is_read_as_it_is(tmp_path: Path) -> None:
+    value = {"a": [1, 2.5, None, True], "ü": {"b": "c"}}
+    (tmp_path / "a.json").write_text(json.dumps(value, ensure_ascii=False), encoding="utf-8")
+    assert read_json(tmp_path / "a.json") == value
+    (tmp_path / "b.jsonl").write_text('{"a": 1}\n\n{"a": NaN}\n')
+    first, second = read_json_lines(tmp_path / "b.jsonl")
+    assert first == {"a": 1}
+    assert np.isnan(second["a"])
+    (tmp_path / "b.jsonl").write_text('{"a": 1}\n{"a" 2}\n')
+    with pytest.raises(RejectedInputError, match="line 2"):
+        list(read_json_lines(tmp_path / "b.jsonl"))
+
+
+@pytest.mark.parametrize("settings", [{}, {"chunks": (2,)}, {"chunks": (3,), "compression": "gzip", "shuffle": True}])
+def test_entries_of_variable_length_are_read(tmp_path: Path, settings: dict[str, object]) -> None:
+    contents = [bytes([n]) * (40 + n) for n in range(5)]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        images = file.create_dataset("images", (5,), dtype=h5py.vlen_dtype(np.uint8), **settings)
+        for number, content in enumerate(contents):
+            images[number] = np.frombuffer(content, np.uint8)
+        file["text"] = ["pick"]
+    with open_hdf5(tmp_path / "a.h5") as file:
+        assert list(file.image_files("images", 5)) == contents
+        assert file.text("text") == "pick"
+
+
+def test_a_dataset_that_was_written_in_part_is_unreadable(tmp_path: Path) -> None:
+    """The library fills in zeros, which look like a robot that stands still."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("state", (6, 2), chunks=(2, 2), dtype="f4")[:4] = 1
+        file.create_dataset("nothing", (6, 2), dtype="f4")
+    with open_hdf5(tmp_path / "a.h5") as file:
+        for key in ("state", "nothing"):
+            with pytest.raises(RejectedInputError, match=f"h5, {key}") as caught:
+                file.array(key, (None, 2))
+            assert caught.value.reason == "unreadable"
+
+
+def test_a_state_of_thousands_of_columns_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["state"] = np.zeros((3, 1001))
+    with open_hdf5(tmp_path / "a.h5") as file, pytest.raises(RejectedInputError, match="1001") as caught:
+        file.array("state", (None, None))
+    assert caught.value.reason == "too_large"
+
+
+def encoded(kind: str, **settings: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(PICTURE).save(stream, kind, **settings)
+    return stream.getvalue()
+
+
+def test_png_and_jpeg_come_as_rgb() -> None:
+    assert np.array_equal(decode_image(encoded("PNG"), "x"), PICTURE)
+    assert np.array_equal(decode_image(encoded("PNG"), "x", channels="bgr"), PICTURE[..., ::-1])
+    jpeg = encoded("JPEG", quality=95)
+    assert np.abs(decode_image(jpeg, "x").astype(int) - np.asarray(Image.open(io.BytesIO(jpeg)))).max() <= 3
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"progressive": True}, {"restart_marker_rows": 1}, {"comment": b"\xff\xc0\x00" * 9}]
+)
+def test_the_size_is_found_among_other_segments(settings: dict[str, object]) -> None:
+    assert image_size(encoded("JPEG", **settings), "x") == (30, 50)
+    exif = Image.Exif()
+    exif[0x010E] = encoded("JPEG").decode("latin-1")[:400]  # a description that is itself the beginning of a JPEG file
+    assert image_size(encoded("JPEG", exif=exif, **settings), "x") == (30, 50)
+
+
+def test_a_jpeg_that_claims_gigapixels_is_refused_undecoded() -> None:
+    sound = encoded("JPEG")
+    frame = sound.index(b"\xff\xc0")
+    length = struct.unpack(">H", sound[frame + 2 : frame + 4])[0]
+    large = bytearray(sound[frame : frame + 2 + length])
+    large[5:9] = struct.pack(">HH", 65_500, 65_500)
+    after = sound[frame + 2 + length :]
+    with pytest.raises(RejectedInputError, match="bomb") as caught:
+        decode_image(sound[:frame] + bytes(large) + after, "bomb.jpg")
+    assert caught.value.reason == "too_large"
+    for content in (sound[:frame] + bytes(large) + sound[frame:], sound[: frame + 2 + length] + bytes(large) + after):
+        with pytest.raises(RejectedInputError, match="bomb"):  # two frames, one of them that large
+            decode_image(content, "bomb.jpg")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"GIF89a", b"\xff\xd8\xff", encoded("JPEG")[:20], b"\xff\xd8\xff" + b"\xff" * 99]
+)
+def test_what_is_no_image_is_unreadable(content: bytes) -> None:
+    with pytest.raises(RejectedInputError, match="where: x") as caught:
+        decode_image(content, "x")
+    assert caught.value.reason == "unreadable"
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+@pytest.mark.parametrize("content", [encoded("PNG"), encoded("JPEG", quality=95)])
+def test_an_image_that_breaks_off_is_not_filled_with_grey(content: bytes, share: float) -> None:
+    assert decode_image(content + b"\0" * 999, "padded").shape == PICTURE.shape
+    with pytest.raises(RejectedInputError, match="where: x") as caught:
+        decode_image(content[: int(len(content) * share)], "x")
+    assert caught.value.reason == "unreadable"
+
+
+def test_a_progressive_jpeg_of_usual_scans_is_read() -> None:
+    assert decode_image(jpeg_of_scans(1), "x").shape == (6000, 6000, 3)
+
+
+def test_special_files_are_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "zero.png").symlink_to("/dev/zero")
+    for name in ("pipe", "folder", "zero"):
+        with pytest.raises(RejectedInputError, match=f"{name}.png") as caught:
+            read_image(tmp_path / f"{name}.png")
+        assert caught.value.reason == "special_file"
+        with pytest.raises(RejectedInputError, match=f"{name}.png") as caught:
+            list(read_clip(VideoClip.whole_file(tmp_path / f"{name}.png", 9, 8.0)))
+        assert caught.value.reason == "special_file"
+    cv2.imwrite(str(tmp_path / "sound.png"), PICTURE[..., ::-1])
+    assert np.array_equal(read_image(tmp_path / "sound.png"), PICTURE)
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 8, 11, 40, 300])
+def test_a_video_that_breaks_off_in_its_header(video: Path, length: int) -> None:
+    video.write_bytes(video.read_bytes()[:length])
+    with pytest.raises(RejectedInputError, match=r"video\.mp4") as caught:
+        list(read_clip(VideoClip.whole_file(video, 9, 8.0)))
+    assert caught.value.reason in ("truncated_video", "unreadable")
+
+
+def frames_of(path: Path) -> int | str:
+    """How many frames are read, or why not."""
+    try:
+        return sum(1 for _ in read_clip(VideoClip.whole_file(path, 9, 8.0)))
+    except RejectedInputError as error:
+        return error.reason
+
+
+def test_boxes_that_lie_about_their_length_end(video: Path) -> None:
+    """A box of length 0 runs to the end of the file; shorter than its own header it would never get on."""
+    content = video.read_bytes()
+    assert frames_of(video) == 9
+    changes: list[Callable[[], bytes]] = [
+        lambda claimed=claimed: content.replace(
+            content[content.index(b"moov") - 4 :][:4], struct.pack(">I", claimed), 1
+        )
+        for claimed in (1, 4, 7, 2**32 - 1)
+    ]
+    many = struct.pack(">I4s8s", 16, b"ftyp", b"isom\0\0\0\0") + struct.pack(">I4s", 8, b"free") * 100_001
+    for change in [*changes, lambda: many]:
+        video.write_bytes(change())
+        assert frames_of(video) in (9, "truncated_video", "unreadable")

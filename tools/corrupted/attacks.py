@@ -1,0 +1,227 @@
+"""Files that claim more than they hold: headers that ask for gigabytes, tables that unpack to them, loops without end.
+
+Each attack exchanges or changes one file of a small recording. Reading must end within the limits of the reader process: in
+a sound recording, or in a rejection whose code is true.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import struct
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+from pydantic import TypeAdapter
+
+from tools.corrupted import files
+from tools.corrupted.mutations import read_everything
+from worldline_core.data.guards.reader_process import ReaderLimits, read_limited
+from worldline_core.data.sources.hdf5 import require_h5py
+from worldline_core.data.sources.open import SourceConfig
+from worldline_core.errors import WorldLineError
+
+LIMITS = ReaderLimits(memory_gb=1.5, seconds=10)
+READ = "read"
+_LARGE = ("out_of_memory", "too_large", "unreadable")
+
+
+@dataclass(frozen=True)
+class Attack:
+    """A change of the first file of a layout that fits a pattern, and how reading may end."""
+
+    layout: str
+    pattern: str
+    name: str
+    change: Callable[[Path], None]
+    endings: tuple[str, ...]
+
+
+def _bytes_at(*edits: tuple[bytes, int, bytes]) -> Callable[[Path], None]:
+    """Writes values at offsets behind the first occurrences of marks."""
+
+    def change(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        for mark, offset, value in edits:
+            start = content.index(mark) + len(mark) + offset
+            content[start : start + len(value)] = value
+        path.write_bytes(bytes(content))
+
+    return change
+
+
+def _content(make: Callable[[], bytes]) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(make()) and None
+
+
+# --- HDF5 (version 1 of RoboMIND: encoded images of variable length)
+
+_IMAGES = "observations/rgb_images/camera_top"
+_JOINTS = "puppet/joint_position"
+
+
+def _entry(path: Path) -> int:
+    """Where the first entry of the images lies: length (4 bytes), address of its heap (8), number there (4)."""
+    with require_h5py().File(path) as file:
+        return file[_IMAGES].id.get_offset()
+
+
+def _long_entry(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, _entry(path), 4_000_000_000)
+    path.write_bytes(bytes(content))
+
+
+def _endless_heap(path: Path) -> None:
+    """The library walks on from an object of no length to itself."""
+    content = bytearray(path.read_bytes())
+    (heap,) = struct.unpack_from("<Q", content, _entry(path) + 4)
+    struct.pack_into("<HHIQ", content, heap + 16, 0, 0, 0, 0)
+    path.write_bytes(bytes(content))
+
+
+def _dataset(key: str, **settings: Any) -> Callable[[Path], None]:
+    def change(path: Path) -> None:
+        with require_h5py().File(path, "r+") as file:
+            del file[key]
+            dataset = file.create_dataset(key, **{name: v for name, v in settings.items() if name != "chunk"})
+            if "chunk" in settings:
+                for start in range(0, dataset.shape[0], dataset.chunks[0]):
+                    dataset.id.write_direct_chunk((start, 0), settings["chunk"])
+
+    return change
+
+
+def _zeros(megabytes: int) -> bytes:
+    """zlib's stream of zeros, each megabyte alike, so that one is compressed."""
+    stream = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+    block = stream.compress(b"\0" * (1 << 20)) + stream.flush(zlib.Z_FULL_FLUSH)
+    check = 1 + (megabytes * (1 << 20) % 65521 << 16)  # Adler-32 of zeros
+    return b"\x78\x9c" + block * megabytes + stream.flush() + struct.pack(">I", check)
+
+
+_SPARSE = {"shape": (10**9, 8), "chunks": (10**6, 8), "dtype": "f8"}
+_PACKED = {"shape": (400 << 20, 1), "chunks": (64 << 20, 1), "dtype": "i1", "compression": "gzip"}
+
+# --- Parquet
+
+
+def _rows(column: pa.Array, times: int = 1) -> Callable[[Path], None]:
+    def change(path: Path) -> None:
+        table = pa.table({"timestamp": column})
+        with pq.ParquetWriter(path, table.schema, compression="zstd", store_schema=False) as writer:
+            for _ in range(times):
+                writer.write_table(table)
+
+    return change
+
+
+def _repeated(value: pa.Array, rows: int) -> pa.Array:
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), value)
+
+
+# --- images
+
+
+def png_with(*chunks: tuple[bytes, bytes], size: tuple[int, int] = (96, 72), data: bytes | None = None) -> bytes:
+    """A black PNG with further chunks behind its header."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0))
+    body = chunk(b"IDAT", zlib.compress(b"\0" * (72 * (1 + 3 * 96))) if data is None else data)
+    return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunk(*each) for each in chunks) + body + chunk(b"IEND", b"")
+
+
+def jpeg_of_scans(count: int) -> bytes:
+    """A progressive JPEG whose last scan is repeated: each goes over all of the picture."""
+    stream = io.BytesIO()
+    Image.new("L", (6000, 6000)).save(stream, "JPEG", progressive=True)
+    sound = stream.getvalue()
+    last = sound.rindex(b"\xff\xda")
+    return sound[:last] + sound[last:-2] * count + sound[-2:]
+
+
+# --- videos
+
+
+def _tracks(path: Path) -> None:
+    """The one track is listed 3,000 times."""
+    content = path.read_bytes()
+    start, moov = content.index(b"trak") - 4, content.index(b"moov") - 4
+    length, size = (struct.unpack_from(">I", content, place)[0] for place in (start, moov))
+    head = content[:moov] + struct.pack(">I", size + length * 2999) + content[moov + 4 : start]
+    path.write_bytes(head + content[start : start + length] * 3000 + content[start + length :])
+
+
+def _random(defect: files.FileDefect) -> Callable[[Path], None]:
+    return lambda path: defect(path, np.random.default_rng(0))
+
+
+_MP4, _PNG = ("video_folder", "*.mp4"), ("agibot_gesim", "head_color/0.png")
+_H5, _TABLE, _NPY = ("robomind", "*.hdf5"), ("lerobot_v21", "data/*/*.parquet"), ("agibot_gesim", "actions.npy")
+_VIDEO = (READ, "truncated_video", "unreadable", "too_large", "wrong_fps", "out_of_memory")
+
+ATTACKS = (
+    Attack(*_H5, "an entry of 4 GB", _long_entry, _LARGE),
+    Attack(*_H5, "a heap without end", _endless_heap, ("out_of_time", "unreadable")),
+    Attack(*_H5, "10^9 rows that were never written", _dataset(_JOINTS, **_SPARSE), ("unreadable",)),
+    Attack(*_H5, "400 MB of int8 that become 3 GB of float64", _dataset(_JOINTS, chunk=_zeros(64), **_PACKED), _LARGE),
+    Attack(*_TABLE, "a text of 100 kB, 50,000 times", _rows(_repeated(pa.array(["x" * 100_000]), 50_000)), _LARGE),
+    Attack(*_TABLE, "a megabyte of fixed length, 6,400 times",
+           _rows(_repeated(pa.array([b"\0" * 1_000_000], pa.binary(1_000_000)), 64), 100), _LARGE),
+    Attack(*_TABLE, "3 * 10^8 equal rows", _rows(pa.array(np.zeros(10**7)), 30), _LARGE),
+    Attack(*_NPY, "10^12 rows", _bytes_at((b"'shape': (", 0, b"1000000000000, 16), }")), _LARGE),
+    Attack(*_NPY, "an array of objects", lambda path: np.save(path, np.array([print]), allow_pickle=True), ("unreadable",)),
+    Attack(*_PNG, "30,000 x 30,000 pixels", _content(lambda: png_with(size=(30_000, 30_000))), ("too_large",)),
+    Attack(*_PNG, "10^9 pictures", _content(lambda: png_with((b"acTL", struct.pack(">II", 10**9, 0)))), ("unreadable",)),
+    Attack(*_PNG, "a text of 200 MB", _content(lambda: png_with((b"zTXt", b"a\0\0" + _zeros(200)))), (READ, "unreadable")),
+    Attack(*_PNG, "data of 200 MB", _content(lambda: png_with(data=_zeros(200))), (READ, "unreadable")),
+    Attack(*_PNG, "5,000 scans", _content(lambda: jpeg_of_scans(5000)), ("too_large",)),
+    Attack(*_MP4, "30,000 x 30,000 pixels", _random(files.claim_pixels), _VIDEO),
+    Attack(*_MP4, "10^9 frames", _random(files.claim_frames), _VIDEO[1:]),
+    Attack(*_MP4, "10^9 frames of one size", _bytes_at((b"stsz", 4, struct.pack(">II", 1, 10**9))), _VIDEO),
+    Attack(*_MP4, "frames of 4 GB", _bytes_at((b"stsz", 4, b"\xff" * 4)), _VIDEO),
+    Attack(*_MP4, "3,000 tracks", _tracks, _VIDEO),
+    Attack(*_MP4, "4 billion times", _bytes_at((b"stts", 4, b"\xff" * 4)), _VIDEO),
+    Attack(*_MP4, "no time scale", _bytes_at((b"mdhd", 12, bytes(4))), _VIDEO),
+    Attack(*_MP4, "frames without duration", _bytes_at((b"stts", 12, bytes(4))), _VIDEO),
+    Attack(*_MP4, "4 billion edits", _bytes_at((b"elst", 4, b"\xff" * 4)), _VIDEO),
+    Attack(*_MP4, "an edit that begins nowhere", _bytes_at((b"elst", 12, b"\x7f\xff\xff\xff")), _VIDEO),
+    Attack(*_MP4, "4 billion chunks", _bytes_at((b"stco", 4, b"\xff" * 4)), _VIDEO),
+    Attack(*_MP4, "chunks beyond the end", _bytes_at((b"stco", 8, b"\xff" * 4)), _VIDEO),
+    Attack(*_MP4, "a description of nothing", _bytes_at((b"avcC", 5, bytes(8))), _VIDEO),
+    Attack(*_MP4, "a playlist", _content(lambda: b"#EXTM3U\n#EXTINF:1,\nfile:///etc/hostname\n#EXT-X-ENDLIST\n"),
+           ("unreadable",)),
+    Attack(*_MP4, "a list of files", _content(lambda: b"ffconcat version 1.0\nfile 'a.mp4'\n"), ("unreadable",)),
+)  # fmt: skip
+
+
+def ending(attack: Attack, source: dict[str, Any], folder: Path) -> str:
+    """Reads an attacked copy of a source at `folder`; the reason of the rejection, or `READ`."""
+    shutil.copytree(source["path"], folder)
+    attack.change(next(path for path in sorted(folder.rglob(attack.pattern))))
+    config = TypeAdapter(SourceConfig).validate_python({**source, "path": str(folder)})
+    try:
+        read_limited(LIMITS, read_everything, config, folder)
+    except WorldLineError as error:
+        return getattr(error, "reason", type(error).__name__)
+    finally:
+        shutil.rmtree(folder)
+    return READ
+
+
+def endings(sources: dict[str, dict[str, Any]], folder: Path) -> Iterator[tuple[Attack, str, float]]:
+    """How each attack ends, and after how many seconds."""
+    for attack in ATTACKS:
+        started = time.monotonic()
+        yield attack, ending(attack, sources[attack.layout], folder / "attacked"), time.monotonic() - started
