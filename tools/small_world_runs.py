@@ -57,7 +57,7 @@ class Timed(StrictModel):
                 betas=self.betas,
                 weight_decay=self.weight_decay,
                 warmup_steps=self.warmup,
-                decay_steps=round(self.decay * steps),
+                decay=self.decay,
             ),
             saving=SavingConfig(share=0.03),
         )

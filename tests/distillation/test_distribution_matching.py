@@ -7,12 +7,12 @@ import torch
 
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.distillation.distribution_matching import (
+    DistributionMatchingObjective,
     causal_score,
     distribution_gradient,
     distribution_matching_loss,
     fake_score_loss,
     full_clip_score,
-    is_student_iteration,
 )
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import KVCache
@@ -46,8 +46,8 @@ def rollout(model, clip, exit_step: int = 3, **options):
 
 
 def test_five_fake_score_updates_then_one_of_the_student() -> None:
-    kinds = [is_student_iteration(i) for i in range(12)]
-    assert kinds == ([False] * 5 + [True]) * 2
+    objective = DistributionMatchingObjective.__new__(DistributionMatchingObjective)
+    assert [objective.trained_group(i) for i in range(12)] == (["fake"] * 5 + ["student"]) * 2
 
 
 def test_the_student_target_lies_towards_the_real_score_and_away_from_the_fake(clip) -> None:

@@ -16,7 +16,7 @@ import pytest
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import Score, summarise, write_scores
-from worldline_core.pipeline.ablations import ablation_plan, matched_steps, tokens_a_step
+from worldline_core.pipeline.ablations import ablation_plan, matched_length, tokens_a_step
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.plan import Node
 from worldline_core.pipeline.steps import STEPS
@@ -90,7 +90,7 @@ def test_compute_is_matched_by_video_tokens() -> None:
     assert mixed.train_stage1 is not None
     assert tokens_a_step(mixed.train_stage1, 3) == 2 * 9  # two clips of 9 latent frames
     assert tokens_a_step(mixed.train_stage2, 3) == 2 * 7 * 2.5  # of 5 or 9; three views, or twice as many clips of one
-    assert matched_steps(mixed) == 100 + round(300 * 18 / 35)
+    assert matched_length(mixed) == f"steps={100 + round(300 * 18 / 35)}"
 
 
 @pytest.mark.parametrize("preset", ["demo", "tiny", "cosmos3-nano"])

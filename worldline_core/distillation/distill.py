@@ -95,7 +95,7 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
         "found": len(run.rows),
         "kept": kept,
         "left_out": {"in other splits": len(run.rows) - kept},
-        "steps": {name: getattr(config, name).trainer.steps for name in STEPS},
+        "steps": {name: read_checkpoint_info(run.folder(name)).metadata["step"] for name in STEPS},
         "lpips": run.lpips,
         "episodes": kept,
         **metrics,
@@ -178,7 +178,7 @@ class DistillationRun:
         sampler = self._sampler(settings.trainer.batch_size, settings.trainer.seed, clips, plan)
         teacher = self._model(self.stage2, settings.trainer)[0] if settings.teacher_share else None
         objective = TeacherForcingObjective(model.train(), self.config, teacher)
-        stop = settings.trainer.steps * plan.accumulation
+        stop = settings.trainer.steps and settings.trainer.steps * plan.accumulation
         load = self.loader.batches(sampler, self.config.input, self._work(STEPS[0]), stop)
         return self._train(STEPS[0], settings.trainer, objective, load, info)
 
@@ -315,7 +315,7 @@ class DistillationRun:
                 trained=self._trained(model.config.views),
                 metadata={
                     "distillation": step,
-                    "step": trainer.steps,
+                    "step": result.steps,
                     "seed": trainer.seed,
                     "start": {"kind": parent.kind, "weights_sha256": parent.weights_sha256},
                     "tokenizer": self.store.description["tokenizer"],

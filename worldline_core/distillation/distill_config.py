@@ -130,12 +130,7 @@ class DistributionMatchingConfig(StrictModel):
     auxiliary: AuxiliaryWeights = AuxiliaryWeights()
 
     @model_validator(mode="after")
-    def _whole_cycles(self) -> Self:
-        if self.trainer.steps % CYCLE or self.trainer.log_every % CYCLE:
-            raise ValueError(
-                f"steps ({self.trainer.steps}) and log_every ({self.trainer.log_every}) must be multiples of {CYCLE}: "
-                "one student update and five fake-score updates make one cycle"
-            )
+    def _rising_range(self) -> Self:
         if not 0 < self.sigma_range[0] < self.sigma_range[1] <= 1:
             raise ValueError(f"sigma_range {self.sigma_range} must rise within (0, 1]")
         return self

@@ -44,9 +44,7 @@ Score = Callable[[Tensor, Tensor, Tensor], Tensor]
 class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
     """Step 3: five updates of the fake score, then one of the student, in one training loop.
 
-    An iteration gives gradients to one of the two models only; the optimiser leaves the other as it is. Every iteration
-    reports all metrics, zero for those of the other model and scaled by the share of the iterations that measure them,
-    so that a mean over whole cycles is the mean over these.
+    An iteration trains one of the two models, and reports the metrics of that one.
     """
 
     def __init__(
@@ -66,9 +64,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
     def loss(self, batch: TrajectoryBatch, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """The student's loss in one iteration of six, the fake score's in the others."""
         maps = maps_of(batch)
-        student_turn = is_student_iteration(step)
-        enabled = enabled_terms(self.settings.auxiliary, perceptual=self.perceptual is not None)
-        names = ("distribution_matching", *enabled)
+        student_turn = self.trained_group(step) == "student"
         noise = torch.randn(batch.latents.shape, generator=generator, device=batch.latents.device)
         if self.settings.target == "teacher":
             # The teacher's trajectory started from this noise: its clean end is what this rollout should become.
@@ -81,7 +77,7 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
             loss = fake_score_loss(
                 fake, generated, fresh, sigma, block_size=self.spec.block_size, weighting=self.settings.weighting
             )
-            return loss, {**dict.fromkeys(names, 0.0), "fake_score": loss.item() * CYCLE / (CYCLE - 1)}
+            return loss, {"fake_score": loss.item()}
         gradient = distribution_gradient(
             self.score(self.real, batch, maps), fake, generated, fresh, sigma, self.spec.block_size
         )
@@ -98,8 +94,13 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
             weights=self.settings.auxiliary,
             perceptual=self.perceptual,
         )
-        values = {"distribution_matching": matching, **values}
-        return matching + auxiliary, {name: values[name].item() * CYCLE for name in names} | {"fake_score": 0.0}
+        enabled = enabled_terms(self.settings.auxiliary, perceptual=self.perceptual is not None)
+        measured = {"distribution_matching": matching, **{name: values[name] for name in enabled}}
+        return matching + auxiliary, {name: value.item() for name, value in measured.items()}
+
+    def trained_group(self, step: int) -> str:
+        """The student in one iteration of six, the last, so that the fake score knows it before it is first asked."""
+        return "student" if step % CYCLE == CYCLE - 1 else "fake"
 
     def exit_step(self, step: int) -> int:
         """Exit step of this iteration: random, and the same on every process (it does not depend on the rank)."""
@@ -118,11 +119,6 @@ class DistributionMatchingObjective(CausalObjective[TrajectoryBatch]):
         """The velocity field of a score model, in the form it was trained in."""
         form = full_clip_score if self.settings.real_score == "stage2" else causal_score
         return form(model, maps, views=batch.views, fps=batch.fps, spec=self.config.training_spec)
-
-
-def is_student_iteration(iteration: int) -> bool:
-    """One in six; the last of each cycle, so that the fake score knows the student before it is first asked."""
-    return iteration % CYCLE == CYCLE - 1
 
 
 def causal_score(

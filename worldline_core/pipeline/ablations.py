@@ -64,7 +64,7 @@ def variant_config(
     # Its rollouts are not rows of the table, and a variant may train no Stage I.
     changes += [f"rollouts.{name}=null" for name, run in load([]).rollouts.items() if run.checkpoint == "stage1"]
     if variant.matched_compute:
-        changes.append(f"train_stage2.trainer.steps={matched_steps(full)}")
+        changes.append(f"train_stage2.trainer.{matched_length(full)}")
     rollouts = {
         name: run.model_copy(update={"config": _changed(_settings(run), variant)})
         for name, run in full.rollouts.items()
@@ -72,19 +72,26 @@ def variant_config(
     return load(changes).model_copy(update={"rollouts": rollouts})
 
 
-def matched_steps(config: PipelineConfig) -> int:
-    """Steps of a Stage II without a Stage I before it that cost what both stages of ``config`` do.
+def matched_length(config: PipelineConfig) -> str:
+    """Length ("steps=7", "minutes=3") of a Stage II without a Stage I before it that costs what both of ``config`` do.
 
     A step's cost is counted in video tokens, which the linear layers' FLOPs are proportional to. Attention over three views
     costs more than that, so the variant gets no less than the full model: what it loses is not for want of compute.
     """
     stage1, stage2 = config.train_stage1, config.train_stage2
+    lengths = [(stage.trainer.steps, stage.trainer.minutes) for stage in (stage1, stage2) if stage is not None]
+    steps, minutes = ([length for length in kind if length is not None] for kind in zip(*lengths, strict=True))
+    if steps and minutes:
+        raise ConfigError(
+            "The compute of steps and of minutes cannot be matched", where="train_stage1.trainer, train_stage2.trainer",
+            expected="steps of both, or minutes of both",
+        )  # fmt: skip
+    if minutes:
+        return f"minutes={sum(minutes)}"
     if stage1 is None:
-        return stage2.trainer.steps
+        return f"steps={steps[-1]}"
     views = len(stage1.model.views)
-    return stage2.trainer.steps + round(
-        stage1.trainer.steps * tokens_a_step(stage1, views) / tokens_a_step(stage2, views)
-    )
+    return f"steps={steps[-1] + round(steps[0] * tokens_a_step(stage1, views) / tokens_a_step(stage2, views))}"
 
 
 def tokens_a_step(stage: StageConfig, views: int) -> float:

@@ -147,7 +147,7 @@ class Planner:
             need.trained,
             need.parts,
             seconds,
-            trainer.steps * seconds / 3600,
+            trainer.minutes / 60 if trainer.minutes else (trainer.steps or 0) * seconds / 3600,
             fits,
             "" if fits else fitting_setting(estimate, spread, machine.memory, clips.lengths),
             facts,

@@ -23,6 +23,7 @@ from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.processes import any_process
 from worldline_core.training.relational import RelationalTerm
+from worldline_core.training.trainer import Objective
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 
@@ -109,7 +110,7 @@ def flow_matching_loss(
     return (error * noisy).sum() / (noisy.sum().clamp_min(1) * per_frame_values)
 
 
-class FlowMatchingObjective:
+class FlowMatchingObjective(Objective[Batch]):
     """Flow matching on clips. The batch decides what conditions the model: text, action maps, or neither."""
 
     def __init__(

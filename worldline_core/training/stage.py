@@ -128,7 +128,7 @@ class Stage:
             ArtifactError: a saved state is damaged or belongs to another run.
         """
         config, trainer = self.config, self.config.trainer
-        stop = trainer.steps * self.plan.accumulation
+        stop = trainer.steps and trainer.steps * self.plan.accumulation
         return train(
             trainer,
             groups=groups,
@@ -167,7 +167,7 @@ class Stage:
                 action_contract=action_contract,
                 trained=self.sampler.trained(self.model.config.views) if kind == "stage2" else None,
                 metadata={
-                    "step": trainer.steps,
+                    "step": result.steps,
                     "seed": trainer.seed,
                     "tokenizer": self.source.description["tokenizer"],
                     "episodes": len(self.training_rows),
@@ -178,10 +178,10 @@ class Stage:
                 },
                 state_dict=weights,
             )
-        clips = trainer.steps * trainer.batch_size * self.plan.per_step
+        clips = result.steps * trainer.batch_size * self.plan.per_step
         found, fit, kept = len(self.episodes), len(self.rows), len(self.training_rows)
         left_out = {"in other splits": fit - kept, "not fit for this stage, or without latents or tracks": found - fit}
-        return {"steps": trainer.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
+        return {"steps": result.steps, "clips": clips, "found": found, "kept": kept, "left_out": left_out}
 
 
 def input_facts(reading: ClipInput, source: ClipSource, *runs: Path) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from worldline_core.training.training_config import OptimizerConfig, TrainerConf
 from worldline_core.training.training_state import (
     ExponentialAverage,
     MetricsLog,
+    RunningMeans,
     TrainingStates,
     identity_digests,
     nan_to_null,
@@ -63,11 +64,16 @@ class NamedBatch(Protocol):
 
 
 class Objective[BatchT: NamedBatch](Protocol):
-    """What a training minimises. Objectives without a state of their own inherit what follows `loss`."""
+    """What a training minimises. Objectives that train all groups at once, without a state, inherit what follows `loss`."""
 
     def loss(self, batch: BatchT, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss of one micro-batch, and values to log beside it."""
         ...
+
+    def trained_group(self, step: int) -> str | None:
+        """The parameter group that ``step`` trains, where groups take turns; None: all of them."""
+        del step
+        return None
 
     def end_step(self, values: Mapping[str, float]) -> None:
         """Take note of a step's mean values over its micro-steps and all processes."""
@@ -84,17 +90,17 @@ class Objective[BatchT: NamedBatch](Protocol):
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Averaged weights of the trained parameters, and the last metrics."""
+    """Averaged weights of the trained parameters, the last metrics, and the steps taken."""
 
     average: dict[str, Tensor]
     metrics: dict[str, float]
+    steps: int
 
 
-def learning_rate_factor(config: OptimizerConfig, step: int, steps: int) -> float:
-    """Factor on the base rate at ``step`` (0-based) of ``steps``."""
+def learning_rate_factor(config: OptimizerConfig, step: int, fraction: float) -> float:
+    """Factor on the base rate at ``step`` (0-based), before which ``fraction`` of the run was done."""
     warmup = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
-    decay = min(1.0, (steps - step) / config.decay_steps) if config.decay_steps else 1.0
-    return warmup * decay
+    return warmup * (min(1.0, (1 - fraction) / config.decay) if config.decay else 1.0)
 
 
 def step_generator(seed: int, index: int, device: str) -> torch.Generator:
@@ -117,14 +123,12 @@ def held_out_losses[BatchT](
     seed: int,
 ) -> dict[str, float]:
     """Mean of ``losses`` over the first ``validation_batches`` that ``load`` gives, each time with the same noise."""
-    totals: dict[str, float] = {}
+    means = RunningMeans()
     for index in range(config.validation_batches):
         batch = load(index)
         with autocast(config):
-            values = losses(batch, step_generator(seed, index, config.device))
-        for key, value in values.items():
-            totals[key] = totals.get(key, 0.0) + value / config.validation_batches
-    return totals
+            means.add(losses(batch, step_generator(seed, index, config.device)))
+    return means.values()
 
 
 def batch_plan(config: TrainerConfig, output: Path) -> BatchPlan:
@@ -144,7 +148,7 @@ def batch_plan(config: TrainerConfig, output: Path) -> BatchPlan:
 
 @contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Whether a scheduler has asked to stop (SIGTERM), within the context; only the main thread can be told."""
+    """A function that tells whether a scheduler has asked to stop (SIGTERM); outside of the main thread never."""
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
@@ -154,50 +158,6 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(received)
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def keep_batch(output: Path, batch: object, **facts: int) -> Path:
-    """Keep a batch whose loss is not finite, so that it can be looked at and tried again.
-
-    Args:
-        facts: step, number of the micro-batch and seed: they decide its noise (`step_generator`).
-    """
-    path = output / "run" / "replay" / f"step-{facts['step']:09d}-micro-batch-{facts['micro_batch']}.safetensors"
-    tensors = {name: value.cpu().contiguous() for name, value in vars(batch).items() if isinstance(value, Tensor)}
-    others = {name: str(value) for name, value in vars(batch).items() if name not in tensors}
-    write_bytes_atomic(path, save(tensors, metadata={"facts": json.dumps({**facts, **others})}))
-    return path
-
-
-def require_finite(scores: Mapping[str, float], states: TrainingStates, where: str) -> None:
-    """Refuse held-out losses that are not finite.
-
-    Raises:
-        TrainingError: one is not.
-    """
-    bad = {name: value for name, value in scores.items() if not math.isfinite(value)}
-    if bad:
-        raise TrainingError(
-            "A held-out loss is not finite.",
-            where=f"{where}, {', '.join(bad)}",
-            expected="finite numbers of the averaged weights",
-            got=bad,
-            next_step=f"look at the held-out clips, or lower the learning rate; {states.last_good()}",
-        )
-
-
-@dataclass(frozen=True)
-class _Run[BatchT: NamedBatch]:  # what every step needs
-    config: TrainerConfig
-    objective: Objective[BatchT]
-    load: Callable[[int], BatchT]
-    optimizer: torch.optim.Optimizer
-    parameters: Mapping[str, nn.Parameter]
-    models: Sequence[nn.Module]
-    plan: BatchPlan
-    states: TrainingStates
-    title: str
-    output: Path
 
 
 def train[BatchT: NamedBatch](
@@ -213,9 +173,11 @@ def train[BatchT: NamedBatch](
     schedule: Callable[[int], float] | None = None,
     models: Sequence[nn.Module] = (),
 ) -> TrainingResult:
-    """Train until ``config.steps``; called again with the same ``output``, it continues from the last saved state.
+    """Train for ``config.steps`` or ``config.minutes``; called again with the same ``output``, it continues from the last
+    saved state, with the steps or the time that are left.
 
-    On a CPU the result does not depend on where it was interrupted; with other processes sums have another order.
+    On a CPU the result of so many steps does not depend on where it was interrupted; with other processes sums have another
+    order. Minutes count the steps alone, not validation.
 
     Args:
         load: number of this process's micro-step to batch (a pure function; `BatchPlan` says which clips it has).
@@ -230,66 +192,58 @@ def train[BatchT: NamedBatch](
         ArtifactError: if a saved state is damaged or belongs to another run.
         StoppedError: the run was asked to stop (SIGTERM); its state is saved.
     """
-    parameters = {f"{group.name}/{name}": value for group in groups for name, value in group.parameters.items()}
-    if not parameters:
+    if not any(group.parameters for group in groups):
         raise ConfigError("There is nothing to train.", where=title, expected="at least one trainable parameter")
-    settings = config.optimizer
-    optimizer = torch.optim.AdamW(
-        [{"params": list(group.parameters.values())} for group in groups],
-        lr=settings.learning_rate,
-        betas=settings.betas,
-        weight_decay=settings.weight_decay,
-        fused=True,
-    )
-    wanted = [f"{group.name}/{name}" for group in groups if group.averaged for name in group.parameters]
-    average = ExponentialAverage({name: parameters[name] for name in wanted}, config.ema_decay)
-    states = TrainingStates(output, config.saving, parameters, average, optimizer)
-    plan = batch_plan(config, output)
-    run = _Run(config, objective, load, optimizer, parameters, models, plan, states, title, output)
+    run = _Run(config, groups, objective, load, models, output, title)
+    settings, states, average = config.optimizer, run.states, run.average
     digests = identity_digests(identity)
-    first, sums, count, last, best = 0, dict[str, float](), 0, dict[str, float](), math.inf
+    done, seconds, best = 0, 0.0, math.inf
+    means, last = RunningMeans(), dict[str, float]()
     if (facts := states.load(digests)) is not None:
-        first, sums, count, last = facts["step"], null_to_nan(facts["sums"]), facts["count"], null_to_nan(facts["last"])
+        done, seconds, last = facts["step"], facts["seconds"], null_to_nan(facts["last"])
+        means, average.updates = RunningMeans(facts["means"]), facts["updates"]
         best = math.inf if facts["best"] is None else facts["best"]
         objective.load_state(facts["objective"])
     rank, world_size = processes()
-    log = MetricsLog(output / "metrics.jsonl", first) if rank == 0 else None
-    timings = MetricsLog(output / "run" / "timings.jsonl", first) if rank == 0 else None
-    started = saved_at = time.monotonic()
+    log = MetricsLog(output / "metrics.jsonl", done) if rank == 0 else None
+    timings = MetricsLog(output / "run" / "timings.jsonl", done) if rank == 0 else None
+    began = saved_at = time.monotonic()
     seen = 0
-    progress = Progress(title, config.steps, "step", done=first, shown=rank == 0)
+    length = config.steps or round(60 * (config.minutes or 0))
+    progress = Progress(title, length, "step" if config.steps else "second", done=done, shown=rank == 0)
     with progress, stop_requests() as stop_requested, reporting_lost_processes(title), states:
-        for step in range(first, config.steps):
-            factor = schedule(step) if schedule else learning_rate_factor(settings, step, config.steps)
-            for slot, group in zip(optimizer.param_groups, groups, strict=True):
+        while (fraction := config.fraction(done, seconds)) < 1:
+            factor = schedule(done) if schedule else learning_rate_factor(settings, done, fraction)
+            for slot, group in zip(run.optimizer.param_groups, groups, strict=True):
                 slot["lr"] = settings.learning_rate * group.multiplier * factor
-            values, size = _step(run, step)
-            average.update(step)
+            step_began = time.monotonic()
+            values, size = run.step(done)
+            if config.minutes:  # clocks differ from process to process
+                seconds += average_values({"seconds": time.monotonic() - step_began})["seconds"]
+            means.add(values)
+            done += 1
             seen += size * world_size
-            sums = {key: sums.get(key, 0.0) + value for key, value in values.items()}
-            count += 1
-            done = step + 1
-            if done % config.log_every == 0 or done == config.steps:
-                last = {key: value / count for key, value in sums.items()}
-                sums, count = {}, 0
-                row = {"step": done, "learning_rate": settings.learning_rate * factor, **last}
-                seconds = time.monotonic() - started
+            ended = config.fraction(done, seconds) >= 1
+            if done % config.log_every == 0 or ended:
+                current, means = means.values(), RunningMeans()
+                last = {**last, **current}
+                elapsed = time.monotonic() - began
                 if log is not None and timings is not None:
-                    log.add(row)
-                    timings.add({"step": done, "seconds": seconds, "clips_per_second": seen / seconds})
-            due = config.validate_every and done % config.validate_every == 0
+                    log.add({"step": done, "learning_rate": settings.learning_rate * factor, **current})
+                    timings.add({"step": done, "seconds": elapsed, "clips_per_second": seen / elapsed})
             score = math.inf
-            if validate is not None and (due or done == config.steps):
+            if validate is not None and (ended or (config.validate_every and done % config.validate_every == 0)):
                 with average.swapped(), torch.no_grad():
                     scores = average_values({f"validation/{key}": value for key, value in validate().items()})
                 if log is not None:
                     log.add({"step": done, **scores})
-                require_finite(scores, states, f"{title}, step {done}")
+                run.require_finite_scores(scores, done)
                 last = {**last, **scores}
                 score = scores.get(f"validation/{config.saving.best}", math.inf)
-            progress.advance(clips=size * world_size, loss=last.get("loss", values["loss"]))
+            advanced = 1 if config.steps else round(min(seconds, length)) - progress.done
+            progress.advance(advanced, clips=size * world_size, loss=last.get("loss", values["loss"]))
             better, best = score < best, min(best, score)
-            # Clocks and signals differ from process to process: what one decides, all do.
+            # Signals, too, differ from process to process: what one decides, all do.
             failure = states.collect()
             pause = max(config.save_every_seconds, states.seconds / config.saving.share)
             late = rank == 0 and not states.busy and time.monotonic() - saved_at >= pause
@@ -297,69 +251,130 @@ def train[BatchT: NamedBatch](
             if asked["failed"]:
                 raise states.failed(failure)
             by_steps = config.save_every_steps and done % config.save_every_steps == 0
-            if by_steps or better or asked["save"] or asked["stop"] or done == config.steps:
+            if by_steps or better or asked["save"] or asked["stop"] or ended:
                 saved_at = time.monotonic()
                 states.save(
                     {
                         "step": done,
+                        "seconds": seconds,
                         "identity": digests,
-                        "micro_batches": plan.per_step,
-                        "drawn_together": plan.together,
-                        "count": count,
+                        "micro_batches": run.plan.per_step,
+                        "drawn_together": run.plan.together,
+                        "updates": average.updates,
                         "objective": objective.state(),
                         **nan_to_null({"score": score, "best": best}),
-                        "sums": nan_to_null(sums),
+                        "means": means.state(),
                         "last": nan_to_null(last),
                     }
                 )
-            if asked["stop"] and done < config.steps:
+            if asked["stop"] and not ended:
                 raise StoppedError(
                     "The training was asked to stop.",
-                    where=f"{title}, after step {done} of {config.steps}",
+                    where=f"{title}, after step {done}, {100 * config.fraction(done, seconds):.3g} % of the run",
                     next_step=f"the same command continues from the state in {states.folder}",
                 )
     names = [name for group in groups if group.averaged for name in group.parameters]
-    return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last)
+    return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last, done)
 
 
-def _step[BatchT: NamedBatch](run: _Run[BatchT], step: int) -> tuple[dict[str, float], int]:
-    """One optimiser step: mean metrics of its micro-steps over all processes, examples of this process."""
-    config, plan = run.config, run.plan
-    run.optimizer.zero_grad(set_to_none=True)
-    totals: dict[str, float] = {}
-    size, saved = 0, ""
-    for part in range(plan.accumulation):
-        index = step * plan.accumulation + part
-        batch = run.load(index)
-        size += len(batch.names)
-        generator = step_generator(config.seed, plan.number(index), config.device)
-        reduce_gradients(run.models, now=config.sharding.reduce_every_micro_step or part + 1 == plan.accumulation)
-        with autocast(config):
-            loss, values = run.objective.loss(batch, generator, step)
-        if not saved and not math.isfinite(loss.item()):
-            kept = keep_batch(run.output, batch, step=step, micro_batch=plan.number(index), seed=config.seed)
-            saved = f"clips {', '.join(batch.names)} (the batch is kept in {kept})"
-        (loss / plan.accumulation).backward()
-        for key, value in {"loss": loss.item(), **values}.items():
-            totals[key] = totals.get(key, 0.0) + value / plan.accumulation
-    totals = average_values(totals)
-    if not math.isfinite(totals["loss"]):
-        raise TrainingError(
-            "The loss is not finite.",
-            where=f"{run.title}, step {step}, {saved or 'clips of another process, which names them'}",
-            expected="a finite loss",
-            got=totals["loss"],
-            next_step=f"lower the learning rate, or look at these clips; {run.states.last_good()}",
+class _Run[BatchT: NamedBatch]:
+    """The parts of a run, and its optimiser step."""
+
+    def __init__(
+        self,
+        config: TrainerConfig,
+        groups: Sequence[ParameterGroup],
+        objective: Objective[BatchT],
+        load: Callable[[int], BatchT],
+        models: Sequence[nn.Module],
+        output: Path,
+        title: str,
+    ) -> None:
+        self.config, self.groups, self.objective, self.load = config, groups, objective, load
+        self.models, self.output, self.title = models, output, title
+        self.plan = batch_plan(config, output)
+        settings = config.optimizer
+        self.optimizer = torch.optim.AdamW(
+            [{"params": list(group.parameters.values())} for group in groups],
+            lr=settings.learning_rate,
+            betas=settings.betas,
+            weight_decay=settings.weight_decay,
+            fused=True,
         )
-    norm = nn.utils.clip_grad_norm_(run.parameters.values(), config.optimizer.clip_norm)
-    totals["gradient_norm"] = float(whole(norm))
-    if not math.isfinite(totals["gradient_norm"]):
-        raise TrainingError(
-            "The gradient is not finite.",
-            where=f"{run.title}, step {step}",
-            got=totals["gradient_norm"],
-            next_step=f"lower the learning rate or the clipping norm; {run.states.last_good()}",
+        named = {group.name: {f"{group.name}/{key}": p for key, p in group.parameters.items()} for group in groups}
+        averaged = {key: p for group in groups if group.averaged for key, p in named[group.name].items()}
+        self.average = ExponentialAverage(averaged, config.ema_decay)
+        parameters = {key: p for group in named.values() for key, p in group.items()}
+        self.states = TrainingStates(output, config.saving, parameters, self.average, self.optimizer)
+
+    def step(self, step: int) -> tuple[dict[str, float], int]:
+        """One optimiser step: mean metrics of its micro-steps over all processes, examples of this process."""
+        config, plan = self.config, self.plan
+        trained = self.objective.trained_group(step)
+        turn = [group for group in self.groups if trained in (None, group.name)]
+        self.optimizer.zero_grad(set_to_none=True)
+        totals: dict[str, float] = {}
+        size, kept = 0, ""
+        for part in range(plan.accumulation):
+            index = step * plan.accumulation + part
+            batch = self.load(index)
+            size += len(batch.names)
+            generator = step_generator(config.seed, plan.number(index), config.device)
+            reduce_gradients(self.models, now=config.sharding.reduce_every_micro_step or part + 1 == plan.accumulation)
+            with autocast(config):
+                loss, values = self.objective.loss(batch, generator, step)
+            if not kept and not math.isfinite(loss.item()):
+                path = keep_batch(self.output, batch, step=step, micro_batch=plan.number(index), seed=config.seed)
+                kept = f"clips {', '.join(batch.names)} (the batch is kept in {path})"
+            (loss / plan.accumulation).backward()
+            for key, value in {"loss": loss.item(), **values}.items():
+                totals[key] = totals.get(key, 0.0) + value / plan.accumulation
+        totals = average_values(totals)
+        if not math.isfinite(totals["loss"]):
+            raise TrainingError(
+                "The loss is not finite.",
+                where=f"{self.title}, step {step}, {kept or 'clips of another process, which names them'}",
+                expected="a finite loss",
+                got=totals["loss"],
+                next_step=f"lower the learning rate, or look at these clips; {self.states.last_good()}",
+            )
+        norm = nn.utils.clip_grad_norm_(
+            [parameter for group in turn for parameter in group.parameters.values()], config.optimizer.clip_norm
         )
-    run.optimizer.step()
-    run.objective.end_step(totals)
-    return totals, size
+        totals["gradient_norm"] = float(whole(norm))
+        if not math.isfinite(totals["gradient_norm"]):
+            raise TrainingError(
+                "The gradient is not finite.",
+                where=f"{self.title}, step {step}",
+                got=totals["gradient_norm"],
+                next_step=f"lower the learning rate or the clipping norm; {self.states.last_good()}",
+            )
+        self.optimizer.step()  # leaves parameters without a gradient as they are
+        if any(group.averaged for group in turn):
+            self.average.update()
+        self.objective.end_step(totals)
+        return totals, size
+
+    def require_finite_scores(self, scores: Mapping[str, float], done: int) -> None:
+        bad = {name: value for name, value in scores.items() if not math.isfinite(value)}
+        if bad:
+            raise TrainingError(
+                "A held-out loss is not finite.",
+                where=f"{self.title}, step {done}, {', '.join(bad)}",
+                expected="finite numbers of the averaged weights",
+                got=bad,
+                next_step=f"look at the held-out clips, or lower the learning rate; {self.states.last_good()}",
+            )
+
+
+def keep_batch(output: Path, batch: object, **facts: int) -> Path:
+    """Keep a batch whose loss is not finite, so that it can be looked at and tried again.
+
+    Args:
+        facts: step, number of the micro-batch and seed: they decide its noise (`step_generator`).
+    """
+    path = output / "run" / "replay" / f"step-{facts['step']:09d}-micro-batch-{facts['micro_batch']}.safetensors"
+    tensors = {name: value.cpu().contiguous() for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    others = {name: str(value) for name, value in vars(batch).items() if name not in tensors}
+    write_bytes_atomic(path, save(tensors, metadata={"facts": json.dumps({**facts, **others})}))
+    return path

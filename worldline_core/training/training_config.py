@@ -81,25 +81,27 @@ class SavingConfig(StrictModel):
 
 
 class OptimizerConfig(StrictModel):
-    """AdamW with linear warm-up, a plateau, and an optional linear decay over the last ``decay_steps``."""
+    """AdamW with linear warm-up, a plateau, and a linear decay to 0 over the last share ``decay`` of the run."""
 
     learning_rate: float = Field(default=1e-3, gt=0)
     betas: tuple[float, float] = (0.9, 0.95)
     weight_decay: float = Field(default=1e-6, ge=0)
     warmup_steps: int = Field(default=100, ge=0)
-    decay_steps: int = Field(default=0, ge=0)
+    decay: float = Field(default=0.0, ge=0, le=1)
     clip_norm: float = Field(default=1.0, gt=0)
 
 
 class TrainerConfig(StrictModel):
     """Length, batch and bookkeeping of a run.
 
+    ``steps`` or ``minutes``: how long it trains; minutes are of its steps, without validation.
     ``batch_size`` counts examples per device and micro-step, ``accumulation`` micro-steps per device and step.
     ``global_batch`` fixes the examples of a step over all devices instead: how many micro-steps each takes follows from
     it, and the run learns the same on 8 or 64 devices.
     """
 
-    steps: int = Field(ge=1)
+    steps: int | None = Field(default=None, ge=1)
+    minutes: float | None = Field(default=None, gt=0)
     batch_size: int = Field(default=8, ge=1)
     accumulation: int = Field(default=1, ge=1)
     seed: int = Field(default=0, ge=0)
@@ -117,12 +119,18 @@ class TrainerConfig(StrictModel):
     saving: SavingConfig = SavingConfig()
 
     @model_validator(mode="after")
-    def _whole_micro_batches(self) -> Self:
+    def _one_length_and_whole_micro_batches(self) -> Self:
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("give steps or minutes, one of the two")
         if self.global_batch is not None and self.global_batch % self.batch_size:
             raise ValueError(f"global_batch ({self.global_batch}) must be a multiple of batch_size ({self.batch_size})")
         if self.global_batch is not None and self.accumulation != 1:
             raise ValueError("accumulation follows from global_batch and the number of processes: give one of the two")
         return self
+
+    def fraction(self, step: int, seconds: float) -> float:
+        """Share of the run that is done after so many steps, which took so many seconds."""
+        return step / self.steps if self.steps else seconds / (60 * (self.minutes or 1))
 
 
 class RelationalConfig(StrictModel):
@@ -219,7 +227,7 @@ class TeacherConfig(StrictModel):
 
     shape: SmallTeacherShape = SmallTeacherShape()
     trainer: TrainerConfig = TrainerConfig(
-        steps=600, batch_size=12, ema_decay=0.99, optimizer=OptimizerConfig(learning_rate=1e-3, decay_steps=200)
+        steps=600, batch_size=12, ema_decay=0.99, optimizer=OptimizerConfig(learning_rate=1e-3, decay=1 / 3)
     )
     splits: tuple[str, ...] = ("train",)
     max_episodes: int = Field(default=120, ge=2)

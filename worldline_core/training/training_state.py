@@ -50,6 +50,33 @@ def null_to_nan(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: math.nan if value is None else value for name, value in values.items()}
 
 
+class RunningMeans:
+    """Means of named values, each over the times that it was added.
+
+    Args:
+        state: what `state` returned.
+    """
+
+    def __init__(self, state: Mapping[str, tuple[float | None, int]] | None = None) -> None:
+        self._totals = {
+            name: (math.nan if total is None else total, count) for name, (total, count) in (state or {}).items()
+        }
+
+    def add(self, values: Mapping[str, float]) -> None:
+        """Take in one value of each name."""
+        for name, value in values.items():
+            total, count = self._totals.get(name, (0.0, 0))
+            self._totals[name] = (total + value, count + 1)
+
+    def values(self) -> dict[str, float]:
+        """The mean of every name."""
+        return {name: total / count for name, (total, count) in self._totals.items()}
+
+    def state(self) -> dict[str, tuple[float | None, int]]:
+        """JSON values to continue from."""
+        return {name: (total if math.isfinite(total) else None, count) for name, (total, count) in self._totals.items()}
+
+
 class MetricsLog:
     """JSON lines, each with a ``step``; lines later than the resumed step are dropped: they will be written again."""
 
@@ -78,16 +105,8 @@ def newest_state(output: Path) -> dict[str, Any] | None:
     """Facts of the newest whole state below ``output``, with its ``folder``; None where there is none.
 
     Raises:
-        ArtifactError: its description is damaged, or it was written by an earlier version.
+        ArtifactError: its description is damaged.
     """
-    old = output / STATES / "state.safetensors"
-    if old.is_file():
-        raise ArtifactError(
-            "The training state is of an earlier version.",
-            where=old,
-            expected=f"folders step-<N> with {INDEX}",
-            next_step="delete it to start this run again, or finish the run with the version that began it",
-        )
     whole = sorted((output / STATES).glob(f"step-*/{INDEX}"))
     if not whole:
         return None
@@ -110,19 +129,21 @@ def _damaged(where: Path, got: object) -> ArtifactError:
 class ExponentialAverage:
     """Exponential moving average of named parameters; shipped checkpoints hold it. Sharded where they are.
 
-    The decay rises with the number of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
+    The decay rises with the number n of updates, ``min(decay, (1 + n) / (10 + n))``, so that the random start is
     forgotten also in short runs.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
         self.parameters = dict(parameters)
         self.decay = decay
+        self.updates = 0
         self.average = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
 
     @torch.no_grad()
-    def update(self, updates: int) -> None:
-        """Take in the current weights; ``updates`` counts earlier updates."""
-        decay = min(self.decay, (1 + updates) / (10 + updates))
+    def update(self) -> None:
+        """Take in the current weights."""
+        decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
+        self.updates += 1
         for name, parameter in self.parameters.items():
             own_part(self.average[name]).lerp_(own_part(parameter), 1 - decay)
 

@@ -344,7 +344,7 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
             "shape": config.shape.model_dump(mode="json"),
             "training": "masked video prediction",
             "episodes": len(chosen),
-            "steps": config.trainer.steps,
+            "steps": result.steps,
             "seed": config.trainer.seed,
             "metrics": result.metrics,
         },
@@ -361,7 +361,7 @@ def train_teacher(config: TeacherConfig, inputs: Mapping[str, Path], output: Pat
         "kept": len(chosen),
         "left_out": left_out,
         "episodes": len(chosen),
-        "steps": config.trainer.steps,
+        "steps": result.steps,
         "parameters": parameters,
         **result.metrics,
     }
