@@ -13,7 +13,7 @@ from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.render_actions import KinematicsByName
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.evaluation.video.tool_paths import (
+from worldline_core.evaluation.video.metrics_on_request import (
     ControlledPair,
     ToolFinder,
     action_following,

@@ -1,11 +1,8 @@
 """The step evaluate_video: full-frame metrics and robot-mask IoU of predicted videos.
 
-Two robot IoUs are reported. ``robot_iou`` follows the paper: one segmenter masks the true and the predicted video
-independently of each other. ``robot_iou_exact`` compares the predicted video's mask with the recording's exact one.
-How good the segmenter itself is shows in the rows of the method ``true``: its masks of true frames against exact ones.
-``object_iou_exact`` is of what the task moves, in the frames in which it has moved, where the recording has its exact
-pixels: the colour that the instruction names masks it in the predicted video.
-Means over trajectories of every frame show drift along a rollout. `metric_registry` has every metric, those on request too.
+``robot_iou`` follows the paper: one segmenter masks the true and the predicted video independently of each other. ``robot_iou_exact``
+compares the predicted video's mask with the recording's exact one; the method ``true`` shows how good the segmenter itself is. Means
+over trajectories of every frame show drift along a rollout. `metric_registry` lists every metric.
 """
 
 from __future__ import annotations
@@ -44,8 +41,14 @@ from worldline_core.evaluation.scores import (
 )
 from worldline_core.evaluation.segmenters.segmenter import Segmenter, open_segmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement, finite_mean
-from worldline_core.evaluation.video.fvd import LEAST_FRAMES, Features, FrechetDistances, distances, open_i3d
-from worldline_core.evaluation.video.tool_paths import ControlledPair
+from worldline_core.evaluation.video.metrics_on_request import (
+    LEAST_FRAMES,
+    ControlledPair,
+    Features,
+    FrechetDistances,
+    frechet_distances,
+    open_i3d,
+)
 from worldline_core.model.lpips import load_lpips
 from worldline_core.progress import Progress
 from worldline_core.rollout.rollout_set import RolloutSet
@@ -160,7 +163,7 @@ def _fvd(
             )
             features[method][row.episode_id] = own, other
     comparisons = list(combinations(sorted(rollouts), 2)) if config.comparisons is None else config.comparisons
-    return distances(features, groups, comparisons, config.seed)
+    return frechet_distances(features, groups, comparisons, config.seed)
 
 
 def _write(
