@@ -81,4 +81,4 @@ def content() -> RecordingContent:
     uv[..., 1, 0] = 30.0
     valid = np.ones((COUNT, 3, 2), bool)
     valid[3:, :, 1] = False
-    return RecordingContent(episode, frames, {"stage2": frames}, tracks_of(uv, valid), episode.state_names or ())
+    return RecordingContent(episode, frames, {"stage2": frames}, tracks_of(uv, valid))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.data.episodes.episode import REPEATS_STATE, CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
-from worldline_core.errors import ConfigError, DataError
-from worldline_core.exports.export import export
+from worldline_core.errors import ArtifactError, ConfigError, DataError
+from worldline_core.exports.export import export, shown_tracks
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.publishing import set_files
 from worldline_core.report.inspect_pictures import write_pictures as inspect
+from worldline_core.store.artifact_files import write_manifest
 
 FRAMES = 20
 
@@ -105,7 +109,7 @@ def test_episodes_as_mcap_and_rerun(linked: Path, tmp_path: Path) -> None:
     written = export(linked, tmp_path, ["mcap-ros2", "mcap", "rrd"], episode_ids=["e1#5-15"])
     stem = safe_stem("e1#5-15")
     names = [f"{stem}.mcap", f"{stem}.ros2.mcap", f"{stem}.rrd"]
-    assert [path.name for path in written] == names
+    assert sorted(path.name for path in written) == names
     episodes: Any = EpisodeSet.open(linked)
     for name in names[:2]:
         read: Any = read_exported_episode(McapFile(tmp_path / name))
@@ -149,6 +153,41 @@ def test_a_rerun_export_holds_the_tools_as_inspect_shows_them(tmp_path: Path, ca
     assert "/world/cameras/head/true" in unknown
     assert not any(path.startswith("/world/tool") for path in unknown)
     assert "unknown.rrd has no tool poses" in caplog.text
+
+
+def test_controls_are_drawn_from_the_commands_where_tool_poses_are_recorded_too() -> None:
+    """As in AgiBot World: joints with commands beside measured tool poses."""
+    kinematics = ArmKinematics(load_embodiment("ur5e_pair"))
+    state = np.linspace(-0.3, 0.3, 4 * 14, dtype=np.float32).reshape(4, 14)
+    state[:, [6, 13]] = 0.5
+    action = state + np.float32(0.1)
+    measured, commanded = (
+        kinematics.tools_of(kinematics.link_poses(np.asarray(values, dtype=np.float64))).numpy()
+        for values in (state, action)
+    )
+    episode = Episode(
+        episode_id="e", source="toy", embodiment="ur5e_pair", scene="s", task_family="lift", instruction="", outcome="unknown",
+        split="train", fps=10.0, state=state, action=action, timestamps=np.arange(4) / 10, T_base_ee=measured,
+        gripper=state[:, [6, 13]], cameras={"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), np.eye(4)[None], 48, 32)},
+    )  # fmt: skip
+    tracks = shown_tracks(episode)
+    assert tracks.controls == "action"
+    assert np.allclose(tracks.T_base_tool, commanded, atol=1e-5)
+    assert not np.allclose(tracks.T_base_tool, measured, atol=1e-3)
+    without_commands = shown_tracks(replace(episode, action=state, conventions={"action": REPEATS_STATE}))
+    assert np.allclose(without_commands.T_base_tool, measured, atol=1e-5)
+
+
+def test_a_damaged_set_is_not_exported(linked: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(linked.parent / "curated", tmp_path / "set")
+    write_manifest(folder, {"step": "curate"})
+    video = next(folder.rglob("*.mp4"))
+    content, facts = bytearray(video.read_bytes()), video.stat()
+    content[len(content) // 2] ^= 1
+    video.write_bytes(content)
+    os.utime(video, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+    with pytest.raises(ArtifactError, match=rf"{video.name}: sha256"):
+        export(folder, tmp_path / "out", ["lerobot"])
 
 
 def test_what_cannot_be_exported(linked: Path, tmp_path: Path) -> None:

@@ -22,8 +22,7 @@ from worldline_core.data.video.clip import Picture
 from worldline_core.data.video.frames import VideoFrames, packed_images, pieces, unpacked_images
 from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
-from worldline_core.exports.export import export
-from worldline_core.exports.rollout import shown_tracks
+from worldline_core.exports.export import export, shown_tracks
 from worldline_core.pictures import write_side_by_side
 from worldline_core.report.inspect_pictures import rollout_sheet, write_pictures
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter

@@ -15,9 +15,9 @@ from PIL import Image
 
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.guards.source_paths import safe_stem
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import DataError
+from worldline_core.exports.export import export_rollout, write_prediction_mcap
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
-from worldline_core.exports.rollout import export_rollout, write_mcap_recordings
 
 COUNT, HEIGHT = 5, 32
 """As `conftest` makes the episode."""
@@ -100,7 +100,9 @@ def test_rerun_robot_lies_along_its_capsules(chunks: dict[str, list], content: R
 
 
 def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent, tmp_path: Path) -> None:
-    (path,) = write_mcap_recordings(content, tmp_path, "episode")
+    path, again, ros2 = (tmp_path / f"{name}.mcap" for name in ("episode", "again", "ros2"))
+    for file in (path, again):
+        write_prediction_mcap(file, content, "stage2", "protobuf")
     topics: dict[str, int] = {}
     with path.open("rb") as stream:
         reader = make_reader(stream)
@@ -113,10 +115,8 @@ def test_mcap_holds_images_calibration_and_transforms(content: RecordingContent,
     }
     assert last.log_time == round((COUNT - 1) / 8.0 * 1e9)
     assert json.loads(facts["method"]) == "stage2"
-    (again,) = write_mcap_recordings(content, tmp_path, "again")
     assert again.read_bytes() == path.read_bytes()
-    (ros2,) = write_mcap_recordings(content, tmp_path, "episode", "mcap-ros2")
-    assert ros2.name == "episode_stage2.ros2.mcap"
+    write_prediction_mcap(ros2, content, "stage2", "ros2")
     found = [message.channel.topic for message in read_ros2_messages(str(ros2))]
     assert {topic: found.count(topic) for topic in found} == topics | {"/tf": 4 * COUNT, "/tf_static": 1}
 
@@ -126,11 +126,9 @@ class _Rollouts:
     episode_ids = ("robot/1",)
 
 
-def test_unknown_formats_and_episodes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"(?s)Unknown export format.*gif"):
-        export_rollout(_Rollouts(), None, None, "robot/1", tmp_path, ("gif",))  # type: ignore[arg-type]
-    with pytest.raises(DataError, match=r"(?s)No prediction of this episode.*robot/2"):
-        export_rollout(_Rollouts(), None, None, "robot/2", tmp_path, ("mp4",))  # type: ignore[arg-type]
+def test_an_episode_without_a_prediction_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"(?s)robot/2.*stage2"):
+        export_rollout({"stage2": _Rollouts()}, None, None, "robot/2", tmp_path, ("mp4",))  # type: ignore[dict-item, arg-type]
 
 
 def test_file_names_are_safe() -> None:

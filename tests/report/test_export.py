@@ -16,8 +16,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import ArtifactError, DataError
-from worldline_core.exports.export import export, export_worldarena
-from worldline_core.exports.rollout import export_rollout
+from worldline_core.exports.export import export, export_rollout, export_worldarena
 from worldline_core.rollout.rollout_set import RolloutSet
 
 
@@ -26,7 +25,9 @@ def test_a_prediction_is_exported_in_every_format(run_artifacts: dict[str, Path]
     rollouts = RolloutSet.open(run_artifacts["rollout.shipped_causal"])
     episodes = EpisodeSet.open(run_artifacts["curate"])
     tracks = ActionTracks.open(run_artifacts["render_actions"])
-    written = export_rollout(rollouts, episodes, tracks, "aloha_viperx-1", tmp_path)
+    written = export_rollout(
+        {rollouts.method: rollouts}, episodes, tracks, "aloha_viperx-1", tmp_path, ("mp4", "rrd", "mcap")
+    )
     assert sorted(path.suffix for path in written) == [".jpg"] * 3 + [".mcap"] + [".mp4"] * 3 + [".rrd"]
     assert all(path.stat().st_size > 500 for path in written)
 

@@ -1,42 +1,52 @@
-"""Episodes and predictions in formats of other tools: MCAP (Foxglove), Rerun, LeRobotDataset v3, WorldArena."""
+"""Episodes and predictions in formats of other tools: MCAP (Foxglove), Rerun, LeRobotDataset v3, videos, WorldArena."""
 
 from __future__ import annotations
 
 import json
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
-from worldline_core.actions.episode_tracks import ActionTracks
+import numpy as np
+
+from worldline_core.actions.action_tracks import compute_tracks
+from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.curation.source_table import SOURCES_FILE
+from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.data.episodes.recorded_poses import with_rigid_poses
 from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
-from worldline_core.data.mcap.exported import write_episode_mcap
+from worldline_core.data.mcap.exported import Encoding, write_episode_mcap, write_rollout_mcap
 from worldline_core.data.video.encoder import PixelFormat, encode_video
-from worldline_core.data.video.frames import VideoFrames
+from worldline_core.data.video.frames import MadeFrames, VideoFrames
 from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
-from worldline_core.exports.rollout import FORMATS as ROLLOUT_FORMATS
-from worldline_core.exports.rollout import MCAP_FORMATS, export_rollout, mcap_file, shown_tracks
-from worldline_core.pictures import png_bytes
+from worldline_core.geometry.embodiment import load_embodiment
+from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.pictures import png_bytes, write_side_by_side
 from worldline_core.rollout.rollout_set import RolloutSet
-from worldline_core.store.artifact_files import kind_of, linked_folder
+from worldline_core.store.artifact_files import kind_of, linked_folder, verify_artifact
 from worldline_core.store.atomic import atomic_path, write_bytes_atomic, write_json_atomic
 from worldline_core.store.store import folder_lock
 
 logger = logging.getLogger(__name__)
 
-WORLDARENA = "worldarena"
-EPISODE_FORMATS = ("lerobot", *MCAP_FORMATS, "rrd")
-# Stream copies keep the stored videos as they are; this is for what has to be encoded again (a cut not at a key frame).
+HEAD = "head"
+MCAP_FORMATS: dict[str, tuple[Encoding, str]] = {"mcap": ("protobuf", ".mcap"), "mcap-ros2": ("ros2", ".ros2.mcap")}
+"""Encoding of the messages, and the files' suffix."""
+FORMATS = {
+    "EpisodeSet": ("lerobot", *MCAP_FORMATS, "rrd"),
+    "RolloutSet": ("mp4", "rrd", *MCAP_FORMATS, "worldarena"),
+}
 _CRF, _PRESET = 10, "veryfast"
+"""For rows that are encoded again because they do not begin at a key frame; others are copied."""
 
 
 def export(
@@ -50,32 +60,35 @@ def export(
 ) -> list[Path]:
     """Write episodes of an EpisodeSet, or predictions of a RolloutSet, below a folder.
 
+    The artifact is compared with its manifest first: by every digest, or, for chosen episodes, by sizes and changed files.
+
     Args:
-        formats: of an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
-            artifact refers to another one's), `mcap`, `mcap-ros2` and
-            `rrd` (one file per episode); of a RolloutSet all but `lerobot`, and `mp4` and
-            `worldarena` (`export_worldarena`).
-        episode_ids: which episodes; none: all.
-        outcome: of an EpisodeSet only recordings that ended so (``success``: demonstrations to train a policy on).
-        episodes: the EpisodeSet that predictions belong to; default: the one that their manifest names.
+        formats: for an EpisodeSet `lerobot` (a set of its own: LeRobotDatasets with the sidecar, whole even where the
+            artifact refers to another one's), `mcap`, `mcap-ros2` and `rrd` (one file per episode); for a RolloutSet
+            these without `lerobot`, `mp4` (truth beside prediction) and `worldarena` (`export_worldarena`).
+        episode_ids: the chosen episodes; default: all.
+        outcome: only recordings of an EpisodeSet with this outcome (``success``: demonstrations to train a policy on).
+        episodes: the EpisodeSet of predictions; default: the one that their manifest names.
 
     Returns: the files, or the folder of the new set.
 
     Raises: ConfigError for a format that the artifact does not have; DataError for an unknown episode; ArtifactError for
-        another kind of artifact, or while another command exports into the folder.
+        another kind of artifact, a damaged one, or while another command exports into the folder.
     """
     kind = kind_of(artifact)
-    offered = {"EpisodeSet": EPISODE_FORMATS, "RolloutSet": (*ROLLOUT_FORMATS, WORLDARENA)}.get(kind)
-    if offered is None:
-        raise ArtifactError("This kind is not exported", where=artifact, expected="EpisodeSet or RolloutSet", got=kind)
-    unknown = [wanted for wanted in formats if wanted not in offered]
+    if kind not in FORMATS:
+        raise ArtifactError("This kind is not exported", where=artifact, expected=" or ".join(FORMATS), got=kind)
+    unknown = [wanted for wanted in formats if wanted not in FORMATS[kind]]
     if unknown or not formats:
-        raise ConfigError(f"Not a format of {kind}", expected=", ".join(offered), got=", ".join(unknown) or "none")
+        raise ConfigError(
+            f"Not a format of {kind}", expected=", ".join(FORMATS[kind]), got=", ".join(unknown) or "none"
+        )
     if outcome is not None and kind != "EpisodeSet":
         raise ConfigError(
             "Predictions are not chosen by outcome", where=artifact, got=outcome, next_step="name episodes"
         )
     with folder_lock(output):
+        verify_artifact(artifact, "fast" if episode_ids else "full")
         if kind == "EpisodeSet":
             return _export_episodes(EpisodeSet.open(artifact), output, formats, episode_ids, outcome)
         return _export_rollouts(artifact, output, formats, episode_ids, episodes)
@@ -87,43 +100,50 @@ def _export_episodes(
     positions = [episodes.position(name) for name in episode_ids] if episode_ids else list(range(len(episodes)))
     positions = [position for position in positions if outcome in (None, episodes.rows[position].outcome)]
     if not positions:
-        ended = sorted({row.outcome for row in episodes.rows})
-        raise DataError("No episode is exported", where=episodes.root, expected=f"an outcome of {ended}", got=outcome)
+        present = sorted({row.outcome for row in episodes.rows})
+        raise DataError("No episode is exported", where=episodes.root, expected=f"an outcome of {present}", got=outcome)
     written: list[Path] = []
     if "lerobot" in formats:
-        written.append(export_lerobot(episodes, output / "lerobot" if len(formats) > 1 else output, positions))
-    output.mkdir(parents=True, exist_ok=True)
-    stems = [safe_stem(episodes.rows[position].episode_id) for position in positions]
-    if len(set(stems)) != len(stems):
-        twice = next(stem for stem in stems if stems.count(stem) > 1)
-        raise DataError("Two episodes would get one file name", where=output, got=twice, next_step="export them apart")
-    for position in positions if {*MCAP_FORMATS, "rrd"} & set(formats) else ():
+        written.append(_export_lerobot(episodes, output / "lerobot" if len(formats) > 1 else output, positions))
+    for position in positions if set(formats) - {"lerobot"} else ():
         row, episode = episodes.rows[position], episodes.episode(position)
-        frames = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
         stem = safe_stem(row.episode_id)
-        for wanted in (each for each in MCAP_FORMATS if each in formats):
+        for encoding, suffix in (MCAP_FORMATS[wanted] for wanted in formats if wanted in MCAP_FORMATS):
+            frames = {view: VideoFrames(episodes.clip(position, view)) for view in row.views}
             masks = {view: mask for view in row.views if (mask := episodes.robot_masks(position, view)) is not None}
-            written.append(mcap_file(output, stem, wanted))
-            write_episode_mcap(written[-1], episode, frames, masks, encoding=MCAP_FORMATS[wanted])
+            written.append(output / f"{stem}{suffix}")
+            write_episode_mcap(written[-1], episode, frames, masks, encoding=encoding)
         if "rrd" in formats:
             tracks = None
             try:
                 tracks = shown_tracks(episode)
             except WorldLineError as error:
                 logger.warning("%s.rrd has no tool poses: %s (%s)", stem, error.what, error.where)
-            content = RecordingContent(episode, frames, tracks=tracks, joint_names=episode.state_names or ())
             written.append(output / f"{stem}.rrd")
-            write_rerun_recording(written[-1], content)
+            write_rerun_recording(written[-1], recording_content({}, episodes, tracks, row.episode_id))
     return written
 
 
-def export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> Path:
-    """Write rows of a set as a set of its own, whose datasets lie inside of it; a few frames are in memory at a time.
+def shown_tracks(episode: Episode) -> EpisodeTracks:
+    """Tracks for pictures: of the commands, which are the controls; else of the recorded tool poses or the measured state.
 
-    Videos are copied without encoding where a row begins at a key frame.
+    Commands are projected where they are recorded and the robot's kinematics are known, as `render_actions` does.
 
-    Raises: DataError when the folder holds a finished set.
+    Raises: DataError, ConfigError, UnavailableError: they cannot be computed.
     """
+    kinematics = None
+    if episode.state_kind == "joints":
+        try:
+            kinematics = ArmKinematics(load_embodiment(episode.embodiment))
+        except ConfigError:
+            if episode.T_base_ee is None:
+                raise
+    commands = episode.commanded and kinematics is not None
+    return compute_tracks(episode, kinematics, controls="action" if commands else "state")[0]
+
+
+def _export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> Path:
+    """Write rows of a set as a self-contained set; videos are copied where a row begins at a key frame."""
     pixel_format = _pixel_format(episodes, positions)
     with EpisodeSetWriter(output, video_crf=_CRF, video_preset=_PRESET, pixel_format=pixel_format) as writer:
         for position in positions:
@@ -142,7 +162,7 @@ def export_lerobot(episodes: EpisodeSet, output: Path, positions: Sequence[int])
 
 
 def _pixel_format(episodes: EpisodeSet, positions: Sequence[int]) -> PixelFormat:
-    """That of the stored videos, so that what is encoded again fits into one dataset with what is copied."""
+    """The format of the stored videos: encoded and copied ones share a dataset."""
     folders = {episodes.dataset_path(position) for position in positions}
     features = [feature for folder in folders for feature in LeRobotV3Dataset(folder).features.values()]
     found = {
@@ -152,7 +172,7 @@ def _pixel_format(episodes: EpisodeSet, positions: Sequence[int]) -> PixelFormat
 
 
 def _copy_sources(episodes: EpisodeSet, output: Path, positions: Sequence[int]) -> None:
-    """Sources and their licences go with the recordings; a filtered set has them where its datasets lie."""
+    """Copy sources and licences along; a filtered set has them beside its datasets."""
     roots = {episodes.dataset_path(position).parent.parent for position in positions} | {episodes.root}
     tables = [
         json.loads((root / SOURCES_FILE).read_text()) for root in sorted(roots) if (root / SOURCES_FILE).is_file()
@@ -173,19 +193,108 @@ def _export_rollouts(
     rollouts, recorded = RolloutSet.open(artifact), EpisodeSet.open(folder)
     tracks_folder = linked_folder(artifact, "tracks")
     tracks = None if tracks_folder is None else ActionTracks.open(tracks_folder)
-    missing = sorted(set(episode_ids) - set(rollouts.episode_ids))
-    if missing:
+    names, written = list(episode_ids or rollouts.episode_ids), list[Path]()
+    if missing := sorted(set(names) - set(rollouts.episode_ids)):
         raise DataError("No prediction of this episode", where=artifact, got=", ".join(missing))
-    written: list[Path] = []
-    if WORLDARENA in formats:
-        written += export_worldarena(rollouts, recorded, episode_ids or rollouts.episode_ids, output)
-    others = [wanted for wanted in formats if wanted != WORLDARENA]
-    for name in (episode_ids or rollouts.episode_ids) if others else ():
-        written += export_rollout(rollouts, recorded, tracks, name, output, others)
+    if "worldarena" in formats:
+        written += export_worldarena(rollouts, recorded, names, output)
+    for name in names:
+        written += export_rollout({rollouts.method: rollouts}, recorded, tracks, name, output, formats)
     return written
 
 
-HEAD = "head"
+def export_rollout(
+    rollouts: Mapping[str, RolloutSet],
+    episodes: EpisodeSet,
+    tracks: ActionTracks | None,
+    episode_id: str,
+    output: Path,
+    formats: Sequence[str],
+    *,
+    name: str | None = None,
+) -> list[Path]:
+    """Write an episode's predictions below `output` and return the files.
+
+    Args:
+        rollouts: by method name.
+        tracks: action tracks for tool poses and heat maps; left out when None.
+        formats: `mp4` (one side-by-side video per view), `rrd` (one recording with everything), `mcap` and `mcap-ros2`
+            (one per method).
+        name: beginning of the file names (default: the episode's id).
+
+    Raises: DataError when no set predicted this episode, or the set does not hold it.
+    """
+    predicted = {method: rollout for method, rollout in rollouts.items() if episode_id in rollout.episode_ids}
+    if not predicted:
+        raise DataError(
+            "No prediction of this episode",
+            where=episode_id,
+            expected="an episode of the RolloutSet",
+            got=", ".join(rollouts) or "no RolloutSet",
+            next_step="list what was predicted with `worldline inspect <folder>`",
+        )
+    sigma_px_ref = SIGMA_PX_REFERENCE if tracks is None else tracks.sigma_px_ref
+    drawn = None if tracks is None else tracks.tracks(episode_id)
+    content = recording_content(predicted, episodes, drawn, episode_id, sigma_px_ref=sigma_px_ref)
+    stem, written = name or safe_stem(episode_id), list[Path]()
+    output.mkdir(parents=True, exist_ok=True)
+    if "mp4" in formats:
+        for view, frames in content.true_frames.items():
+            columns = {method: views[view] for method, views in content.predicted_frames.items() if view in views}
+            made = write_side_by_side(output / f"{stem}_{view}.mp4", {"true": frames, **columns}, content.episode.fps)
+            written += [made.video, made.poster]
+    if "rrd" in formats:
+        written.append(output / f"{stem}.rrd")
+        write_rerun_recording(written[-1], content)
+    for encoding, suffix in (MCAP_FORMATS[wanted] for wanted in formats if wanted in MCAP_FORMATS):
+        for method in content.predicted_frames:
+            written.append(output / f"{stem}_{safe_stem(method)}{suffix}")
+            write_prediction_mcap(written[-1], content, method, encoding)
+    return written
+
+
+def recording_content(
+    rollouts: Mapping[str, RolloutSet],
+    episodes: EpisodeSet,
+    tracks: EpisodeTracks | None,
+    episode_id: str,
+    *,
+    sigma_px_ref: float = SIGMA_PX_REFERENCE,
+) -> RecordingContent:
+    """Gather the frames, predictions and tracks of one episode."""
+    position = episodes.position(episode_id)
+    views = [view for view in VIEWS if view in episodes.rows[position].views]
+    predicted = {
+        method: {
+            view: VideoFrames(rollout.clip(episode_id, view)) for view in views if view in rollout.views(episode_id)
+        }
+        for method, rollout in rollouts.items()
+    }
+    recorded = {view: VideoFrames(episodes.clip(position, view)) for view in views}
+    return RecordingContent(episodes.episode(position), recorded, predicted, tracks, sigma_px_ref)
+
+
+def write_prediction_mcap(path: Path, content: RecordingContent, method: str, encoding: Encoding) -> None:
+    """Write a method's predicted views as MCAP with cameras and commanded tool poses.
+
+    Calibration follows the frames' size; poses are cut to the prediction's length.
+    """
+    episode, views = content.episode, content.predicted_frames[method]
+    count = min(len(frames) for frames in views.values())
+    facts = {name: getattr(episode, name) for name in ("episode_id", "embodiment", "instruction")}
+    write_rollout_mcap(
+        path,
+        {view: MadeFrames(frames.__iter__, frames.shape, np.uint8)[:count] for view, frames in views.items()},
+        episode.fps,
+        metadata={key: json.dumps(value) for key, value in ({"method": method} | facts).items()},
+        cameras={
+            view: episode.cameras[view].resized(frames.shape[2], frames.shape[1]).cut(0, count)
+            for view, frames in views.items()
+            if view in episode.cameras
+        },
+        T_base_ee=None if content.tracks is None else content.tracks.T_base_tool[:count],
+        encoding=encoding,
+    )
 
 
 def export_worldarena(rollouts: RolloutSet, episodes: EpisodeSet, names: Sequence[str], output: Path) -> list[Path]:

@@ -1,6 +1,6 @@
-"""Rerun recordings: an episode and its predictions in 3-D, in every view, and as time series.
+"""Rerun recordings: an episode and its predictions in 3-D, in every view and as time series; and the filters' findings.
 
-Entities (all poses in the robot's base frame, metres, z up; cameras have OpenCV axes, x right, y down, z forward):
+Entities of an episode (all poses in the robot's base frame, metres, z up; cameras have OpenCV axes, x right, y down, z forward):
 
     world/cameras/<view>            camera pose and pinhole (K), shown as a frustum
     world/cameras/<view>/true       recorded frames
@@ -11,6 +11,13 @@ Entities (all poses in the robot's base frame, metres, z up; cameras have OpenCV
     world/robot                     the arms as the kinematics place them: one line per link
     predicted/<method>/<view>       predicted frames
     signals/{state,action}/<joint>  joint and gripper values
+
+Entities of a filter recording:
+
+    views/<view>                        recorded frames
+    segments/<kept or reason>           a coloured dot per frame, one row per reason: the episode's timeline
+    curves/<detector>/<view>/<name>     a detector's measure over its threshold: above or below 1 decides
+    verdict                             the findings, as text
 
 The bytes of a recording differ between runs (chunk identifiers are random), so recordings are written outside the
 digested part of an artifact. Importing this module imports Rerun.
@@ -33,13 +40,14 @@ from numpy.typing import NDArray
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
-from worldline_core.pictures import jpeg_bytes, png_bytes
+from worldline_core.pictures import KEPT_COLOUR, jpeg_bytes, png_bytes, reason_colour
 from worldline_core.store.atomic import atomic_path
 
 if TYPE_CHECKING:
     from worldline_core.actions.episode_tracks import EpisodeTracks
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.data.video.frames import Frames
+    from worldline_core.filters.verdict import Finding
 
 PIECE_FRAMES = 64
 """So many pictures are logged together."""
@@ -48,24 +56,24 @@ FRUSTUM_M = {"fixed": 0.25, "moving": 0.08}
 ROBOT_COLOUR = (190, 194, 202)
 ROBOT_LINE_M = 0.01
 FRUSTUM_COLOUR = (220, 222, 228)
-EYE_DISTANCE_M = 1.0
+LARGEST_RATIO = 5.0
+"""Filter curves are clipped there, or one outlier would flatten all others."""
 
 
 @dataclass(frozen=True)
 class RecordingContent:
-    """Everything one recording holds.
+    """The data of one recording.
 
     Attributes:
-        true_frames: view -> frames.
-        predicted_frames: method -> view -> frames.
-        sigma_px_ref: of the heat, pixels on the 384 x 512 reference canvas.
+        true_frames: by view.
+        predicted_frames: by method and view.
+        sigma_px_ref: width of the heat, pixels on the 384 x 512 reference canvas.
     """
 
     episode: Episode
     true_frames: Mapping[str, Frames]
     predicted_frames: Mapping[str, Mapping[str, Frames]] = field(default_factory=dict)
     tracks: EpisodeTracks | None = None
-    joint_names: Sequence[str] = ()
     sigma_px_ref: float = SIGMA_PX_REFERENCE
 
 
@@ -80,25 +88,25 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
         _log_cameras(stream, content)
         for method, views in content.predicted_frames.items():
             for view, frames in views.items():
-                log_frames(stream, f"predicted/{method}/{view}", frames, episode.fps)
+                _log_frames(stream, f"predicted/{method}/{view}", frames, episode.fps)
         if tracks is not None:
             _log_tools(stream, tracks, episode.fps)
             _log_robot(stream, tracks, episode.fps)
             for view in tracks.views:
                 if view in content.true_frames:
                     _log_overlay(stream, tracks, view, content.true_frames[view], episode.fps, content.sigma_px_ref)
-        _log_signals(stream, content)
+        _log_signals(stream, episode)
         _log_description(stream, episode)
         stream.disconnect()
 
 
-def timeline(count: int, fps: float, first: int = 0) -> list[rr.TimeColumn]:
-    """The two time columns that every entity uses: frame number, and seconds since the episode's start."""
+def _timeline(count: int, fps: float, first: int = 0) -> list[rr.TimeColumn]:
+    """The time columns of every entity: frame number, and seconds since the episode's start."""
     frames = np.arange(first, first + count)
     return [rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("time", duration=frames / fps)]
 
 
-def log_frames(stream: rr.RecordingStream, entity: str, frames: Frames, fps: float) -> None:
+def _log_frames(stream: rr.RecordingStream, entity: str, frames: Frames, fps: float) -> None:
     """Log frames `n h w 3` as JPEG pictures, one per time step."""
     _log_images(stream, entity, (jpeg_bytes(frame, quality=92) for frame in frames), "image/jpeg", fps)
 
@@ -107,7 +115,7 @@ def _log_images(stream: rr.RecordingStream, entity: str, images: Iterable[bytes]
     """Log encoded images, one per time step, in pieces."""
     for number, part in enumerate(batched(images, PIECE_FRAMES)):
         columns = rr.EncodedImage.columns(blob=list(part), media_type=[kind] * len(part))
-        stream.send_columns(entity, timeline(len(part), fps, number * PIECE_FRAMES), columns)
+        stream.send_columns(entity, _timeline(len(part), fps, number * PIECE_FRAMES), columns)
 
 
 def _log_cameras(stream: rr.RecordingStream, content: RecordingContent) -> None:
@@ -130,7 +138,7 @@ def _log_cameras(stream: rr.RecordingStream, content: RecordingContent) -> None:
             )
             stream.log(entity, pinhole, static=True)
             _log_poses(stream, entity, np.asarray(camera.T_base_camera, dtype=np.float64), fps)
-        log_frames(stream, f"{entity}/true", frames, fps)
+        _log_frames(stream, f"{entity}/true", frames, fps)
 
 
 def _log_poses(stream: rr.RecordingStream, entity: str, poses: NDArray[np.floating], fps: float) -> None:
@@ -139,7 +147,7 @@ def _log_poses(stream: rr.RecordingStream, entity: str, poses: NDArray[np.floati
         stream.log(entity, rr.Transform3D(translation=poses[0, :3, 3], mat3x3=poses[0, :3, :3]), static=True)
         return
     columns = rr.Transform3D.columns(translation=poses[:, :3, 3], mat3x3=np.ascontiguousarray(poses[:, :3, :3]))
-    stream.send_columns(entity, timeline(len(poses), fps), columns)
+    stream.send_columns(entity, _timeline(len(poses), fps), columns)
 
 
 def _log_tools(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) -> None:
@@ -165,7 +173,7 @@ def _log_robot(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) ->
     columns = rr.LineStrips3D.columns(
         strips=list(strips), radii=[ROBOT_LINE_M] * (count * links), colors=[ROBOT_COLOUR] * (count * links)
     )
-    stream.send_columns("world/robot", timeline(count, fps), columns.partition([links] * count))
+    stream.send_columns("world/robot", _timeline(count, fps), columns.partition([links] * count))
 
 
 def _log_overlay(
@@ -174,7 +182,7 @@ def _log_overlay(
     """What `draw_overlay` draws over a view, as layers that can be shown and hidden one by one."""
     v, entity = tracks.views.index(view), f"world/cameras/{view}"
     count, size = min(len(frames), tracks.num_frames), (frames.shape[1], frames.shape[2])
-    times = timeline(count, fps)
+    times = _timeline(count, fps)
     heat = (png_bytes(heat_layer(tracks, n, view, size, sigma_px_ref)) for n in range(count))
     _log_images(stream, f"{entity}/actions", heat, "image/png", fps)
     stream.log(f"{entity}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
@@ -210,34 +218,19 @@ def _log_overlay(
     stream.log(f"{entity}/axes", rr.LineStrips2D.from_fields(draw_order=20.0), static=True)
 
 
-def _log_signals(stream: rr.RecordingStream, content: RecordingContent) -> None:
+def _log_signals(stream: rr.RecordingStream, episode: Episode) -> None:
     """Joint and gripper values, recorded and commanded."""
-    episode = content.episode
+    names = episode.state_names or [f"joint_{joint}" for joint in range(episode.state.shape[1])]
     for kind, values in (("state", episode.state), ("action", episode.action)):
-        for joint, column in enumerate(np.asarray(values, dtype=np.float64).T):
-            name = content.joint_names[joint] if joint < len(content.joint_names) else f"joint_{joint}"
+        for name, column in zip(names, np.asarray(values, dtype=np.float64).T, strict=True):
             entity = f"signals/{kind}/{name.replace('/', '_')}"
-            stream.send_columns(entity, timeline(len(column), episode.fps), rr.Scalars.columns(scalars=column))
+            stream.send_columns(entity, _timeline(len(column), episode.fps), rr.Scalars.columns(scalars=column))
 
 
 def _log_description(stream: rr.RecordingStream, episode: Episode) -> None:
     names = ("episode_id", "embodiment", "scene", "task_family", "instruction", "outcome", "split")
     text = "\n".join(f"{name.replace('_', ' ')}: {getattr(episode, name)}" for name in names)
     stream.log("description", rr.TextDocument(text, media_type=rr.MediaType.TEXT), static=True)
-
-
-def _eye(content: RecordingContent) -> tuple[list[float], list[float]]:
-    """Where the viewer's eye stands and what it looks at [m, base]: the tools, from beside the head camera."""
-    target = np.zeros(3)
-    if content.tracks is not None:
-        target = np.asarray(content.tracks.T_base_tool[..., :3, 3], dtype=np.float64).reshape(-1, 3).mean(axis=0)
-    head = content.episode.cameras.get("head")
-    away = np.array([1.0, 1.0, 0.8]) if head is None else head.T_base_camera[0, :3, 3] - target
-    turn = np.radians(50.0)  # off the head camera's own line of sight, whose frustum would stand in the way
-    level = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ away[:2]
-    direction = np.array([*level, 0.7 * max(float(np.linalg.norm(level)), 0.5)])
-    position = target + EYE_DISTANCE_M * direction / np.linalg.norm(direction)
-    return position.tolist(), target.tolist()
 
 
 def _blueprint(content: RecordingContent) -> rrb.Blueprint:
@@ -249,14 +242,12 @@ def _blueprint(content: RecordingContent) -> rrb.Blueprint:
     pictures = [rrb.Horizontal(*[rrb.Spatial2DView(origin=at, name=name) for at, name in row]) for row in rows]
     # What is drawn over the frames would float in the scene twice; Rerun's patterns know no wildcard but a last `/**`.
     flat = [f"- $origin/cameras/{view}/{layer}" for view in views for layer in ("actions", "points", "axes")]
-    position, target = _eye(content)
     scene = rrb.Spatial3DView(
         origin="world",
         name="scene",
         contents=["$origin/**", *flat],
         line_grid=True,
         background=(24, 26, 31),
-        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
     )
     if len(pictures) == 1:
         top = rrb.Vertical(*pictures, scene, row_shares=[5, 6])
@@ -271,5 +262,84 @@ def _blueprint(content: RecordingContent) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(top, series, row_shares=[4, 1]),
         rrb.TimePanel(timeline="frame", fps=content.episode.fps, state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def write_filter_recording(
+    path: Path,
+    frames: Mapping[str, Frames],
+    dropped: Mapping[str, NDArray[np.bool_]],
+    findings: Sequence[Finding],
+    fps: float,
+    summary: str,
+) -> None:
+    """Write one `.rrd` with a blueprint; opens with `rerun <file>`.
+
+    Args:
+        frames: by view, (n, H, W, 3).
+        dropped: by reason, bool (n,) frames that were dropped for it.
+        findings: of the detectors, with their curves.
+        summary: Markdown.
+    """
+    stream = rr.RecordingStream("worldline_filters", send_properties=False)
+    with atomic_path(path) as temporary:
+        stream.save(temporary, default_blueprint=_filter_blueprint(list(frames), _shown_curves(findings), fps))
+        for view, images in frames.items():
+            _log_frames(stream, f"views/{view}", images, fps)
+        _log_segments(stream, dropped, len(next(iter(frames.values()))), fps)
+        for finding in findings:
+            _log_curves(stream, finding, fps)
+        stream.log("verdict", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
+        stream.disconnect()
+
+
+def _log_segments(stream: rr.RecordingStream, dropped: Mapping[str, NDArray[np.bool_]], count: int, fps: float) -> None:
+    lost = np.logical_or.reduce([*dropped.values(), np.zeros(count, dtype=bool)])
+    rows = [("kept", ~lost, KEPT_COLOUR), *[(r, flags, reason_colour(r)) for r, flags in dropped.items()]]
+    for height, (name, flags, colour) in enumerate(rows):
+        at = np.flatnonzero(flags)
+        if len(at) == 0:
+            continue
+        entity = f"segments/{name}"
+        stream.log(
+            entity, rr.SeriesPoints(colors=[colour], markers=["square"], marker_sizes=[5], names=[name]), static=True
+        )
+        times = [rr.TimeColumn("frame", sequence=at), rr.TimeColumn("time", duration=at / fps)]
+        stream.send_columns(entity, times, rr.Scalars.columns(scalars=np.full(len(at), -float(height))))
+
+
+def _log_curves(stream: rr.RecordingStream, finding: Finding, fps: float) -> None:
+    for name, curve in finding.verdict.curves.items():
+        if curve.threshold <= 0:
+            continue
+        entity = f"curves/{finding.detector}/{finding.view or 'all'}/{name}"
+        label = f"{finding.detector}, {finding.view or 'all'}: {name.replace('_', ' ')} / {curve.threshold:g}"
+        colour = reason_colour(finding.verdict.reason)
+        stream.log(entity, rr.SeriesLines(colors=[colour], names=[label], widths=[1.5]), static=True)
+        ratio = np.clip(curve.values / curve.threshold, -LARGEST_RATIO, LARGEST_RATIO)
+        stream.send_columns(entity, _timeline(len(ratio), fps), rr.Scalars.columns(scalars=ratio))
+
+
+def _shown_curves(findings: Sequence[Finding]) -> list[str]:
+    """Curves of the detectors that found something; of all where none did. The others can be switched on."""
+    shown = [f for f in findings if not f.verdict.clean and f.verdict.curves] or findings
+    return [f"curves/{f.detector}/{f.view or 'all'}/**" for f in shown if f.verdict.curves]
+
+
+def _filter_blueprint(views: Sequence[str], curves: Sequence[str], fps: float) -> rrb.Blueprint:
+    pictures = [rrb.Spatial2DView(origin=f"views/{view}", name=view.replace("_", " ")) for view in views]
+    series = rrb.Vertical(
+        rrb.TimeSeriesView(origin="segments", name="kept and dropped frames"),
+        rrb.TimeSeriesView(
+            origin="curves", contents=[f"+ /{name}" for name in curves], name="detectors: measured over threshold"
+        ),
+        row_shares=[1, 3],
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(*pictures, rrb.TextDocumentView(origin="verdict", name="verdict")), series, row_shares=[2, 3]
+        ),
+        rrb.TimePanel(timeline="frame", fps=fps, state="collapsed"),
         collapse_panels=True,
     )

@@ -213,7 +213,7 @@ def write_episode(filtered: FilteredSet, episode_id: str, output: Path, *, rerun
     write_bytes_atomic(path, png_bytes(stacked([filtered.strip(episode, reason) for reason in episode.reasons])))
     if not rerun:
         return [path]
-    from worldline_core.exports.filter_recording import write_filter_recording  # imports Rerun
+    from worldline_core.exports.rerun_recording import write_filter_recording  # imports Rerun
 
     i = filtered.episodes.position(episode_id)
     row = filtered.episodes.rows[i]

@@ -16,7 +16,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError, WorldLineError
-from worldline_core.exports.rollout import export_rollout, recording_content, shown_tracks
+from worldline_core.exports.export import export_rollout, recording_content, shown_tracks
 from worldline_core.pages.page import render, words
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced, png_bytes
 from worldline_core.progress import with_progress
@@ -183,7 +183,9 @@ class Subject:
     def write_video(self, output: Path, episode_id: str) -> list[Path]:
         """All views side by side with the controls drawn over them, `<episode>.mp4`; truth beside a prediction."""
         if self.kind == "RolloutSet":
-            return export_rollout(self.rollouts, self.episodes, None, episode_id, output, ("mp4",))
+            return export_rollout(
+                {self.rollouts.method: self.rollouts}, self.episodes, None, episode_id, output, ("mp4",)
+            )
         path = output / f"{safe_stem(episode_id)}.mp4"
         self._write_overlay(path, self.episodes.position(episode_id), self.tracks(episode_id))
         return [path]

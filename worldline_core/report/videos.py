@@ -20,7 +20,7 @@ from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import Frames, VideoFrames
 from worldline_core.errors import DataError
-from worldline_core.exports.rollout import export_rollout
+from worldline_core.exports.export import export_rollout
 from worldline_core.pages.page import words
 from worldline_core.pictures import draw_tag, side_by_side, write_side_by_side, write_video
 from worldline_core.report.context import ReportContext, Section
