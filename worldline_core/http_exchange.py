@@ -5,18 +5,20 @@ from __future__ import annotations
 import asyncio
 import functools
 import ssl
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import httpx
 
 
-class Unreachable(Exception):  # noqa: N818  (a cause, not the error that is shown)
+class UnreachableError(Exception):
     """No server listens at the address."""
 
 
-class NoAnswer(Exception):  # noqa: N818
+class IncompleteResponseError(Exception):
     """The server did not answer completely and in time."""
 
 
@@ -28,12 +30,12 @@ def exchange(
     Redirects are not followed, so that keys and pictures reach no other address than the trusted one.
 
     Args:
-        timeout_s: from the first byte sent to the last one read.
+        timeout_s: of the whole exchange, name resolution included.
         proxies: use the proxies named by environment variables.
 
     Raises:
-        Unreachable: nothing listens there.
-        NoAnswer: the answer broke off or took too long.
+        UnreachableError: nothing listens there.
+        IncompleteResponseError: the answer broke off or took too long.
     """
 
     async def answered() -> tuple[int, bytes]:
@@ -54,17 +56,44 @@ def exchange(
     try:
         urlsplit(url).port  # noqa: B018  (raises for a port above 65535)
     except ValueError as error:
-        raise Unreachable(str(error)) from error
+        raise UnreachableError(str(error)) from error
     try:
-        # In a thread: the caller's may run an event loop of its own (a notebook).
-        with ThreadPoolExecutor(1, "request") as thread:
-            return thread.submit(asyncio.run, answered()).result()
+        # Half a second to end by itself; only the resolution of a name cannot be cancelled.
+        return within(timeout_s + 0.5, lambda: asyncio.run(answered()))
     except (httpx.ConnectError, httpx.UnsupportedProtocol, httpx.ProxyError, httpx.InvalidURL) as error:
-        raise Unreachable(f"{type(error).__name__}: {error}") from error
+        raise UnreachableError(f"{type(error).__name__}: {error}") from error
     except TimeoutError:
-        raise NoAnswer(f"TimeoutError: no whole answer within {timeout_s:g} s") from None
+        raise IncompleteResponseError(f"TimeoutError: no whole answer within {timeout_s:g} s") from None
     except (httpx.HTTPError, OSError, UnicodeError) as error:  # UnicodeError: a host name
-        raise NoAnswer(f"{type(error).__name__}: {error}") from error
+        raise IncompleteResponseError(f"{type(error).__name__}: {error}") from error
+
+
+def within[T](seconds: float, call: Callable[[], T], *, discard: Callable[[T], None] = lambda late: None) -> T:
+    """Returns the result of a call in a thread of its own, which is abandoned when the time is up; ``discard`` gets a late result.
+
+    Raises: TimeoutError.
+    """
+    future: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            result = call()
+        except BaseException as error:  # noqa: BLE001  (raised again where the result is waited for)
+            with suppress(InvalidStateError):
+                future.set_exception(error)
+            return
+        try:
+            future.set_result(result)
+        except InvalidStateError:
+            discard(result)
+
+    threading.Thread(target=run, name="bounded call", daemon=True).start()
+    try:
+        return future.result(seconds)
+    except TimeoutError:
+        if future.cancel():
+            raise
+        return future.result()  # done at the last moment, or a time-out of its own
 
 
 @functools.cache

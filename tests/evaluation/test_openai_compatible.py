@@ -11,7 +11,7 @@ from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import Image, NoAnswerError, Text
+from worldline_core.evaluation.vlm import Image, Text, UnansweredMessageError
 from worldline_core.evaluation.vlm_models import OpenAICompatibleModel, open_vlm
 
 
@@ -86,10 +86,10 @@ def test_does_not_retry_a_refusal_or_a_malformed_reply(server):
     with pytest.raises(UnavailableError, match="HTTP 401"):
         _model(server).answer([Text("?")])
     server.replies = [(200, {"choices": []})]
-    with pytest.raises(NoAnswerError, match="another form"):
+    with pytest.raises(UnansweredMessageError, match="another form"):
         _model(server).answer([Text("?")])
     server.replies = [(200, b"<html>")]
-    with pytest.raises(NoAnswerError, match="JSON"):
+    with pytest.raises(UnansweredMessageError, match="JSON"):
         _model(server).answer([Text("?")])
     assert len(server.requests) == 3
 

@@ -168,7 +168,7 @@ def test_a_reply_that_nobody_asked_for_is_not_taken_for_the_next() -> None:
     with policy_server(lambda _: twice) as url, OpenpiPolicy(url) as policy:
         assert policy.infer({})["actions"][0, 0] == 0.0
         time.sleep(0.1)
-        with pytest.raises(DataError, match="nobody asked for"):
+        with pytest.raises(DataError, match="unexpected message"):
             policy.infer({})
 
 
@@ -261,3 +261,20 @@ def test_what_cannot_be_sent_is_named() -> None:
     for wrong in (np.array([object()]), np.zeros(2, "V4"), np.complex64(1), {1, 2}, math, 1 << 70):
         with pytest.raises(DataError, match="cannot be sent"):
             pack({"x": wrong})
+
+
+def test_a_name_that_is_not_resolved_counts_towards_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    resolved = threading.Event()
+
+    def hang(*_: object, **__: object) -> list[Any]:
+        resolved.wait(20)
+        raise socket.gaierror("no such name")
+
+    monkeypatch.setattr(socket, "getaddrinfo", hang)
+    begin = time.monotonic()
+    with pytest.raises(UnavailableError, match=r"ws://policy\.example"):
+        OpenpiPolicy("ws://policy.example:8000", deadline_s=0.3)
+    with pytest.raises(UnavailableError, match=r"ws://policy\.example"):
+        is_healthy("ws://policy.example:8000", deadline_s=0.3)
+    assert time.monotonic() - begin < 5
+    resolved.set()

@@ -80,7 +80,7 @@ def _text(value: Any) -> Any:
 AnswerText = Annotated[str, BeforeValidator(_text)]
 
 
-class NoAnswerError(UnavailableError):
+class UnansweredMessageError(UnavailableError):
     """A model gave no answer to this one message; it may answer the next."""
 
 
@@ -91,7 +91,7 @@ def ask[T: Answer](model: VisionLanguageModel, parts: Sequence[Part], schema: ty
     """
     try:
         answer = model.answer(parts)
-    except NoAnswerError as error:
+    except UnansweredMessageError as error:
         logger.warning("counted as no evidence: %s", error)
         return schema(), False
     return parse_answer(schema, answer)

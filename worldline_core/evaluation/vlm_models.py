@@ -18,8 +18,16 @@ from einops import rearrange
 
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, NoAnswerError, Part, Text, Video, VisionLanguageModel
-from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
+from worldline_core.evaluation.vlm import (
+    MAX_NEW_TOKENS,
+    Image,
+    Part,
+    Text,
+    UnansweredMessageError,
+    Video,
+    VisionLanguageModel,
+)
+from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
 from worldline_core.untrusted_text import cut, without_secret
 
 MAX_ANSWER_BYTES = 1 << 20
@@ -70,7 +78,7 @@ class OpenAICompatibleModel:
         """The model's text.
 
         Raises:
-            NoAnswerError: the server has none to this message: it did not answer in time, or with something else.
+            UnansweredMessageError: the server has none to this message: it did not answer in time, or with something else.
             UnavailableError: it cannot be reached, refuses the key or the address, or had no answer to several messages
                 in a row.
         """
@@ -83,7 +91,7 @@ class OpenAICompatibleModel:
         }
         try:
             text = self._text(self._post(json.dumps(body).encode()))
-        except NoAnswerError as error:
+        except UnansweredMessageError as error:
             self._unanswered += 1
             if self._unanswered < _PATIENCE:
                 raise
@@ -103,8 +111,8 @@ class OpenAICompatibleModel:
                 status, answer = exchange(
                     self.url, body, headers=headers, timeout_s=self.config.timeout_s, max_bytes=MAX_ANSWER_BYTES
                 )
-            except (Unreachable, NoAnswer) as error:
-                reason, there = str(error), isinstance(error, NoAnswer)
+            except (UnreachableError, IncompleteResponseError) as error:
+                reason, there = str(error), isinstance(error, IncompleteResponseError)
                 continue
             if status == 200:
                 return answer
@@ -126,8 +134,8 @@ class OpenAICompatibleModel:
             raise self._no_answer("another form than choices[0].message.content") from error
         return text if isinstance(text, str) else ""
 
-    def _no_answer(self, reason: str) -> NoAnswerError:
-        return NoAnswerError("The judge's server gave no answer", where=self.url, got=self._hidden(reason))
+    def _no_answer(self, reason: str) -> UnansweredMessageError:
+        return UnansweredMessageError("The judge's server gave no answer", where=self.url, got=self._hidden(reason))
 
     def _unusable(self, reason: str) -> UnavailableError:
         return UnavailableError(

@@ -10,26 +10,26 @@ from types import TracebackType
 from typing import Any, Self
 
 from worldline_core.errors import ConfigError, DataError, UnavailableError
+from worldline_core.http_exchange import within
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES, pack, unpack
 from worldline_core.untrusted_text import without_secret
 
 
 class MessageSocket:
-    """A connection to a server of array messages; to be used by one thread at a time.
+    """A connection to a server of array messages, for one thread at a time.
 
-    A reply is waited for until its deadline, however slowly it trickles in or the request is taken. After a deadline
-    or a broken message the connection is closed: a late reply would be taken for that of the next request.
+    Deadlines are of the whole exchange, name resolution included. After a deadline or a broken message the connection is closed: a late
+    reply would be taken for that of the next request.
 
     Args:
         url: ``ws://host:port/path`` or ``wss://...``; reached directly, without a proxy.
-        headers: sent with the connection request, without white space around them; the last word of each is a secret, and
-            hidden where the server repeats it.
+        headers: sent with the connection request; the last word of each is a secret, hidden where the server repeats it.
         deadline_s: for connecting, and for each exchange where it names no other.
         max_bytes: of one reply.
 
     Raises:
         ConfigError: a header cannot be sent.
-        UnavailableError: nobody answers there, or the request is refused.
+        UnavailableError: no server answers, or it refuses the request.
     """
 
     def __init__(
@@ -54,15 +54,14 @@ class MessageSocket:
             )  # fmt: skip
         self._secrets = [value.split()[-1] for value in given.values() if value]
         try:
-            self._connection = connect(
-                url,
-                additional_headers=given,
-                compression=None,
-                max_size=max_bytes,
-                open_timeout=deadline_s,
-                close_timeout=1.0,
-                proxy=None,
-            )
+            self._connection = within(
+                deadline_s,
+                lambda: connect(
+                    url, additional_headers=given, compression=None, max_size=max_bytes, open_timeout=deadline_s,
+                    close_timeout=1.0, proxy=None,
+                ),
+                discard=lambda late: late.close(),
+            )  # fmt: skip
         except InvalidStatus as error:
             status = error.response.status_code
             raise UnavailableError(
@@ -75,7 +74,7 @@ class MessageSocket:
             InvalidURI,
             EOFError,
             ValueError,
-        ) as error:  # ValueError: an address that is none
+        ) as error:  # ValueError: a malformed address
             raise UnavailableError(
                 "No server answers", where=url, got=f"{type(error).__name__}: {error}",
                 next_step="start it, or correct the address (ws://HOST:PORT)",
@@ -86,8 +85,8 @@ class MessageSocket:
 
         Raises:
             UnavailableError: the server is gone, reports an error (a text frame), or does not answer in time.
-            DataError: the request cannot be packed, the reply is no message or too large, or a message is there that
-                nobody asked for, which would be taken for the reply.
+            DataError: the request cannot be packed, the reply is no message or too large, or an unexpected message
+                arrived before, which would be taken for the reply.
         """
         from websockets.exceptions import ConnectionClosed
 
@@ -95,9 +94,7 @@ class MessageSocket:
         with suppress(TimeoutError, ConnectionClosed):
             self._connection.recv(timeout=0)
             self.close()
-            raise DataError(
-                "The server sent a message that nobody asked for", where=self.url, next_step="connect again"
-            )
+            raise DataError("The server sent an unexpected message", where=self.url, next_step="connect again")
         return self._exchange(lambda: self._connection.send(content), deadline_s)
 
     def receive(self, *, deadline_s: float | None = None) -> dict[str, Any]:

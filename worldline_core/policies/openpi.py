@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
+from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
 from worldline_core.policies.array_messages import MAX_MESSAGE_BYTES
 from worldline_core.policies.message_socket import MessageSocket
 
@@ -29,10 +29,10 @@ class OpenpiPolicy(MessageSocket):
         max_bytes: of one reply.
 
     Attributes:
-        metadata: what the server says of its policy.
+        metadata: the server's description of its policy.
 
     Raises:
-        UnavailableError: nobody answers there, or the key is refused.
+        UnavailableError: no server answers, or it refuses the key.
         DataError: the metadata are no map.
         ConfigError: the key cannot be sent.
     """
@@ -84,11 +84,11 @@ class OpenpiPolicy(MessageSocket):
 def is_healthy(url: str, *, deadline_s: float = 5.0) -> bool:
     """Whether the server at a websocket address answers ``GET /healthz`` with status 200.
 
-    Raises: UnavailableError: nobody answers there.
+    Raises: UnavailableError: no server answers.
     """
     address = re.sub(r"^ws(s?://[^/?#]*).*", r"http\1/healthz", url)
     try:
         status, _ = exchange(address, None, headers={}, timeout_s=deadline_s, max_bytes=1 << 16, proxies=False)
-    except (Unreachable, NoAnswer) as error:
+    except (UnreachableError, IncompleteResponseError) as error:
         raise UnavailableError("No server answers", where=url, got=str(error)) from error
     return status == 200

@@ -23,7 +23,7 @@ import numpy as np
 from worldline_core.data.guards.plain_files import decode_image
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
-from worldline_core.http_exchange import NoAnswer, Unreachable, exchange
+from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
 from worldline_core.untrusted_text import cut
 
 CHUNK = 25
@@ -147,7 +147,7 @@ class GeSimClient:
             status, answer = exchange(
                 self.url + path, body, headers=headers, timeout_s=self.timeout_s, max_bytes=max_bytes
             )
-        except (Unreachable, NoAnswer) as error:
+        except (UnreachableError, IncompleteResponseError) as error:
             raise self._unusable(path, str(error)) from error
         if status in (400, 500):  # what it says of a request that it understood
             raise self._refusal(path, f"HTTP {status}: {answer.decode(errors='replace')}")
