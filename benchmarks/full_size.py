@@ -6,8 +6,7 @@
     python benchmarks/full_size.py --time cuda --captured            # the model's passes replayed as CUDA graphs
     python benchmarks/full_size.py --memory                          # planned against measured memory at three small sizes
 
-The floor counts every matrix product, convolution and attention at the card's peak, or at its bandwidth where that takes
-longer. Targets on one H200: causal 7 s, Stage II 50 s for 129 frames of three views (the paper: 21 s and 90 s).
+The floor counts every matrix product, convolution and attention at the card's peak. Targets on one H200: causal 7 s, Stage II 50 s for 129 frames of three views (the paper: 21 s and 90 s).
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -26,20 +26,18 @@ from torch.profiler import ProfilerActivity, profile
 
 from worldline_core.config import load_config
 from worldline_core.model.contracts import CausalSpec
-from worldline_core.model.step_cost import CARDS, in_bfloat16
 from worldline_core.model.tokenizers import WanTokenizer, tokenizer_outline
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.pipeline.memory_estimate import Checkpointing, ClipShape, Placement, Training, to_bfloat16
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.planner import Planner
-from worldline_core.pipeline.sheet import Machine
+from worldline_core.pipeline.size_sheet import PEAK_FLOPS, Machine, SizeSheet
 from worldline_core.rollout.captured import Captured, Run, run_now
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip
 from worldline_core.rollout.speed import device_name, timed
+from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.flow_matching import FlowMatchingObjective
-from worldline_core.training.stage_cost import parameter_counts, trained_cost
-from worldline_core.training.stage_memory import Checkpointing, ClipShape, Spread, StageMemory
 from worldline_core.training.trainer import ParameterGroup, train
 from worldline_core.training.training_config import LossWeighting, ShardingConfig, SigmaSampling, TrainerConfig
 from worldline_core.training.training_state import TrainingStates
@@ -51,12 +49,12 @@ TARGETS = {"causal": 7.0, "stage2": 50.0}
 def floors(preset: str, card: str, overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Operations and least seconds of every stage of a preset."""
     config = load_config(PipelineConfig, preset=preset, overrides=overrides)
-    planner = Planner(config, Path.cwd(), Machine(1, CARDS[card].memory, CARDS[card], 1.0))
+    machine = Machine.model_validate({"devices": 1, "memory": "80GB", "card": card, "utilisation": 1})
     return [
-        {"stage": row.title, "pflop": row.facts["PFLOP"], "gigabytes": row.facts["GB moved"],
-         "floor_seconds": row.facts["floor in seconds"]}
-        for row in planner.rows() if "PFLOP" in row.facts
-    ]  # fmt: skip
+        {"stage": row.title, "pflop": row.flops / 1e15, "floor_seconds": machine.seconds(row.flops)}
+        for row, _ in SizeSheet(config, Path.cwd(), machine).rows()
+        if row.flops
+    ]
 
 
 @dataclass(frozen=True)
@@ -79,12 +77,12 @@ class Rollouts:
     def of(cls, preset: str, device: str, run: Run = run_now) -> Rollouts:
         """Clips as long as the preset's longest; weights made in bfloat16 on the device, never in float32."""
         config = load_config(PipelineConfig, preset=preset)
-        planner = Planner(config, Path.cwd(), Machine(1, 80e9, CARDS["H100"], 1.0))
-        tokenizer = tokenizer_outline(planner.folder("tokenizer")).to(device)
+        sheet = SizeSheet(config, Path.cwd(), Machine.model_validate({"memory": "80GB"}))
+        tokenizer = tokenizer_outline(sheet.folder("tokenizer")).to(device)
         if isinstance(tokenizer, WanTokenizer):
-            in_bfloat16(tokenizer)
-        grid, frames = planner.grid(config.encode_latents.image_size), max(config.distill.clips.lengths)
-        return cls(random_model(planner.generation, device), tokenizer, config.distill.spec, frames, grid, device, run)
+            to_bfloat16(tokenizer)
+        grid, frames = sheet.source().grid, max(config.distill.clips.lengths)
+        return cls(random_model(sheet.generation, device), tokenizer, config.distill.spec, frames, grid, device, run)
 
     @torch.no_grad()
     def seconds(self, sampler: str) -> float:
@@ -149,18 +147,17 @@ def memory(config: WorldModelConfig, frames: int, grid: tuple[int, int], trainer
     Neither counts the copy of a state that is being written: how long it is there depends on the disk.
     """
     shape = ClipShape(1, config.views, frames, grid)
-
-    def objective(model: WorldModel) -> FlowMatchingObjective:
-        return FlowMatchingObjective(model, sigma=SigmaSampling(), weighting=LossWeighting())
-
-    spread = Spread.of(trainer, 1)
-    cost = trained_cost(objective, lambda: shape.batch(config, maps=True), config, trainer, spread)
-    parts = StageMemory("", trainer, spread, shape, 0, *parameter_counts(config), cost).parts
+    objective = partial(FlowMatchingObjective, sigma=SigmaSampling(), weighting=LossWeighting())
+    clips = ClipSampling(lengths=(frames,))
+    training = Training(
+        "memory", trainer, clips, config, config.views, grid, objective, lambda shape: shape.batch(config)
+    )
+    parts = training.estimate(Placement.of(trainer, 1)).parts
     planned = sum(size for name, size in parts.items() if name != "state being written")
     model = WorldModel(config)
     model.initialise(torch.Generator().manual_seed(0))
-    model.checkpointing = spread.checkpointing
-    batch = shape.batch(config, maps=True)
+    model.checkpointing = trainer.sharding.checkpointing
+    batch = shape.batch(config)
     for tensor in (batch.latents, batch.action_maps):
         if tensor is not None:
             tensor.normal_()
@@ -196,7 +193,7 @@ def most_bytes(recorded: profile) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="cosmos3-nano")
-    parser.add_argument("--card", choices=tuple(CARDS), default="H200")
+    parser.add_argument("--card", choices=tuple(PEAK_FLOPS), default="H200")
     parser.add_argument("--set", action="append", default=[], metavar="a.b=value", help="of the floors' preset")
     parser.add_argument("--time", metavar="DEVICE", help="time the rollouts there (cuda)")
     parser.add_argument(
@@ -209,7 +206,7 @@ def main() -> None:
         for config, frames, grid in SIZES:
             for accumulation, checkpointing in CASES:
                 sharding = ShardingConfig(checkpointing=checkpointing)
-                trainer = TrainerConfig(steps=2, accumulation=accumulation, sharding=sharding)
+                trainer = TrainerConfig(steps=2, batch_size=1, accumulation=accumulation, sharding=sharding)
                 planned, measured = memory(config, frames, grid, trainer)
                 print(f"{config.num_layers} layers of {config.hidden_size}, {frames} frames, accumulation {accumulation}, checkpointing {checkpointing}: planned "
                       f"{planned / 1e6:.1f} MB, measured {measured / 1e6:.1f} MB, ratio {planned / measured:.4f}")  # fmt: skip

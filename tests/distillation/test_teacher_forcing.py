@@ -17,11 +17,10 @@ from worldline_core.distillation.causal_objective import maps_of, self_forced_ro
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.distill_memory import DistillEstimates
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.world_model import WorldModel
+from worldline_core.pipeline.memory_estimate import ClipFrames, Placement, trainings
 from worldline_core.training.clip_loader import Batch
-from worldline_core.training.stage_memory import Spread
 
 VIEWS = ("head", "left_wrist", "right_wrist")
 FRAMES = 7  # the observed latent frame and three blocks of two
@@ -119,13 +118,13 @@ def test_the_step_trains_with_both(inputs: dict[str, Path], tmp_path: Path) -> N
 
 def test_the_teacher_is_in_the_memory_sheet(make_model: Callable[..., WorldModel]) -> None:
     def planned(**settings: Any) -> Any:
-        estimates = DistillEstimates(config_of(**settings), make_model(0).config, (4, 4))
-        return estimates.steps()["teacher_forcing"](Spread())
+        source = ClipFrames(None, None, (4, 4), (32, 32))
+        return trainings(config_of(**settings), make_model(0).config, source)[0].estimate(Placement())
 
     alone, taught = planned(), planned(teacher_share=0.5)
-    assert alone.frozen_parts == 0
-    assert taught.frozen_parts == 4 * taught.trained
-    assert taught.cost.products > alone.cost.products
+    assert "frozen scores" not in alone.parts
+    assert taught.parts["frozen scores"] == 4 * taught.parameters
+    assert taught.flops > alone.flops
 
 
 def test_noise_is_of_recorded_blocks() -> None:

@@ -22,7 +22,6 @@ from worldline_core.distillation.auxiliary_losses import PerceptualDistance, Per
 from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.distillation.distill_memory import DistillEstimates
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.teacher_trajectories import trajectory_shard
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
@@ -61,7 +60,6 @@ from worldline_core.training.processes import (
     wait_for_all,
 )
 from worldline_core.training.stage import input_facts, validation_function
-from worldline_core.training.stage_cost import latent_grid
 from worldline_core.training.trainer import ParameterGroup, batch_plan, train
 from worldline_core.training.training_config import TrainerConfig
 
@@ -84,9 +82,6 @@ def distill(config: DistillConfig, inputs: Mapping[str, Path], output: Path) -> 
         DataError: no clip fits the blocks.
         TrainingError: a loss or gradient is not finite.
     """
-    if (grid := latent_grid(config.input, inputs)) is not None:
-        model = read_checkpoint_info(Path(inputs["stage2"])).config.model_copy(update={"towers": "generation"})
-        DistillEstimates(config, model, grid, Path(inputs["tokenizer"])).require_fit()
     torch.manual_seed(config.teacher_forcing.trainer.seed)
     run = DistillationRun.open(config, inputs, output)
     metrics = {**run.teacher_forcing(), **run.trajectory_regression(), **run.distribution_matching()}

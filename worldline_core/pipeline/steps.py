@@ -334,6 +334,10 @@ def run_step(
 
     def work(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
         function = step.load_function()
+        if step.distributed:
+            from worldline_core.pipeline.memory_estimate import require_memory
+
+            require_memory(config, inputs)
         with same_threads(output):
             return function(config, inputs, output, **options)
 

@@ -8,14 +8,13 @@ from typing import Any
 
 import torch
 
-from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
+from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.stage import Stage
-from worldline_core.training.stage_cost import require_stage_fits
 from worldline_core.training.trainer import ParameterGroup
 from worldline_core.training.training_config import Stage1Config
 
@@ -51,8 +50,6 @@ def train_stage1(config: Stage1Config, inputs: Mapping[str, Path], output: Path)
         return model, None
 
     title = "stage I" if config.kind == "stage1" else "base"
-    shape = read_checkpoint_info(Path(inputs["base"])).config if "base" in inputs else config.model
-    require_stage_fits(title, config, shape, inputs, maps=False, text=config.text.max_length, trained=is_trained)
     stage = Stage.open(config, inputs, output, number=1, title=title, load_model=load_model)
     model = stage.model
     loader = stage.loader(text=load_text_encoder(config.text, model.config.vocab_size))

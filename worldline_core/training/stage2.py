@@ -16,11 +16,11 @@ from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
 from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContract
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
 from worldline_core.training.stage import Stage
-from worldline_core.training.stage_cost import require_stage_fits
 from worldline_core.training.trainer import ParameterGroup
 from worldline_core.training.training_config import Stage2Config
 from worldline_core.training.video_teacher import load_teacher
@@ -41,6 +41,12 @@ def _film(config: Stage2Config) -> dict[str, Any]:
     return {"action_conditioning": "native_film", "action_channels": config.native_size}
 
 
+def stage2_model_config(config: Stage2Config, start: WorldModelConfig) -> WorldModelConfig:
+    """The model that Stage II trains from a checkpoint: its video tower, with the configured action branch."""
+    controls = {"action_frames": config.action_frames or start.action_frames, **_film(config)}
+    return start.model_copy(update={"towers": "generation", **controls})
+
+
 def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
     """Train on ``episodes`` and ``tracks`` from the checkpoint ``stage1``; ``teacher`` for the relational terms.
 
@@ -54,10 +60,6 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
     kinds = ("base", "stage1") if config.start_from == "stage1" else ("stage2",)
     parent = Path(inputs["stage1"])
     native = config.native_size is not None
-    begun = read_checkpoint_info(parent).config
-    controls = {"action_frames": config.action_frames or begun.action_frames, **_film(config)}
-    shape = begun.model_copy(update={"towers": "generation", **controls})
-    require_stage_fits("stage II", config, shape, inputs, maps=True, relational=config.relational)
     tracks = ActionTracks.open(Path(inputs["tracks"]), EpisodeSet.open(Path(inputs["episodes"])) if native else None)
 
     def load_model() -> tuple[WorldModel, CheckpointInfo]:
