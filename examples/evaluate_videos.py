@@ -11,9 +11,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tasks.evaluate_video import evaluate_video
+from tasks.import_rollouts import import_rollouts
+from tasks.render_actions import render_actions
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
-from worldline_core.pipeline.steps import run_step
 from worldline_core.rollout.rollout_config import ImportRolloutsConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.shipped import shipped_folder
@@ -31,14 +33,12 @@ def main() -> None:
     arguments = parser.parse_args()
     store = ArtifactStore(arguments.artifacts)
     config = ImportRolloutsConfig(method=arguments.method, missing="report")
-    imported = run_step(
-        store, "import_rollouts", config, {"videos": arguments.videos, "episodes": arguments.episode_set}
-    ).path
+    imported = import_rollouts.run(store, config, {"videos": arguments.videos, "episodes": arguments.episode_set}).path
     predicted = RolloutSet.open(imported)
     count, views = len(predicted.episode_ids), sorted({row.view for row in predicted.rows})
-    tracks = run_step(store, "render_actions", RenderActionsConfig(), {"episodes": arguments.episode_set})
-    scores = run_step(
-        store, "evaluate_video", VideoEvaluationConfig.model_validate({"views": views}),
+    tracks = render_actions.run(store, RenderActionsConfig(), {"episodes": arguments.episode_set})
+    scores = evaluate_video.run(
+        store, VideoEvaluationConfig.model_validate({"views": views}),
         {"episodes": arguments.episode_set, "tracks": tracks.path, f"rollouts.{arguments.method}": imported,
          "segmenter": shipped_folder() / "models" / "segmenter"},
     )  # fmt: skip

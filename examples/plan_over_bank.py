@@ -10,9 +10,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from flows.pipeline import chain
+from tasks.execution.chain import outline, ready_inputs
 from worldline_core.config import load_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan, run_node
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
 
@@ -20,7 +21,7 @@ METHOD = "banks_shipped_causal"
 
 
 def main() -> None:
-    """Run the nodes that planning with one bank needs, and print what came of it."""
+    """Run the tasks that planning with one bank needs, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", default="bank_close_ur5e")
     parser.add_argument("--candidates", type=int, default=8)
@@ -37,11 +38,10 @@ def main() -> None:
         ],
     )
     only_causal = config.model_copy(update={"rollouts": {METHOD: config.rollouts[METHOD]}})
-    nodes = plan(only_causal, Path.cwd())
-    store = ArtifactStore(arguments.artifacts)
-    for name in ("curate.banks", "render_actions.banks", f"rollout.{METHOD}"):
-        run_node(name, nodes, store)
-    planning = run_node("evaluate_planning", nodes, store)
+    calls, store = outline(chain, only_causal), ArtifactStore(arguments.artifacts)
+    for name in ("curate.banks", "render_actions.banks", f"rollout.{METHOD}", "evaluate_planning"):
+        call = calls[name]
+        planning = call.task.run(store, call.config, ready_inputs(call, calls, store))
     print(planning.path)
     for method, found in read_json(planning.path / "summary.json")["methods"].items():
         for budget, values in found["budgets"].items():

@@ -12,10 +12,12 @@ import argparse
 import json
 from pathlib import Path
 
+from tasks.curate import curate
+from tasks.encode_latents import encode_latents
+from tasks.filter import filter_episodes
+from tasks.train_stage1 import train_stage1
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.pipeline.pipeline_config import source_inputs
-from worldline_core.pipeline.steps import run_step
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
@@ -32,7 +34,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--artifacts", type=Path, default=Path("artifacts"))
     arguments = parser.parse_args()
-    curate = CurateConfig.model_validate(
+    settings = CurateConfig.model_validate(
         {
             "sources": [
                 {"kind": "lerobot_v3", "path": arguments.dataset, "embodiment": arguments.embodiment,
@@ -47,16 +49,15 @@ def main() -> None:
         {"trainer": trainer, "clips": {"lengths": [17], "view_weights": {"primary": 1.0}}}
     )
     store, models = ArtifactStore(arguments.artifacts), shipped_folder() / "models"
-    curated = run_step(store, "curate", curate, source_inputs(curate, Path.cwd()))
-    kept = run_step(store, "filter", FilterConfig(), {"episodes": curated.path})
-    latents = run_step(
+    curated = curate.run(store, settings, {"source.0": arguments.dataset})
+    kept = filter_episodes.run(store, FilterConfig(), {"episodes": curated.path})
+    latents = encode_latents.run(
         store,
-        "encode_latents",
         EncodeLatentsConfig(primary_alone=True),
         {"episodes": kept.path, "tokenizer": models / "tokenizer"},
     )
     inputs = {"episodes": kept.path, "latents": latents.path, "base": models / "base"}
-    trained = run_step(store, "train_stage1", stage1, inputs)
+    trained = train_stage1.run(store, stage1, inputs)
     print(json.dumps(read_json(trained.path / "manifest.json")["metrics"], indent=1))
     print(trained.path)
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from prefect import flow
 
-from tasks.artifact_task import ArtifactReference
-from tasks.run_nodes import run_nodes
-from worldline_core.config import load_config
-from worldline_core.pipeline.ablations import TABLE, ablation_plan
+from flows.pipeline import Inputs, choose, evaluate, predict, prepare, prepare_banks, train
+from tasks.ablation_table import ablation_table
+from tasks.execution.chain import variant
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.pipeline.ablations import FULL, METHOD, LoadConfig, choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.report.ablation_table import AblationTableConfig, Variant
 
 
 @flow(name="ablations")
@@ -22,15 +25,30 @@ def ablations(
     artifacts: Path = Path("artifacts"),
     variants: tuple[str, ...] | None = None,
 ) -> ArtifactReference:
-    """The full model and its variants (default: all five); what a variant shares with others is made once.
+    """The full model and its variants (default: all five). Returns the table."""
+    load = partial(load_changed, preset, config, overrides)
+    with PrefectRun(artifacts.resolve(), load([]).runner) as run:
+        compare_variants(load, choose_variants(variants))
+    return run.artifacts[ablation_table.name]
 
-    Returns the table.
-    """
 
-    def load(changes: Sequence[str]) -> PipelineConfig:
-        return load_config(
-            PipelineConfig, preset=None if config else preset, path=config, overrides=[*overrides, *changes]
-        )
+def compare_variants(load: LoadConfig, variants: Mapping[str, Variant]) -> None:
+    """The chain of every variant up to its evaluations, and the table. Equal calls of several variants are one call."""
+    scores: dict[str, Inputs] = {}
+    for name, changes in variants.items():
+        settings = variant_config(load, changes)
+        with variant("" if name == FULL else name):
+            (_, data), banks = prepare(settings), prepare_banks(settings)
+            trained = train(settings, data)
+            made = evaluate(settings, data, predict(settings, data, trained))
+            made |= choose(settings, banks, predict(settings, banks, trained, banks=True))
+            for step, call in made.items():
+                scores.setdefault(step, {})[name] = call
+    ablation_table.submit(AblationTableConfig(method=METHOD, variants=dict(variants)), **scores)
 
-    nodes = ablation_plan(load, Path.cwd(), variants)
-    return run_nodes(nodes, artifacts.resolve(), load([]).runner)[TABLE]
+
+def load_changed(
+    preset: str | None, config: Path | None, overrides: Sequence[str], changes: Sequence[str]
+) -> PipelineConfig:
+    """The run's configuration with some more overrides."""
+    return PipelineConfig.load(preset, config, [*overrides, *changes])

@@ -12,8 +12,8 @@ from flows.embodiment_commands import add_embodiment_commands
 from flows.exchange_commands import add_exchange_commands
 from flows.full_size_commands import add_plan_command, add_rehearse_command
 from flows.serve_commands import add_serve_commands
-from tasks.temporary_server import prepare_prefect
-from worldline_core.pipeline.steps import STEPS
+from tasks.execution.artifact_task import find_task, task_names
+from tasks.execution.temporary_server import prepare_prefect
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -37,7 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
     for parser_with_config in (pipeline, nightly, ablations):
         _add_config_arguments(parser_with_config)
     task = commands.add_parser("task", help="run one step alone", formatter_class=argparse.RawDescriptionHelpFormatter)
-    task.add_argument("step", choices=sorted(STEPS), metavar="STEP", help="one of: " + ", ".join(STEPS))
+    task.add_argument("step", choices=task_names(), metavar="STEP", help="one of: " + ", ".join(task_names()))
     _add_task_arguments(task)
     task.set_defaults(run=_task)
     rollout = commands.add_parser("rollout", help="predict videos (short for: task rollout)")
@@ -120,13 +120,13 @@ def _add_calibrate(commands: argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    from tasks.command_line import add_config_arguments
+    from tasks.execution.command_line import add_config_arguments
 
     add_config_arguments(parser)
 
 
 def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    from tasks.command_line import add_task_arguments
+    from tasks.execution.command_line import add_task_arguments
 
     add_task_arguments(parser)
 
@@ -152,7 +152,7 @@ def _pipeline(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments, weights=True)
     prepare_prefect(arguments.artifacts)
     from flows.pipeline import pipeline
-    from tasks.prefect_artifacts import run_flow
+    from tasks.execution.prefect_artifacts import run_flow
 
     print(f"how far it is, and then the report: {arguments.artifacts / 'report' / 'latest' / 'index.html'}")
     report = run_flow(pipeline, preset, arguments.config, tuple(arguments.overrides), arguments.artifacts)
@@ -169,7 +169,7 @@ def _nightly(arguments: argparse.Namespace) -> None:
     preset = _checked_preset(arguments)
     prepare_prefect(arguments.artifacts)
     from flows.nightly_evaluation import nightly_evaluation
-    from tasks.prefect_artifacts import run_flow
+    from tasks.execution.prefect_artifacts import run_flow
 
     values = preset, arguments.config, tuple(arguments.overrides), arguments.artifacts, arguments.night
     print(f"nightly: {run_flow(nightly_evaluation, *values) / 'index.html'}")
@@ -186,11 +186,10 @@ def _ablations(arguments: argparse.Namespace) -> None:
 
 
 def _task(arguments: argparse.Namespace) -> None:
-    from tasks.command_line import print_artifact, run_task
+    from tasks.execution.command_line import print_artifact, run_task
 
     prepare_prefect(arguments.artifacts)
-
-    print_artifact(run_task(arguments.step, arguments), as_json=arguments.json)
+    print_artifact(run_task(find_task(arguments.step), arguments), as_json=arguments.json)
 
 
 def _record(arguments: argparse.Namespace) -> None:
@@ -292,9 +291,9 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console command, which works in a child process; with `argv` it works in this one."""
-    from tasks.command_line import exit_with_clear_errors
-    from tasks.supervisor import run_supervised
-    from worldline_core.pipeline.steps import keep_freed_memory
+    from tasks.execution.command_line import exit_with_clear_errors
+    from tasks.execution.supervisor import run_supervised
+    from worldline_core.scale.process import keep_freed_memory
 
     # Early: threads that have allocated keep the arena that they have.
     keep_freed_memory()

@@ -7,8 +7,8 @@ import argparse
 import os
 from pathlib import Path
 
-from tasks.command_line import add_config_arguments, add_preset_arguments
-from tasks.temporary_server import prepare_prefect
+from tasks.execution.command_line import add_config_arguments, add_preset_arguments
+from tasks.execution.temporary_server import prepare_prefect
 
 
 def add_plan_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -72,7 +72,7 @@ def add_rehearse_command(commands: argparse._SubParsersAction[argparse.ArgumentP
 
 def rehearse_command(arguments: argparse.Namespace) -> None:
     """Prepare the folder, train in several processes, let the flow do the rest, and report."""
-    from tasks.rehearse import train_in_processes
+    from flows.rehearse import train_in_processes
     from worldline_core.rehearsal.rehearsal import prepare, table
 
     path = None if arguments.config is None else arguments.config.resolve()

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from prefect import flow, task
 
-from tasks.prefect_artifacts import show_in_prefect
-from tasks.run_nodes import run_nodes
-from worldline_core.config import load_config
+from flows.pipeline import choose, evaluate, predict, prepare, prepare_banks
+from tasks.execution.prefect_artifacts import show_in_prefect
+from tasks.execution.prefect_run import PrefectRun
+from tasks.report import report
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan, without_training
 from worldline_core.report.comparison import NightlyComparison
 from worldline_core.report.nightly import compare_with_history, refuse_regressions
 
@@ -34,10 +34,16 @@ def nightly_evaluation(
 
     A night that became worse than the last good one ends in the state Failed, with the metrics named.
     """
-    settings = load_config(PipelineConfig, preset=None if config else preset, path=config, overrides=overrides)
-    done = run_nodes(without_training(plan(settings, Path.cwd())), artifacts.resolve(), settings.runner)
+    settings = PipelineConfig.load(preset, config, overrides)
+    with PrefectRun(artifacts.resolve(), settings.runner) as run:
+        (curated, data), banks = prepare(settings), prepare_banks(settings)
+        predicted = predict(settings, data, trained={})
+        planned = predict(settings, banks, trained={}, banks=True)
+        scores = evaluate(settings, data, predicted) | choose(settings, banks, planned)
+        made = {"curate": curated, "filter": data["episodes"], "render_actions": data["tracks"], **scores}
+        report.submit(settings.report, **made, rollout=predicted | planned, models=settings.model_folders())
     history = artifacts.resolve() / "nightly"
-    compared = compare_nights({name: Path(str(reference.path)) for name, reference in done.items()}, history, night)
-    show_in_prefect(history, done, [history / file for file in compared.pictures.values()])
+    compared = compare_nights({name: made.folder for name, made in run.artifacts.items()}, history, night)
+    show_in_prefect(history, run.artifacts, [history / file for file in compared.pictures.values()])
     refuse_regressions(compared, history)
     return history

@@ -1,8 +1,16 @@
 """`curate`: read recordings of any source into one EpisodeSet."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-curate = artifact_task("curate")
+curate = ArtifactTask(
+    name="curate",
+    summary="read recordings of any source into one EpisodeSet",
+    version=5,
+    function="worldline_core.data.curation.curate:curate",
+    config="worldline_core.data.curation.curate_config:CurateConfig",
+    optional_inputs=("source.*",),
+    mapped=True,
+)
 
 if __name__ == "__main__":
     curate.main()

@@ -1,8 +1,17 @@
 """`distill`: Stage III: teacher forcing, trajectory regression, distribution matching."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-distill = artifact_task("distill")
+distill = ArtifactTask(
+    name="distill",
+    summary="Stage III: teacher forcing, trajectory regression, distribution matching",
+    version=4,
+    function="worldline_core.distillation.distill:distill",
+    config="worldline_core.distillation.distill_config:DistillConfig",
+    inputs=("tracks", "episodes", "stage2", "tokenizer"),
+    optional_inputs=("latents",),
+    distributed=True,
+)
 
 if __name__ == "__main__":
     distill.main()

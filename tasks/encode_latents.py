@@ -1,8 +1,16 @@
 """`encode_latents`: cache the video tokenizer's latents."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-encode_latents = artifact_task("encode_latents")
+encode_latents = ArtifactTask(
+    name="encode_latents",
+    summary="cache the video tokenizer's latents",
+    version=3,
+    function="worldline_core.training.encode_latents:encode_latents",
+    config="worldline_core.training.clip_config:EncodeLatentsConfig",
+    inputs=("episodes", "tokenizer"),
+    mapped=True,
+)
 
 if __name__ == "__main__":
     encode_latents.main()

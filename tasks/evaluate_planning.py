@@ -1,8 +1,16 @@
 """`evaluate_planning`: bracket selection among candidate controls, success of the choice."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-evaluate_planning = artifact_task("evaluate_planning")
+evaluate_planning = ArtifactTask(
+    name="evaluate_planning",
+    summary="bracket selection among candidate controls, success of the choice",
+    version=5,
+    function="worldline_core.evaluation.planning.evaluate_planning:evaluate_planning",
+    config="worldline_core.evaluation.evaluation_config:PlanningConfig",
+    inputs=("banks", "rollouts.*"),
+    optional_inputs=("tracks", "segmenter", "sealed"),
+)
 
 if __name__ == "__main__":
     evaluate_planning.main()

@@ -1,8 +1,16 @@
 """`evaluate_policy`: evidence, rules, accuracy against the recorded outcome."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-evaluate_policy = artifact_task("evaluate_policy")
+evaluate_policy = ArtifactTask(
+    name="evaluate_policy",
+    summary="evidence, rules, accuracy against the recorded outcome",
+    version=6,
+    function="worldline_core.evaluation.policy.evaluate_policy:evaluate_policy",
+    config="worldline_core.evaluation.evaluation_config:PolicyEvaluationConfig",
+    inputs=("episodes", "rollouts.*"),
+    optional_inputs=("tracks", "segmenter"),
+)
 
 if __name__ == "__main__":
     evaluate_policy.main()

@@ -1,8 +1,16 @@
-"""`evaluate_video`: PSNR, SSIM, LPIPS and robot-mask IoU."""
+"""`evaluate_video`: PSNR, SSIM, LPIPS, robot-mask and object IoU."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-evaluate_video = artifact_task("evaluate_video")
+evaluate_video = ArtifactTask(
+    name="evaluate_video",
+    summary="PSNR, SSIM, LPIPS, robot-mask and object IoU",
+    version=3,
+    function="worldline_core.evaluation.video.evaluate_video:evaluate_video",
+    config="worldline_core.evaluation.evaluation_config:VideoEvaluationConfig",
+    inputs=("episodes", "tracks", "rollouts.*"),
+    optional_inputs=("segmenter",),
+)
 
 if __name__ == "__main__":
     evaluate_video.main()

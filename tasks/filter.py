@@ -1,8 +1,16 @@
 """`filter`: drop static, reset, corrupted, moving-base, misaligned and badly calibrated segments."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-filter_episodes = artifact_task("filter")
+filter_episodes = ArtifactTask(
+    name="filter",
+    summary="drop static, reset, corrupted, moving-base, misaligned and badly calibrated segments",
+    version=6,
+    function="worldline_core.filters.filter:filter_episodes",
+    config="worldline_core.filters.filter_config:FilterConfig",
+    inputs=("episodes",),
+    mapped=True,
+)
 
 if __name__ == "__main__":
     filter_episodes.main()

@@ -1,8 +1,15 @@
 """`import_rollouts`: any folder of predicted videos as a set of rollouts, every file accounted for."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-import_rollouts = artifact_task("import_rollouts")
+import_rollouts = ArtifactTask(
+    name="import_rollouts",
+    summary="any folder of predicted videos as a set of rollouts, every file accounted for",
+    version=1,
+    function="worldline_core.rollout.import_rollouts:import_rollouts",
+    config="worldline_core.rollout.rollout_config:ImportRolloutsConfig",
+    inputs=("videos", "episodes"),
+)
 
 if __name__ == "__main__":
     import_rollouts.main()

@@ -1,8 +1,16 @@
 """`render_actions`: project the controls into every view: action tracks and overlay previews."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-render_actions = artifact_task("render_actions")
+render_actions = ArtifactTask(
+    name="render_actions",
+    summary="project the controls into every view: action tracks and overlay previews",
+    version=6,
+    function="worldline_core.actions.render_actions:render_actions",
+    config="worldline_core.actions.actions_config:RenderActionsConfig",
+    inputs=("episodes",),
+    mapped=True,
+)
 
 if __name__ == "__main__":
     render_actions.main()

@@ -1,8 +1,15 @@
-"""`report`: one static page with tables, plots and videos."""
+"""`report`: static pages with tables, plots and videos."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-report = artifact_task("report")
+report = ArtifactTask(
+    name="report",
+    summary="static pages with tables, plots and videos",
+    version=15,
+    function="worldline_core.report.report:report",
+    config="worldline_core.report.context:ReportConfig",
+    optional_inputs=("*",),
+)
 
 if __name__ == "__main__":
     report.main()

@@ -1,8 +1,16 @@
 """`rollout`: predict videos from a first observation and controls."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-rollout = artifact_task("rollout")
+rollout = ArtifactTask(
+    name="rollout",
+    summary="predict videos from a first observation and controls",
+    version=2,
+    function="worldline_core.rollout.rollout:rollout",
+    config="worldline_core.rollout.rollout_config:RolloutConfig",
+    inputs=("episodes", "tracks", "tokenizer"),
+    optional_inputs=("checkpoint",),
+)
 
 if __name__ == "__main__":
     rollout.main()

@@ -1,8 +1,16 @@
 """`train_segmenter`: train the small robot segmenter of the embedded default."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-train_segmenter = artifact_task("train_segmenter")
+train_segmenter = ArtifactTask(
+    name="train_segmenter",
+    summary="train the small robot segmenter of the embedded default",
+    version=2,
+    function="worldline_core.evaluation.segmenters.train_segmenter:train_segmenter",
+    config="worldline_core.evaluation.evaluation_config:SegmenterConfig",
+    inputs=("episodes",),
+    optional_inputs=("evaluation",),
+)
 
 if __name__ == "__main__":
     train_segmenter.main()

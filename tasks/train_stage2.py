@@ -1,8 +1,17 @@
 """`train_stage2`: Stage II: action-driven three-view prediction on successes and failures."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-train_stage2 = artifact_task("train_stage2")
+train_stage2 = ArtifactTask(
+    name="train_stage2",
+    summary="Stage II: action-driven three-view prediction on successes and failures",
+    version=3,
+    function="worldline_core.training.stage2:train_stage2",
+    config="worldline_core.training.training_config:Stage2Config",
+    inputs=("tracks", "episodes", "stage1"),
+    optional_inputs=("latents", "tokenizer", "teacher"),
+    distributed=True,
+)
 
 if __name__ == "__main__":
     train_stage2.main()

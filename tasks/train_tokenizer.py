@@ -1,8 +1,16 @@
-"""`train_tokenizer`: fit the small video tokenizer of the embedded default."""
+"""`train_tokenizer`: fit the small video tokenizer of the embedded default, or a small decoder for any tokenizer's latents."""
 
-from tasks.artifact_task import artifact_task
+from tasks.execution.artifact_task import ArtifactTask
 
-train_tokenizer = artifact_task("train_tokenizer")
+train_tokenizer = ArtifactTask(
+    name="train_tokenizer",
+    summary="fit the small video tokenizer of the embedded default, or a small decoder for any tokenizer's latents",
+    version=3,
+    function="worldline_core.training.train_tokenizer:train_tokenizer",
+    config="worldline_core.training.training_config:TokenizerConfig",
+    inputs=("episodes",),
+    optional_inputs=("start", "encoder", "held_out"),
+)
 
 if __name__ == "__main__":
     train_tokenizer.main()

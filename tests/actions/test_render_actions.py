@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from tasks.render_actions import render_actions as render_actions_task
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.actions_config import RenderActionsConfig
 from worldline_core.actions.episode_tracks import ActionTracks
@@ -22,7 +23,6 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.pipeline.steps import run_step
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.store import ArtifactStore
 
@@ -182,9 +182,9 @@ def test_data_that_is_gone_is_no_verdict_on_an_episode(linked, tmp_path, mode):
     store = ArtifactStore(tmp_path / "store", mode)
     curated.rename(tmp_path / "elsewhere")
     with pytest.raises(ArtifactError, match="shares recordings that are not there"):
-        run_step(store, "render_actions", CONFIG, {"episodes": filtered})
+        render_actions_task.run(store, CONFIG, {"episodes": filtered})
     (tmp_path / "elsewhere").rename(curated)
-    tracks = run_step(store, "render_actions", CONFIG, {"episodes": filtered})
+    tracks = render_actions_task.run(store, CONFIG, {"episodes": filtered})
     assert read_json(tracks.path / "manifest.json")["metrics"]["kept"] == 3
 
 
@@ -205,7 +205,7 @@ def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage, file
     filtered, curated = linked
     damage(next(path for path in sorted(curated.rglob(file)) if "episodes" not in path.parts))
     with pytest.raises(ArtifactError, match="An input of this step is missing or damaged"):
-        run_step(ArtifactStore(tmp_path / "store", "off"), "render_actions", CONFIG, {"episodes": filtered})
+        render_actions_task.run(ArtifactStore(tmp_path / "store", "off"), CONFIG, {"episodes": filtered})
     assert not list((tmp_path / "store" / "render_actions").glob("*/manifest.json"))
 
 

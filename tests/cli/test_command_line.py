@@ -29,8 +29,8 @@ def test_recordings_and_configurations_are_read_without_torch(project_root: Path
         "import sys; sys.modules['torch'] = None\n"
         "import worldline_core.data.curation.curate, worldline_core.filters.filter_config\n"
         "from worldline_core.pipeline.pipeline_config import PipelineConfig\n"
-        "from worldline_core.pipeline.steps import STEPS\n"
-        "print(len({step.load_config() for step in STEPS.values()}) == len(STEPS))"
+        "from tasks.execution.artifact_task import find_task, task_names\n"
+        "print(len({find_task(name).load_config() for name in task_names()}) == len(task_names()))"
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout.strip()) == (0, "True"), result.stderr
@@ -71,8 +71,8 @@ for command in ("pipeline", "nightly"):
         ("filter --preset tiny", ["filter", "worldline task curate"]),
         ("filter --preset tiny --input episode={tmp}", ["filter", "episodes"]),
         # The named step to run is a command that works.
-        ("render_actions --node render_actions.banks", ["`worldline task curate --node curate.banks`"]),
-        ("curate --node filter", ["filter", "curate.banks"]),
+        ("render_actions --name render_actions.banks", ["`worldline task curate --name curate.banks`"]),
+        ("curate --name filter", ["filter", "curate.banks"]),
     ],
 )
 def test_a_mistake_ends_with_a_clear_error(
@@ -85,21 +85,21 @@ def test_a_mistake_ends_with_a_clear_error(
     assert "Traceback" not in error
 
 
-def test_a_node_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`--node` once chose the first of two nodes of a step silently: banks were never curated."""
+def test_the_named_call_is_the_one_that_is_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--name` once chose the first of two calls of a step silently: banks were never curated."""
     missing = tmp_path / "no_such_banks"
     changed = ["--set", f"curate_banks.sources=[{{kind: episode_set, path: {missing}, name: banks}}]"]
     with pytest.raises(SystemExit, match="1"):
-        main(["task", "curate", "--node", "curate.banks", "--artifacts", str(tmp_path), *changed])
+        main(["task", "curate", "--name", "curate.banks", "--artifacts", str(tmp_path), *changed])
     said = capsys.readouterr().err
     assert str(missing) in said
     assert "sources[].path" in said
 
 
-def test_an_input_is_fed_to_the_node_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_input_is_fed_to_the_call_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         arguments = ["--artifacts", str(tmp_path / "store"), "--input", f"episodes={tmp_path}"]
-        main(["task", "render_actions", "--node", "render_actions.banks", *arguments])
+        main(["task", "render_actions", "--name", "render_actions.banks", *arguments])
     error = capsys.readouterr().err
     assert "not finished" not in error
     assert str(tmp_path) in error

@@ -13,14 +13,14 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from flows.command_line import build_parser
-from tasks.command_line import add_task_arguments
+from tasks.execution.artifact_task import find_task, task_names
+from tasks.execution.command_line import add_task_arguments
 from worldline_core.config import _known_keys
 from worldline_core.data.sources.calibration_file import CalibrationFile
 from worldline_core.data.sources.lerobot_columns import LeRobotSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSourceConfig
 from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.steps import STEPS
 from worldline_core.serving.serve_config import ServeConfig
 from worldline_core.training.training_config import Stage2Config, StageConfig
 
@@ -113,8 +113,8 @@ def test_documented_configurations_are_valid(page: str) -> None:
             model, given = SNIPPETS.get(key, PipelineConfig), {key: value}
             if page == "embodiments.md":
                 model = Embodiment
-            elif key in STEPS and key not in PipelineConfig.model_fields:
-                model, given = STEPS[key].load_config(), value
+            elif key in task_names() and key not in PipelineConfig.model_fields:
+                model, given = find_task(key).load_config(), value
             try:
                 model.model_validate(given)
             except ValidationError as error:

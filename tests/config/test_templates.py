@@ -7,6 +7,9 @@ from typing import Any, get_args
 
 import pytest
 
+from flows.pipeline import chain
+from tasks.execution.artifact_task import find_task
+from tasks.execution.chain import outline
 from worldline_core.config import CONFIG_ROOT, load_config, preset_names, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
@@ -15,8 +18,6 @@ from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import embodiment_names
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan
-from worldline_core.pipeline.steps import get_step
 from worldline_core.recorder.banks import RecordBanksConfig
 from worldline_core.recorder.policies import RecordPoliciesConfig
 from worldline_core.recorder.record import RecordConfig, plan_jobs
@@ -27,8 +28,8 @@ KNOWN = {*embodiment_names(), NO_EMBODIMENT}
 
 
 @pytest.mark.parametrize("preset", preset_names())
-def test_a_preset_is_a_plan(preset: str, project_root: Path) -> None:
-    assert plan(load_config(PipelineConfig, preset=preset), project_root)
+def test_a_preset_is_a_chain(preset: str) -> None:
+    assert outline(chain, PipelineConfig.load(preset))
 
 
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
@@ -47,7 +48,7 @@ def test_a_template_loads_as_it_is(path: Path) -> None:
     sections = read_yaml(path)
     assert "curate" in sections or path.parent.name != "sources"
     for section in sections:
-        config = load_config(get_step(section).load_config(), path=path, section=section)
+        config = load_config(find_task(section).load_config(), path=path, section=section)
         if isinstance(config, CurateConfig):
             assert all(
                 getattr(source, "embodiment", None) in {*KNOWN, None, "unspecified"} for source in config.sources

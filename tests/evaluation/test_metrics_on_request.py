@@ -11,6 +11,8 @@ import pytest
 import torch
 from scipy.linalg import sqrtm
 
+from flows.pipeline import chain, evaluate, predict, prepare
+from tasks.execution.chain import outline
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
@@ -23,7 +25,6 @@ from worldline_core.evaluation.video.metrics_on_request import (
     scene_consistency,
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan, without_training
 from worldline_core.report.context import ReportConfig, ReportContext
 from worldline_core.report.quality import quality_section
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
@@ -114,15 +115,16 @@ def test_what_is_asked_for_must_exist(recordings, tmp_path):
 
 def test_a_plan_asks_only_for_pairs_that_it_predicts(project_root: Path):
     config = load_config(PipelineConfig, preset="tiny")
-    nodes = plan(config, project_root)
-    whole, nightly = (
-        next(node.config for node in chosen if node.name == "evaluate_video")
-        for chosen in (nodes, without_training(nodes))
-    )
-    assert whole == nightly == config.evaluate_video
+
+    def nightly() -> None:
+        _, data = prepare(config)
+        evaluate(config, data, predict(config, data, trained={}))
+
+    for calls in (outline(chain, config), outline(nightly)):
+        assert calls["evaluate_video"].config == config.evaluate_video
     fewer = {name: run for name, run in config.rollouts.items() if name != "shipped_stage2_shuffled"}
-    nodes = plan(config.model_copy(update={"rollouts": fewer}), project_root)
-    assert next(node.config for node in nodes if node.name == "evaluate_video").changed_controls == {}  # pyright: ignore[reportAttributeAccessIssue]
+    calls = outline(chain, config.model_copy(update={"rollouts": fewer}))
+    assert calls["evaluate_video"].config.model_dump()["changed_controls"] == {}
 
 
 @pytest.mark.slow

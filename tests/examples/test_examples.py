@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from worldline_core.config import load_config
+from flows.pipeline import chain
+from tasks.execution.chain import outline, ready_inputs
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan, run_node
 from worldline_core.store.store import ArtifactStore
 
 pytestmark = pytest.mark.slow
@@ -43,10 +43,10 @@ def test_check_calibration(project_root: Path, tmp_path: Path) -> None:
 
 
 def test_evaluate_videos_of_another_simulator(project_root: Path, tmp_path: Path) -> None:
-    nodes = plan(load_config(PipelineConfig, preset="smoke"), project_root)
+    calls = outline(chain, PipelineConfig.load("smoke"))
     store = ArtifactStore(tmp_path / "artifacts")
-    run_node("curate", nodes, store)
-    kept = run_node("filter", nodes, store)
+    calls["curate"].task.run(store, calls["curate"].config, ready_inputs(calls["curate"], calls, store))
+    kept = calls["filter"].task.run(store, calls["filter"].config, ready_inputs(calls["filter"], calls, store))
     episodes = EpisodeSet.open(kept.path)
     number, row = next((i, row) for i, row in enumerate(episodes.rows) if row.split == "test")
     # A simulator that predicts that nothing moves.

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 from prefect import Flow
 
+from flows.pipeline import chain
+from tasks.execution.chain import outline
 from worldline_core.config import load_config, preset_names, read_yaml
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan
 
 TOP_KEYS = {"name", "prefect-version", "definitions", "deployments"}
 DEPLOYMENT_KEYS = {"name", "description", "entrypoint", "parameters", "schedules", "work_pool", "tags"}
@@ -29,8 +30,8 @@ def deployments(project_root: Path) -> list[dict[str, Any]]:
 def test_names(deployments: list[dict[str, Any]]) -> None:
     """The two flows, and every step of a run of the preset that they run."""
     names = [deployment["name"] for deployment in deployments]
-    nodes = plan(load_config(PipelineConfig, preset="tiny"), Path.cwd())
-    assert names == ["pipeline", "nightly-evaluation", *dict.fromkeys(node.step for node in nodes)]
+    calls = outline(chain, load_config(PipelineConfig, preset="tiny"))
+    assert names == ["pipeline", "nightly-evaluation", *dict.fromkeys(call.task.name for call in calls.values())]
 
 
 @pytest.mark.parametrize("index", range(14))

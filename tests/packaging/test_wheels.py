@@ -46,6 +46,6 @@ def test_an_empty_folder_is_enough(installed: Path, tmp_path: Path) -> None:
     assert "aloha_viperx" in _worldline(installed, tmp_path, "embodiment", "list")
     for step in ("curate", "filter", "render_actions"):
         assert "built" in _worldline(installed, tmp_path, "task", step, "--preset", "smoke")
-    made = _worldline(installed, tmp_path, "task", "rollout", "--preset", "smoke", "--node", "rollout.copy_first_frame")
+    made = _worldline(installed, tmp_path, "task", "rollout", "--preset", "smoke", "--name", "rollout.copy_first_frame")
     assert Path(made.split()[0], "manifest.json").is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["artifacts"]

@@ -9,17 +9,18 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 
+from flows.ablations import compare_variants
+from tasks.execution.chain import TaskCall, outline
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import Score, summarise, write_scores
-from worldline_core.pipeline.ablations import ablation_plan, matched_length, tokens_a_step
+from worldline_core.pipeline.ablations import choose_variants, matched_length, tokens_a_step, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import Node
-from worldline_core.pipeline.steps import STEPS
 from worldline_core.report.ablation_table import AblationTableConfig, ablation_table, load_variants
 from worldline_core.store.atomic import write_json_atomic
 
@@ -30,42 +31,46 @@ def load(changes: Sequence[str] = (), preset: str = "smoke") -> PipelineConfig:
     return load_config(PipelineConfig, preset=preset, overrides=list(changes))
 
 
+def variants_outline(*variants: str, **options: Any) -> dict[str, TaskCall]:
+    return outline(compare_variants, partial(load, **options), choose_variants(variants or None))
+
+
 @pytest.fixture(scope="module")
-def nodes(project_root: Path) -> dict[str, Node]:
-    return {node.name: node for node in ablation_plan(load, project_root)}
+def calls() -> dict[str, TaskCall]:
+    return variants_outline()
 
 
-def test_what_variants_share_is_one_node(nodes: dict[str, Node]) -> None:
-    assert [name for name in nodes if name.startswith("train_stage2")] == [
+def test_what_variants_share_is_one_call(calls: dict[str, TaskCall]) -> None:
+    assert [name for name in calls if name.startswith("train_stage2")] == [
         "train_stage2", *(f"train_stage2.{name}" for name in VARIANTS)
     ]  # fmt: skip
-    shared = {"curate", "filter", "render_actions", "encode_latents", "train_stage1", "curate.banks"}
-    assert shared <= nodes.keys()
-    assert not [
-        name
-        for name in nodes
-        for one in shared
-        if name.startswith(f"{one}.") and name not in shared | {"render_actions.banks"}
-    ]
-    assert not any(name.startswith(("distill", "evaluate_policy", "report")) for name in nodes)
-    for node in nodes.values():
-        STEPS[node.step].check_inputs(node.inputs)
-        assert all(source in nodes for source in node.inputs.values() if isinstance(source, str))
-    assert set(nodes["ablation_table"].inputs) == {
+    shared = (
+        "curate",
+        "filter",
+        "render_actions",
+        "encode_latents",
+        "train_stage1",
+        "curate.banks",
+        "render_actions.banks",
+    )
+    assert set(shared) == {
+        name for name, call in calls.items() if call.task.name in {n.partition(".")[0] for n in shared}
+    }
+    assert not any(name.startswith(("distill", "evaluate_policy", "report")) for name in calls)
+    assert set(calls["ablation_table"].inputs) == {
         f"{step}.{name}" for step in ("evaluate_video", "evaluate_planning") for name in ("full", *VARIANTS)
     }
 
 
-def test_a_run_that_rolls_out_stage1_has_a_variant_without_it(project_root: Path) -> None:
-    names = {node.name for node in ablation_plan(partial(load, preset="cosmos3-nano"), project_root)}
-    assert {f"train_stage2.{name}" for name in VARIANTS} <= names
+def test_a_run_that_rolls_out_stage1_has_a_variant_without_it() -> None:
+    assert {f"train_stage2.{name}" for name in VARIANTS} <= set(variants_outline(preset="cosmos3-nano"))
 
 
-def test_each_variant_changes_what_it_says_and_nothing_else(nodes: dict[str, Node]) -> None:
-    full = nodes["train_stage2"]
+def test_each_variant_changes_what_it_says_and_nothing_else(calls: dict[str, TaskCall]) -> None:
+    full = calls["train_stage2"]
 
     def changed(variant: str) -> dict[str, object]:
-        own, before = nodes[f"train_stage2.{variant}"].config.model_dump(), full.config.model_dump()
+        own, before = calls[f"train_stage2.{variant}"].config.model_dump(), full.config.model_dump()
         return {key: own.get(key) for key in own.keys() | before.keys() if own.get(key) != before.get(key)}
 
     assert changed("success_only") == {"outcomes": ("success",)}
@@ -75,13 +80,13 @@ def test_each_variant_changes_what_it_says_and_nothing_else(nodes: dict[str, Nod
     assert set(changed("no_action_free")) == {"trainer"}
     # 2 steps of Stage I on one view beside 2 steps of Stage II on three: two thirds of a step more.
     assert changed("no_action_free")["trainer"]["steps"] == 3  # type: ignore[index]
-    base = nodes["train_stage2.no_action_free"].inputs["stage1"]
+    base = calls["train_stage2.no_action_free"].inputs["stage1"]
     assert isinstance(base, Path)
     assert base.name == "base"
-    assert all(nodes[f"train_stage2.{name}"].inputs["stage1"] == "train_stage1" for name in VARIANTS[1:])
-    assert nodes["rollout.stage2.head_only"].config.model_dump()["views"] == ("head",)
-    assert nodes["evaluate_video.head_only"].config.model_dump()["views"] == ("head",)
-    assert nodes["rollout.stage2.native_film"].config == nodes["rollout.stage2"].config
+    assert all(calls[f"train_stage2.{name}"].inputs["stage1"] is calls["train_stage1"] for name in VARIANTS[1:])
+    assert calls["rollout.stage2.head_only"].config.model_dump()["views"] == ("head",)
+    assert calls["evaluate_video.head_only"].config.model_dump()["views"] == ("head",)
+    assert calls["rollout.stage2.native_film"].config == calls["rollout.stage2"].config
 
 
 def test_compute_is_matched_by_video_tokens() -> None:
@@ -94,16 +99,15 @@ def test_compute_is_matched_by_video_tokens() -> None:
 
 
 @pytest.mark.parametrize("preset", ["demo", "tiny", "cosmos3-nano"])
-def test_every_preset_has_ablations(preset: str, project_root: Path) -> None:
-    names = {node.name for node in ablation_plan(partial(load, preset=preset), project_root)}
-    assert {f"evaluate_video.{variant}" for variant in VARIANTS} <= names
+def test_every_preset_has_ablations(preset: str) -> None:
+    assert {f"evaluate_video.{variant}" for variant in VARIANTS} <= set(variants_outline(preset=preset))
 
 
-def test_mistakes_are_named(project_root: Path) -> None:
+def test_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match=r"(?s)Unknown ablation.*no_regularization.*got.*no_actions"):
-        ablation_plan(load, project_root, ["no_actions"])
+        choose_variants(["no_actions"])
     with pytest.raises(ConfigError, match="predicts nothing with its own"):
-        ablation_plan(lambda changes: load([*changes, "rollouts.stage2.checkpoint=causal"]), project_root)
+        variant_config(lambda changes: load([*changes, "rollouts.stage2.checkpoint=causal"]), load_variants()["full"])
     with pytest.raises(ConfigError, match=r"train_stage1: without it Stage II starts from models\.base"):
         load(["train_stage1=null", "models.base=null"])
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.command_line import add_task_arguments
+from tasks.execution.command_line import add_task_arguments
 from worldline_core.config import load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, UnavailableError
@@ -32,7 +32,7 @@ from worldline_core.training.clip_config import FrameInput
 
 PRESET = "cosmos3-nano"
 SIZES = {"image_size", "device", "steps", "workers", "student_layer", "clips", "start_step", "seeds", "timed_blocks",
-         "sources", "nodes_at_once"}  # fmt: skip
+         "sources", "steps_at_once"}  # fmt: skip
 FOLDERS = ("Cosmos3-Nano/vae", "Cosmos3-Nano/text_tokenizer", "base", "vjepa2-vitg-fpc64-384", "lpips", "sam3",
            "Qwen3-VL-8B-Instruct")  # fmt: skip
 
@@ -155,15 +155,15 @@ def test_recordings_are_those_of_a_robot_at_thirty_frames_a_second(tmp_path: Pat
     assert np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < 1e-6
 
 
-def test_torchrun_hands_the_node_on_to_the_step() -> None:
-    """It takes a `--node` for a short form of options of its own."""
+def test_torchrun_hands_the_name_of_a_call_on() -> None:
+    """It would take a `--node` for a short form of an option of its own."""
     from torch.distributed.run import parse_args
 
-    given = ["--plan-node", "train_stage2.head_only"]
+    given = ["--name", "train_stage2.head_only"]
     handed = parse_args(["--nproc-per-node", "2", "-m", "tasks.train_stage2", *given]).training_script_args
     parser = argparse.ArgumentParser()
     add_task_arguments(parser)
-    assert parser.parse_args(handed).node == "train_stage2.head_only"
+    assert parser.parse_args(handed).name == "train_stage2.head_only"
 
 
 @pytest.mark.slow

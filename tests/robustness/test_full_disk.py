@@ -14,12 +14,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tasks.command_line import exit_with_clear_errors
+from tasks.execution.artifact_task import find_task
+from tasks.execution.command_line import exit_with_clear_errors
 from tests.evaluation.conftest import _write as write_world
 from worldline_core.config import StrictModel
 from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.evaluation.planning.evaluate_planning import SEALED_FILE
-from worldline_core.pipeline.steps import run_step
 from worldline_core.report.report import ReportConfig
 from worldline_core.rollout.rollout import RolloutConfig
 from worldline_core.shipped import shipped_folder
@@ -100,7 +100,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Path
     bank = write_world(root / "bank", {"c-0": True, "c-1": False}, split="bank", bank="bank-0")
     table = pa.table({"episode_id": list(bank.outcomes), "outcome": list(bank.outcomes.values())})
     pq.write_table(table, bank.inputs["banks"] / SEALED_FILE)
-    scores = run_step(ArtifactStore(root), "evaluate_video", CONFIGS["evaluate_video"], recordings).path
+    scores = find_task("evaluate_video").run(ArtifactStore(root), CONFIGS["evaluate_video"], recordings).path
     tokenizer = shipped_folder() / "models" / "tokenizer"
     return {
         "rollout": {"episodes": recordings["episodes"], "tracks": recordings["tracks"], "tokenizer": tokenizer},
@@ -126,7 +126,7 @@ def test_the_later_steps_end_with_one_message_and_the_same_command_continues(
     step: str, disk: Path, tmp_path: Path, inputs: dict[str, dict[str, Path]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(root: Path) -> Artifact:
-        return run_step(ArtifactStore(root), step, CONFIGS[step], inputs[step])
+        return find_task(step).run(ArtifactStore(root), CONFIGS[step], inputs[step])
 
     whole = run(tmp_path / "elsewhere")
     (disk / step).mkdir()

@@ -180,7 +180,7 @@ def test_plain_urls_and_words_stay() -> None:
 
 
 def test_logs_hide_credentials_for_every_handler_behind(capsys: pytest.CaptureFixture[str]) -> None:
-    from tasks.command_line import log_to_stderr
+    from tasks.execution.command_line import log_to_stderr
 
     log_to_stderr()
     kept: list[str] = []
@@ -199,7 +199,7 @@ def test_logs_hide_credentials_for_every_handler_behind(capsys: pytest.CaptureFi
 
 def test_an_unforeseen_error_is_printed_without_credentials() -> None:
     code = (
-        "from tasks.command_line import exit_with_clear_errors\n"
+        "from tasks.execution.command_line import exit_with_clear_errors\n"
         "def fail(): raise RuntimeError('no answer from https://me:pw-secret@host/x, token token-secret-value')\n"
         "exit_with_clear_errors(fail)"
     )
@@ -219,7 +219,7 @@ def test_an_unforeseen_error_is_printed_without_credentials() -> None:
     ids=["no space", "quota", "file size", "safetensors"],
 )
 def test_a_full_disk_ends_a_command_with_one_message(full: Exception, capsys: pytest.CaptureFixture[str]) -> None:
-    from tasks.command_line import exit_with_clear_errors
+    from tasks.execution.command_line import exit_with_clear_errors
 
     def fail() -> None:
         raise full

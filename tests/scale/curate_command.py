@@ -7,7 +7,7 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    from tasks.shard_mapper import shard_mapper
+    from tasks.execution.shard_mapper import shard_mapper
     from worldline_core.data.curation.curate import curate
     from worldline_core.data.curation.curate_config import CurateConfig
     from worldline_core.scale.mapping import RunnerConfig

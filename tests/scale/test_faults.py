@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -175,14 +174,10 @@ def test_runner_settings() -> None:
 
 
 def test_the_runner_is_no_part_of_a_key() -> None:
-    from worldline_core.config import load_config
+    from flows.pipeline import chain
+    from tasks.execution.chain import outline
     from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.plan import plan
 
-    plain, dask = (
-        plan(load_config(PipelineConfig, preset="tiny", overrides=overrides), Path.cwd())
-        for overrides in ((), ("runner.kind=dask", "runner.episodes_per_shard=3"))
-    )
-    assert [json.dumps(node.config.model_dump(mode="json")) for node in plain] == [
-        json.dumps(node.config.model_dump(mode="json")) for node in dask
-    ]
+    configs = [PipelineConfig.load("tiny", None, changed) for changed in ((), ("runner.kind=dask", "runner.workers=3"))]
+    plain, dask = (outline(chain, config) for config in configs)
+    assert {name: call.config for name, call in plain.items()} == {name: call.config for name, call in dask.items()}

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tasks.shard_mapper import shard_mapper
+from tasks.execution.shard_mapper import shard_mapper
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine
@@ -93,7 +93,7 @@ def test_other_sizes_of_shards(recordings: Path, undisturbed: tuple[str, str], t
 CURATION = """
 import json, sys
 from pathlib import Path
-from tasks.shard_mapper import shard_mapper
+from tasks.execution.shard_mapper import shard_mapper
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.scale.mapping import RunnerConfig
@@ -138,15 +138,17 @@ def test_in_a_flow_the_shards_are_tasks_with_names(
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName
 
-    from tasks.artifact_task import ArtifactReference, artifact_task
-    from worldline_core.pipeline.pipeline_config import source_inputs
+    from tasks.curate import curate as curate_task
+    from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+    from worldline_core.pipeline.pipeline_config import source_folders
 
     configured, settings = config(recordings), runner("processes", workers=1, episodes_per_shard=4)
 
     @flow(flow_run_name=str(tmp_path))
     def one_step() -> ArtifactReference:
-        inputs = source_inputs(configured, tmp_path)
-        return artifact_task("curate")(configured, inputs, store_root=tmp_path / "artifacts", runner=settings)
+        with PrefectRun(tmp_path / "artifacts", settings) as run:
+            curate_task.submit(configured, source=source_folders(configured))
+        return run.artifacts["curate"]
 
     assert one_step().digest == undisturbed[0]
     shards = {f"curate shard {number}" for number in range(3)}

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from number_work import NumberFileWork, NumberWork, attempts, do_numbers
 
-from tasks.shard_mapper import shard_mapper
+from tasks.execution.shard_mapper import shard_mapper
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.scale.mapping import (
     RunnerConfig,
@@ -120,7 +120,7 @@ def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path, monkeypatch: p
     """Ten shards wait as plain values; no more than `in_flight` are with the runner when one is answered."""
     from prefect.task_runners import ThreadPoolTaskRunner
 
-    monkeypatch.setattr("tasks.shard_mapper.process_runner", ThreadPoolTaskRunner)  # a thread starts at once
+    monkeypatch.setattr("tasks.execution.shard_mapper.process_runner", ThreadPoolTaskRunner)  # a thread starts at once
     begun_before_taken: list[int] = []
     config = RunnerConfig.model_validate({"kind": "processes", "workers": 1, "in_flight": 3})
 

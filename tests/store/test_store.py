@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
+from tasks.execution.artifact_task import find_task
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.pipeline.steps import get_step
 from worldline_core.store import store as store_module
 from worldline_core.store.artifact_files import digest_folder, digest_value, folder_files
 from worldline_core.store.atomic import atomic_path, write_arrays_atomic, write_bytes_atomic, write_json_atomic
@@ -120,7 +120,7 @@ def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) ->
     named = {"sam3_weights": "sam3", "vlm": {"weights": "qwen"}}
 
     def read(step: str, values: dict[str, Any]) -> dict[str, Path]:
-        config = get_step(step).load_config().model_validate(values)
+        config = find_task(step).load_config().model_validate(values)
         return {name: path for name, path in config.weights_read().items() if path is not None}
 
     sam3, vlm = {"sam3": Path("sam3")}, {"vlm": Path("qwen")}

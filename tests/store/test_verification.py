@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 from flows.command_line import main
+from flows.pipeline import chain
+from tasks.execution.chain import TaskCall, outline, ready_inputs
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import Node, plan, run_node
 from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.store import artifact_files
 from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
@@ -57,12 +58,13 @@ def flipped(path: Path, position: int, bit: int) -> Iterator[None]:
 class Run(dict[str, Path]):
     """Finished artifacts of two recordings, each made when it is asked for, after those that it may need."""
 
-    def __init__(self, nodes: list[Node], store: ArtifactStore) -> None:
-        self.nodes, self.store = nodes, store
+    def __init__(self, calls: dict[str, TaskCall], store: ArtifactStore) -> None:
+        self.calls, self.store = calls, store
 
     def __missing__(self, kind: str) -> Path:
         for name in [name for name in KINDS[: KINDS.index(kind) + 1] if name not in self]:
-            self[name] = run_node(name, self.nodes, self.store).path
+            call = self.calls[name]
+            self[name] = call.task.run(self.store, call.config, ready_inputs(call, self.calls, self.store)).path
         return self[kind]
 
 
@@ -75,7 +77,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Run:
         "train_stage1.trainer.validation_batches=0",
     ]
     settings = load_config(PipelineConfig, preset="smoke", overrides=[recordings, *small])
-    return Run(plan(settings, project_root), ArtifactStore(tmp_path_factory.mktemp("store")))
+    return Run(outline(chain, settings), ArtifactStore(tmp_path_factory.mktemp("store")))
 
 
 @pytest.mark.parametrize("kind", [*KINDS[:-1], pytest.param(KINDS[-1], marks=pytest.mark.slow)])

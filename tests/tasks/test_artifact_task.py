@@ -7,7 +7,7 @@ import json
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,38 +18,28 @@ from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.client.schemas.sorting import TaskRunSort
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
-from tasks.artifact_task import ArtifactReference, artifact_task
-from worldline_core.config import StrictModel
-from worldline_core.pipeline import steps
-from worldline_core.pipeline.steps import Step
+from tasks.execution.artifact_task import ArtifactTask
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.scale.mapping import RunnerConfig
 
 
-class WriteConfig(StrictModel):
-    text: str = "a"
-
-
-def write(config: WriteConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
-    before = "".join((folder / "text").read_text() for folder in inputs.values())
-    (output / "text").write_text(before + config.text)
-    return {}
-
-
-class WriteStep(Step):
-    def load_function(self) -> Any:
-        return write
-
-    def load_config(self) -> type[StrictModel]:
-        return WriteConfig
-
-
-def _run(root: Path, first: str, second: str) -> tuple[ArtifactReference, ArtifactReference]:
+def _run(
+    root: Path, tasks: tuple[ArtifactTask, ArtifactTask], first: str, second: str
+) -> tuple[ArtifactReference, ArtifactReference]:
     @flow
-    def two_steps() -> tuple[ArtifactReference, ArtifactReference]:
-        one = artifact_task("write_one")(WriteConfig(text=first), {}, store_root=root, name="one")
-        two = artifact_task("write_two")(WriteConfig(text=second), {"before": one}, store_root=root, name="two")
-        return one, two
+    def two_steps() -> dict[str, ArtifactReference]:
+        with PrefectRun(root, RunnerConfig()) as run:
+            one = tasks[0].submit(tasks[0].load_config()(text=first), "one")
+            tasks[1].submit(tasks[1].load_config()(text=second), "two", before=one)
+        return run.artifacts
 
-    return two_steps()
+    made = two_steps()
+    return made["one"], made["two"]
+
+
+@pytest.fixture
+def writers(declare: Any) -> tuple[ArtifactTask, ArtifactTask]:
+    return declare("write_one"), declare("write_two", "before")
 
 
 def _last_states() -> dict[str, str]:
@@ -70,24 +60,22 @@ def _shown(expected: dict[str, str]) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_prefect_shows_what_the_store_has(
-    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    prefect_server: None, tmp_path: Path, writers: tuple[ArtifactTask, ArtifactTask]
 ) -> None:
-    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
-        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
-        one, two = _run(tmp_path, "a", "b")
+        one, two = _run(tmp_path, writers, "a", "b")
         assert (two.path / "text").read_text() == "ab"
         assert _shown(expected := {"one": "Completed", "two": "Completed"}) == expected
 
-        assert _run(tmp_path, "a", "b") == (one, two)
+        assert _run(tmp_path, writers, "a", "b") == (one, two)
         assert _shown(expected := {"one": "Cached", "two": "Cached"}) == expected
 
-        changed_one, changed_two = _run(tmp_path, "a", "c")
+        changed_one, changed_two = _run(tmp_path, writers, "a", "c")
         assert (changed_one, (changed_two.path / "text").read_text()) == (one, "ac")
         assert _shown(expected := {"one": "Cached", "two": "Completed"}) == expected
 
         shutil.rmtree(one.path)
-        assert _run(tmp_path, "a", "b") == (one, two)
+        assert _run(tmp_path, writers, "a", "b") == (one, two)
         assert (one.path / "text").read_text() == "a"
         assert _shown(expected := {"one": "Completed", "two": "Cached"}) == expected
 
@@ -126,34 +114,34 @@ def _records(trap: Path, elsewhere: Path) -> dict[str, Callable[[dict[str, Any]]
     "kind", ["pickle", "a decoder", "another place", "a class", "no record", "half a character", "a folder"]
 )
 def test_prefects_records_are_not_believed(
-    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    prefect_server: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    writers: tuple[ArtifactTask, ArtifactTask],
 ) -> None:
-    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
-        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
     (tmp_path / "trap_door.py").write_text(f"open({str(tmp_path / 'trap')!r}, 'w')")
     monkeypatch.syspath_prepend(tmp_path)
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
-        one, two = _run(tmp_path, "a", "b")
+        one, two = _run(tmp_path, writers, "a", "b")
         change = _records(tmp_path / "trap", tmp_path / "elsewhere").get(kind)
         for path in (tmp_path / "prefect").iterdir():
             record = json.loads(path.read_text())
             path.unlink()
             path.mkdir() if change is None else path.write_text(json.dumps(change(record)))
-        assert _run(tmp_path, "a", "b") == (one, two)
+        assert _run(tmp_path, writers, "a", "b") == (one, two)
     assert not (tmp_path / "trap").exists()
 
 
 @pytest.mark.slow
 def test_a_store_that_was_moved_is_found_where_it_is(
-    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    prefect_server: None, tmp_path: Path, writers: tuple[ArtifactTask, ArtifactTask]
 ) -> None:
-    for name, inputs in (("write_one", ()), ("write_two", ("before",))):
-        monkeypatch.setitem(steps.STEPS, name, WriteStep(name, 1, "", "", "", inputs))
     before, after = tmp_path / "before", tmp_path / "after"
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: before / "prefect"}):
-        _run(before, "a", "b")
+        _run(before, writers, "a", "b")
     before.rename(after)
     with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: after / "prefect"}):
-        one, two = _run(after, "a", "b")
+        one, two = _run(after, writers, "a", "b")
     assert (one.path.parents[1], two.path.parents[1]) == (after, after)
     assert not before.exists()

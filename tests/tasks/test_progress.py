@@ -81,7 +81,7 @@ def test_other_processes_of_the_same_loop_are_silent(piped: pytest.LogCaptureFix
 
 TERMINAL = """
 import logging, time
-from tasks.command_line import log_to_stderr
+from tasks.execution.command_line import log_to_stderr
 from worldline_core.progress import Progress
 
 log_to_stderr()

@@ -26,7 +26,7 @@ SLOW_ROLLBACK = """
         Connection.rollback = slow_rollback
 """
 SHORT_RUN = """
-    from tasks.temporary_server import set_up_temporary_server
+    from tasks.execution.temporary_server import set_up_temporary_server
 
     set_up_temporary_server()
     from prefect import flow, task
@@ -46,11 +46,11 @@ SHORT_RUN = """
 KILLED = """
     import os, signal, sys
     from pathlib import Path
-    from tasks.temporary_server import set_up_temporary_server
+    from tasks.execution.temporary_server import set_up_temporary_server
 
     set_up_temporary_server()
     from prefect import flow, task
-    from tasks.prefect_artifacts import run_flow, show_in_prefect
+    from tasks.execution.prefect_artifacts import run_flow, show_in_prefect
     from worldline_core.errors import UnavailableError
 
     def kill_server():

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from tasks.shard_mapper import PrefectMapper, shard_mapper
+from tasks.execution.shard_mapper import PrefectMapper, shard_mapper
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.scale.account import read_account

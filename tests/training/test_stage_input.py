@@ -11,11 +11,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from flows.pipeline import chain
+from tasks.execution.chain import outline
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import plan
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_config import EncodeLatentsConfig
@@ -195,19 +196,18 @@ def test_the_input_that_is_missing_is_named(world: Any, tiny_model: dict[str, ob
             train_stage1(stage1(tiny_model, **values), {"episodes": world.episodes}, tmp_path / name)
 
 
-def test_the_plan_gives_a_stage_what_it_reads(tmp_path: Path) -> None:
+def test_the_chain_gives_a_stage_what_it_reads(tmp_path: Path) -> None:
     config, strides = load_config(PipelineConfig, preset="cosmos3-nano"), {}
-    nodes = {node.name: node for node in plan(config, tmp_path)}
+    calls = outline(chain, config)
     for name in ("train_stage1", "train_stage2"):
-        assert nodes[name].inputs["tokenizer"] == tmp_path / config.models.tokenizer
-        assert "latents" not in nodes[name].inputs
+        assert calls[name].inputs["tokenizer"] == Path.cwd() / config.models.tokenizer
+        assert "latents" not in calls[name].inputs
         clips = getattr(config, name).clips
         strides[name] = clips.strides
         assert clips.lengths[0] == 33
         assert clips.lengths[-1] == 129
     # Stage I spans longer motion, Stage II is denser (method.md section 1).
     assert min(strides["train_stage1"]) > max(strides["train_stage2"])
-    tiny = {node.name: node for node in plan(load_config(PipelineConfig, preset="tiny"), tmp_path)}
+    tiny = outline(chain, load_config(PipelineConfig, preset="tiny"))
     for name in ("train_stage1", "train_stage2"):
-        assert tiny[name].inputs["latents"] == "encode_latents"
-        assert "tokenizer" not in tiny[name].inputs
+        assert tiny[name].inputs["latents"] is tiny["encode_latents"]

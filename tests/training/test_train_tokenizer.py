@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
+from tasks.train_tokenizer import train_tokenizer as tokenizer_task
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.small_decoder import SmallDecoder
-from worldline_core.pipeline.steps import get_step
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.train_tokenizer import train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig
@@ -49,7 +49,7 @@ def test_the_step_writes_a_tokenizer_its_losses_and_its_metrics(trained: Path) -
 
 def test_a_decoder_is_trained_further_on_the_bases_of_its_start(world: Any, trained: Path, tmp_path: Path) -> None:
     inputs = {"episodes": world.episodes, "start": trained, "held_out": world.episodes}
-    get_step("train_tokenizer").check_inputs(inputs)
+    tokenizer_task.check_inputs(inputs)
     metrics = train_tokenizer(CONFIG, inputs, tmp_path)
     before, after = PatchTokenizer.load(trained), PatchTokenizer.load(tmp_path)
     assert after.encoder_digest == before.encoder_digest
@@ -74,7 +74,7 @@ def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(
     world: Any, trained: Path, tmp_path: Path
 ) -> None:
     inputs = {"episodes": world.episodes, "encoder": trained}
-    get_step("train_tokenizer").check_inputs(inputs)
+    tokenizer_task.check_inputs(inputs)
     before = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
     found = [
         train_tokenizer(CONFIG.model_copy(update={"steps": steps}), inputs, tmp_path / str(steps)) for steps in (0, 12)

@@ -1,65 +1,42 @@
 """The paper's ablations as variants of one run (paper, "Ablation Studies" and appendix, "Ablation Protocol").
 
-A variant is a named set of changes to a run's configuration. The plan of all variants holds every node once: what a variant
-does not change (recordings, filters, Stage I) has the same key in the store, and is one node here.
+A variant is a named set of changes to a run's configuration. What it does not change (recordings, filters, Stage I) has the
+same key in the store.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import cast
 
 from worldline_core.config import validate
 from worldline_core.errors import ConfigError
 from worldline_core.pipeline.pipeline_config import PipelineConfig, RolloutRun
-from worldline_core.pipeline.plan import Node, plan
-from worldline_core.report.ablation_table import AblationTableConfig, Variant, load_variants
+from worldline_core.report.ablation_table import Variant, load_variants
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.training.training_config import StageConfig
 
 FULL, METHOD = "full", "stage2"
-TABLE = "ablation_table"
-EVALUATIONS = ("evaluate_video", "evaluate_planning")
+
+type LoadConfig = Callable[[Sequence[str]], PipelineConfig]
+"""Loads the run's configuration with some more ``a.b=value`` overrides."""
 
 
-def ablation_plan(
-    load: Callable[[Sequence[str]], PipelineConfig], project: Path, names: Sequence[str] | None = None
-) -> list[Node]:
-    """The nodes of the full model's row and of those of ``names`` (default: all five), and the table at the end.
-
-    Args:
-        load: the run's configuration with some more ``a.b=value`` overrides.
-
-    Raises:
-        ConfigError: there is no such variant; or the run has no rollout of its Stage II model, or no base model.
-    """
+def choose_variants(names: Sequence[str] | None = None) -> dict[str, Variant]:
+    """The full model's row and those of ``names`` (default: all five). Raises ConfigError for an unknown name."""
     variants = load_variants()
     if unknown := sorted(set(names or ()) - set(variants)):
         raise ConfigError("Unknown ablation", expected=f"some of {', '.join(variants)}", got=unknown)
-    chosen = [name for name in variants if name == FULL or names is None or name in names]
-    full = _with_rows(load([]))
-    nodes: list[Node] = []
-    known: dict[tuple[str, str, tuple[tuple[str, str | Path], ...]], str] = {}
-    results: dict[str, str | Path] = {}
-    for name in chosen:
-        renamed: dict[str, str] = {}
-        for node in _evaluated(plan(variant_config(load, full, variants[name]), project)):
-            inputs = {key: renamed.get(f"{s}", s) if isinstance(s, str) else s for key, s in node.inputs.items()}
-            content = (node.step, node.config.model_dump_json(), tuple(sorted(inputs.items(), key=str)))
-            if content not in known:
-                known[content] = node.name if name == FULL else f"{node.name}.{name}"
-                nodes.append(Node(known[content], node.step, node.config, inputs))
-            renamed[node.name] = known[content]
-        results |= {f"{step}.{name}": renamed[step] for step in EVALUATIONS if step in renamed}
-    rows = {name: variants[name] for name in chosen}
-    return [*nodes, Node(TABLE, TABLE, AblationTableConfig(method=METHOD, variants=rows), results)]
+    return {name: row for name, row in variants.items() if name == FULL or names is None or name in names}
 
 
-def variant_config(
-    load: Callable[[Sequence[str]], PipelineConfig], full: PipelineConfig, variant: Variant
-) -> PipelineConfig:
-    """The configuration of a variant of the run whose configuration, with the table's rollouts, is ``full``."""
+def variant_config(load: LoadConfig, variant: Variant) -> PipelineConfig:
+    """The configuration of a variant, with the rollouts and evaluations of its row of the table alone.
+
+    Raises:
+        ConfigError: the run has no rollout of its Stage II model, or no base model.
+    """
+    full = _with_row(load([]))
     changes = [change for change in variant.changes if _section(full, change) is not None]
     # Its rollouts are not rows of the table, and a variant may train no Stage I.
     changes += [f"rollouts.{name}=null" for name, run in load([]).rollouts.items() if run.checkpoint == "stage1"]
@@ -69,7 +46,8 @@ def variant_config(
         name: run.model_copy(update={"config": _changed(_settings(run), variant)})
         for name, run in full.rollouts.items()
     }
-    return load(changes).model_copy(update={"rollouts": rollouts})
+    own = {"rollouts": rollouts, "evaluate_policy": None, "curate_banks": full.curate_banks}
+    return load(changes).model_copy(update=own)
 
 
 def matched_length(config: PipelineConfig) -> str:
@@ -104,8 +82,8 @@ def tokens_a_step(stage: StageConfig, views: int) -> float:
     return stage.trainer.batch_size * stage.trainer.accumulation * latent_frames * mean_views
 
 
-def _with_rows(config: PipelineConfig) -> PipelineConfig:
-    """The run with the rollouts of the table's rows alone: its Stage II model on recordings, and on banks where it plans."""
+def _with_row(config: PipelineConfig) -> PipelineConfig:
+    """The run with the rollouts of a table's row alone: its Stage II model on recordings, and on banks where it plans."""
     runs = [run for run in config.rollouts.values() if run.checkpoint == METHOD and _settings(run).actions == "true"]
     recordings = next((run for run in runs if run.episodes == "recordings"), None)
     if recordings is None:
@@ -124,7 +102,8 @@ def _with_rows(config: PipelineConfig) -> PipelineConfig:
             episodes="banks",
             config=_checked({**_settings(recordings).model_dump(), **{k: getattr(on_banks[0], k) for k in _CHOICE}}),
         )
-    return config.model_copy(update={"rollouts": rows})
+    banks = config.curate_banks if f"banks_{METHOD}" in rows else None
+    return config.model_copy(update={"rollouts": rows, "curate_banks": banks})
 
 
 _CHOICE = ("splits", "banks", "embodiments", "max_episodes_per_embodiment", "num_frames", "batch_size")
@@ -146,12 +125,3 @@ def _checked(values: dict[str, object]) -> RolloutConfig:
 def _section(config: PipelineConfig, change: str) -> object:
     """The section that a change is of; None where the run has none."""
     return getattr(config, change.partition(".")[0].partition("=")[0], None)
-
-
-def _evaluated(nodes: Sequence[Node]) -> list[Node]:
-    """The evaluations of the table, and what they need."""
-    needed: set[str] = set(EVALUATIONS)
-    for node in reversed(nodes):
-        if node.name in needed:
-            needed |= {source for source in node.inputs.values() if isinstance(source, str)}
-    return [node for node in nodes if node.name in needed]

@@ -1,17 +1,15 @@
-"""The configuration of a whole run: one section a verb. A preset is one YAML file of this form.
-
-The folders that curation reads, as inputs of its cache key: a changed recording means new work.
-"""
+"""The configuration of a whole run: one section a verb. A preset is one YAML file of this form."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import RenderActionsConfig
-from worldline_core.config import StrictModel
+from worldline_core.config import StrictModel, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import UnavailableError
@@ -24,7 +22,7 @@ from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.shipped import project_path
 from worldline_core.store.remote import is_remote
 from worldline_core.training.clip_config import EncodeLatentsConfig, FrameInput
-from worldline_core.training.training_config import Stage1Config, Stage2Config
+from worldline_core.training.training_config import Stage1Config, Stage2Config, StageConfig
 
 
 class ModelPaths(StrictModel):
@@ -82,6 +80,42 @@ class PipelineConfig(StrictModel):
     runner: RunnerConfig = Field(
         default=RunnerConfig(), description="where work on many episodes runs; changes no result and no cache key"
     )
+
+    @classmethod
+    def load(cls, preset: str | None, path: Path | None = None, overrides: Sequence[str] = ()) -> Self:
+        """Read a preset, or a file of the same form instead, and apply ``a.b=value`` overrides."""
+        return load_config(cls, preset=None if path else preset, path=path, overrides=overrides)
+
+    @property
+    def caches_latents(self) -> bool:
+        """Whether a training reads latents that `encode_latents` made before it."""
+        stages = (self.train_stage1, self.train_stage2, self.distill)
+        return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
+
+    def clips_of[T](self, stage: StageConfig | DistillConfig, latents: T) -> dict[str, T | Path]:
+        """The input that gives a training its clips: cached latents, or the tokenizer that encodes the videos."""
+        if isinstance(stage.input, FrameInput):
+            return {"tokenizer": self.model_folders()["tokenizer"]}
+        return {"latents": latents}
+
+    def rollouts_of(self, *, banks: bool) -> list[tuple[str, RolloutRun]]:
+        """Names and settings of the rollouts on recordings, or on candidate banks."""
+        return [(name, run) for name, run in self.rollouts.items() if (run.episodes == "banks") == banks]
+
+    def model_folders(self) -> dict[str, Path]:
+        """Folders of the weights that the run starts from or compares with, those that it names."""
+        named = self.models.model_dump().items()
+        return {name: project_path(Path.cwd(), path) for name, path in named if path is not None}
+
+    def shipped_checkpoints(self) -> dict[str, Path]:
+        """Folders of the checkpoints that a rollout may name and this run does not make."""
+        folders = self.model_folders()
+        shipped = {f"shipped_{name}": folders[name] for name in ("stage2", "causal") if name in folders}
+        return shipped | {name: folder for name, folder in folders.items() if name == "base"}
+
+    def videos_folder(self, run: RolloutRun) -> Path:
+        """Folder of an imported rollout's videos."""
+        return project_path(Path.cwd(), cast("Path", run.videos))
 
     @model_validator(mode="after")
     def _references_exist(self) -> PipelineConfig:
@@ -190,11 +224,12 @@ def check_recordings(config: PipelineConfig, project: Path) -> None:
         )
 
 
-def source_inputs(config: StrictModel, project: Path) -> dict[str, Path]:
-    """``source.<n>`` -> folder or location in an object store, in the order of the configuration. Relative folders are
-    taken from ``project``."""
-    sources = getattr(config, "sources", ())
+def source_folders(config: CurateConfig) -> dict[str, Path]:
+    """Folders or object-store locations of the recordings, numbered in the order of the configuration.
+
+    They are inputs of curation's cache key: a changed recording means new work.
+    """
     return {
-        f"source.{number}": source.path if is_remote(source.path) else project_path(project, source.path)
-        for number, source in enumerate(sources)
+        f"{number}": source.path if is_remote(source.path) else project_path(Path.cwd(), source.path)
+        for number, source in enumerate(config.sources)
     }

@@ -29,7 +29,7 @@ from worldline_core.recorder.rendering import prepare_rendering
 from worldline_core.recorder.scene_model import FRAME_RATE
 from worldline_core.recorder.simulate import EpisodeRecorder
 from worldline_core.recorder.things import TASKS
-from worldline_core.scale.process_end import end_with_pool
+from worldline_core.scale.process import end_with_pool
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.store import describe_environment, folder_lock

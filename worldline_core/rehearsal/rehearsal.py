@@ -18,7 +18,7 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
 from worldline_core.geometry.rotations import nearest_rotation
-from worldline_core.pipeline.ablations import ablation_plan
+from worldline_core.pipeline.ablations import choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.shipped import shipped_folder
@@ -57,7 +57,7 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.*.seeds", [42], "one seed is enough beside them"),
     ("rollouts.*.steps", 4, "Euler steps of a whole clip"),
     ("rollouts.*.timed_blocks", 10, "past the window of the cache"),
-    ("runner.nodes_at_once", 2, "two cores"),
+    ("runner.steps_at_once", 2, "two cores"),
 )
 """Pattern of a dotted key, its small value, and why; the first that fits holds. What no pattern names stays as it is."""
 
@@ -71,7 +71,7 @@ ABLATION_SIZES: tuple[tuple[str, Any, str], ...] = (
 OTHER_INPUT_SIZES: tuple[tuple[str, Any, str], ...] = (("distill.clips.lengths", [33], "two blocks"),)
 """What the second distillation changes besides: see :func:`other_input`."""
 
-ALWAYS = ("curate.sources", "encode_latents.start_step", "runner.nodes_at_once")
+ALWAYS = ("curate.sources", "encode_latents.start_step", "runner.steps_at_once")
 """Changed whatever they are; of the others nothing is made larger, and what is off stays off."""
 
 
@@ -184,7 +184,8 @@ def prepare(
         def load(more: Sequence[str]) -> PipelineConfig:
             return load_config(PipelineConfig, preset=preset, path=path, overrides=[*changed, *more])
 
-        ablation_plan(load, folder)
+        for variant in choose_variants().values():
+            variant_config(load, variant)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / CHANGES_FILE) as temporary:
         temporary.write_text(

@@ -294,10 +294,10 @@ class RunnerConfig(StrictModel):
         description="how a step's inputs are compared with what was written. full: the digest of every file, once a process;"
         " fast: sizes, and the digests of files changed after their manifest; off",
     )
-    nodes_at_once: int = Field(
+    steps_at_once: int = Field(
         default=1,
         ge=1,
-        description="nodes of a run side by side, each in a process with its share of the cores; for runs on a CPU, whose"
+        description="steps of a run side by side, each in a process with its share of the cores; for runs on a CPU, whose"
         " last bits depend on the number of threads",
     )
 

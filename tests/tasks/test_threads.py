@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import torch
 
+from tasks.execution.artifact_task import ArtifactTask
 from worldline_core.config import StrictModel
 from worldline_core.errors import ArtifactError
-from worldline_core.pipeline import steps
-from worldline_core.pipeline.steps import Step, run_step
+from worldline_core.scale.process import same_threads
 from worldline_core.store.store import ArtifactStore
 
 seen: list[int] = []
@@ -31,12 +31,8 @@ def work(config: SumConfig, inputs: Mapping[str, Path], output: Path) -> dict[st
     return {}
 
 
-class SumStep(Step):
-    def load_function(self) -> Any:
-        return work
-
-    def load_config(self) -> type[StrictModel]:
-        return SumConfig
+def _load(address: str) -> Any:
+    return {"work": work, "config": SumConfig}[address]
 
 
 @pytest.fixture
@@ -49,13 +45,14 @@ def threads() -> Iterator[int]:
 def test_a_step_is_continued_on_the_threads_that_it_began_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    monkeypatch.setitem(steps.STEPS, "sum", SumStep("sum", 1, "", "", "", ()))
+    monkeypatch.setattr("tasks.execution.artifact_task._load", _load)
+    task = ArtifactTask("sum", "", 1, "work", "config")
     seen.clear()
     torch.set_num_threads(3)
     with pytest.raises(KeyboardInterrupt):
-        run_step(ArtifactStore(tmp_path), "sum", SumConfig(), {})
+        task.run(ArtifactStore(tmp_path), SumConfig(), {})
     torch.set_num_threads(1)
-    artifact = run_step(ArtifactStore(tmp_path), "sum", SumConfig(), {})
+    artifact = task.run(ArtifactStore(tmp_path), SumConfig(), {})
     assert seen == [3, 3]
     assert torch.get_num_threads() == 1
     manifest = json.loads((artifact.path / "manifest.json").read_text())
@@ -67,6 +64,6 @@ def test_a_number_of_threads_that_is_none_is_refused(tmp_path: Path, threads: in
     """Left aside, the bytes would depend on where the work was stopped; believed, a million threads would be started."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "threads.json").write_text(json.dumps({"threads": begun}))
-    with pytest.raises(ArtifactError, match="Not a number of threads"), steps.same_threads(tmp_path):
+    with pytest.raises(ArtifactError, match="Not a number of threads"), same_threads(tmp_path):
         pass
     assert torch.get_num_threads() == threads

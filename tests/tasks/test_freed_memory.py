@@ -11,7 +11,7 @@ import pytest
 
 _CODE = """
 import resource, sys
-from worldline_core.pipeline.steps import keep_freed_memory
+from worldline_core.scale.process import keep_freed_memory
 kept = keep_freed_memory() if sys.argv[1] == "keep" else False
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt

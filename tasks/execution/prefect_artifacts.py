@@ -17,7 +17,7 @@ import httpx
 from prefect import Flow
 from prefect.artifacts import create_image_artifact, create_link_artifact, create_table_artifact
 
-from tasks.artifact_task import ArtifactReference
+from tasks.execution.prefect_run import ArtifactReference
 from worldline_core.errors import UnavailableError, WorldLineError
 from worldline_core.report.comparison import collect_metrics
 
@@ -59,7 +59,7 @@ def is_worth_saying(record: logging.LogRecord) -> bool:
     return "aborted by a termination signal" not in record.getMessage()
 
 
-def report_pictures(report: Path) -> list[Path]:
+def _report_pictures(report: Path) -> list[Path]:
     """Pictures of a report to show: what was recorded, and what was predicted of the first episode."""
     return [
         path
@@ -68,14 +68,16 @@ def report_pictures(report: Path) -> list[Path]:
     ]
 
 
-def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures: Sequence[Path] = ()) -> None:
+def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures: Sequence[Path] | None = None) -> None:
     """Add the artifacts `report`, `metrics` and `pictures` (a link, a table, images) to the flow run that calls this.
 
     Args:
         page: folder of the report or comparison, with `index.html`.
         done: the artifacts of the run by the nodes' names; its evaluations fill the table.
-        pictures: files to show. They travel inside of the artifacts: a page that a browser has over http may not show files.
+        pictures: files to show (default: the report's). They travel inside of the artifacts: a page that a browser has over
+            http may not show files.
     """
+    pictures = _report_pictures(done["report"].folder) if pictures is None else pictures
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     rows = [
         {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}

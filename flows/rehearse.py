@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import worldline_core
-from worldline_core.config import load_config
+from flows.pipeline import chain
+from tasks.execution.chain import find_artifacts, outline, ready_inputs
+from tasks.import_backbone import import_backbone
 from worldline_core.errors import TrainingError
 from worldline_core.model.world_model_config import ImportBackboneConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig, check_weights
-from worldline_core.pipeline.plan import find_artifacts, plan, run_node
-from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.store.store import ArtifactStore
 
 
@@ -24,7 +24,7 @@ def import_base(config: PipelineConfig, store: ArtifactStore) -> None:
         return
     source = config.models.tokenizer.parent
     settings = config.import_backbone or ImportBackboneConfig.model_validate({})
-    imported = run_step(store, "import_backbone", settings, {"diffusers": source})
+    imported = import_backbone.run(store, settings, {"diffusers": source})
     config.models.base.parent.mkdir(parents=True, exist_ok=True)
     config.models.base.unlink(missing_ok=True)  # a link to an artifact that is gone
     config.models.base.symlink_to(imported.path.resolve(), target_is_directory=True)
@@ -39,33 +39,33 @@ def train_in_processes(
         UnavailableError: a folder of weights is missing.
         TrainingError: the processes of a training ended with an error, which they have printed.
     """
-    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
+    config = PipelineConfig.load(preset, path, overrides)
     chosen = ["--config", str(path)] if path else ["--preset", str(preset)]
     chosen += [argument for override in overrides for argument in ("--set", override)]
     store = ArtifactStore(artifacts, config.runner.verify)
     import_base(config, store)
     check_weights(config, Path.cwd())
-    nodes = plan(config, Path.cwd())
-    last = max(number for number, node in enumerate(nodes) if get_step(node.step).distributed)
-    for node in nodes[: last + 1]:
-        if not get_step(node.step).distributed or node.name in find_artifacts(nodes, store):
-            run_node(node.name, nodes, store)
+    calls = outline(chain, config)
+    last = max(number for number, call in enumerate(calls.values()) if call.task.distributed)
+    for call in list(calls.values())[: last + 1]:
+        if not call.task.distributed or call.name in find_artifacts(calls, store):
+            call.task.run(store, call.config, ready_inputs(call, calls, store))
             continue
         launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
         command = [
             *launcher,
             "-m",
-            f"tasks.{node.step}",
+            f"tasks.{call.task.name}",
             *chosen,
             "--artifacts",
             str(store.root),
-            "--plan-node",
-            node.name,
+            "--name",
+            call.name,
         ]
         code = Path(worldline_core.__file__).parents[1]
         search = os.pathsep.join([str(code), *filter(None, [os.environ.get("PYTHONPATH")])])
         ended = subprocess.run(command, env={**os.environ, "PYTHONPATH": search}, check=False)  # noqa: S603
         if ended.returncode:
             raise TrainingError(
-                "A training ended with an error", where=node.name, got=f"exit status {ended.returncode}; see above"
+                "A training ended with an error", where=call.name, got=f"exit status {ended.returncode}; see above"
             )

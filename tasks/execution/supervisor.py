@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from worldline_core.scale.process_end import end_with_parent
+from worldline_core.scale.process import end_with_parent
 
 GRACE_SECONDS = 3.0
 """How long the work may take to say goodbye, to Prefect's server for example, before it is killed."""

@@ -15,16 +15,20 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO, cast
 
 from safetensors import SafetensorError
 
-from tasks.supervisor import run_supervised
+from tasks.execution.artifact_task import ArtifactTask
+from tasks.execution.chain import find_call, load_chain, outline, ready_inputs
+from tasks.execution.supervisor import run_supervised
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, StoppedError, WorldLineError
-from worldline_core.pipeline.steps import get_step, run_step
 from worldline_core.store.store import Artifact, ArtifactStore
 from worldline_core.untrusted_text import shown, visible, without_credentials
+
+if TYPE_CHECKING:
+    from worldline_core.data.curation.curate_config import CurateConfig
 
 
 def add_preset_arguments(parser: argparse.ArgumentParser, default: str) -> None:
@@ -57,39 +61,35 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
         help="where work on many episodes runs (short for: --set runner.kind=...)",
     )  # fmt: skip
     parser.add_argument(
-        "--node", "--plan-node", dest="node",
-        help="which node of the run, when a step occurs more than once (rollout.shipped_stage2); torchrun, which has a"
-        " --node-rank of its own, takes --plan-node alone",
-    )  # fmt: skip
+        "--name", help="which call of the run, when a step occurs more than once (rollout.shipped_stage2)"
+    )
     parser.add_argument("--json", action="store_true", help="print the artifact and its metrics as JSON")
 
 
-def run_task(step_name: str, arguments: argparse.Namespace) -> Artifact:
-    """Run one step with parsed arguments."""
-    step = get_step(step_name)
+def run_task(task: ArtifactTask, arguments: argparse.Namespace) -> Artifact:
+    """Run one task with parsed arguments, on the finished artifacts of those before it in the chain."""
     preset = arguments.preset if arguments.config is not None or arguments.preset is not None else "demo"
-    from tasks.shard_mapper import shard_mapper
-    from worldline_core.pipeline.pipeline_config import source_inputs
+    from tasks.execution.shard_mapper import shard_mapper
+    from worldline_core.pipeline.pipeline_config import PipelineConfig, source_folders
     from worldline_core.scale.mapping import RunnerConfig
 
     overrides = [*arguments.overrides, *([f"runner.kind={arguments.runner}"] if arguments.runner else [])]
     runner = load_config(RunnerConfig, preset=preset, path=arguments.config, overrides=overrides, section="runner")
     store, mapper = ArtifactStore(arguments.artifacts, runner.verify), shard_mapper(runner)
     given = dict(_parse_input(text) for text in arguments.inputs)
-    if arguments.node is None and (given or step_name == "curate"):
-        # The step's own section is enough: a file for one's own data need not describe a whole run.
+    if arguments.name is None and (task.name == "curate" or (task.inputs and set(task.inputs) <= set(given))):
+        # The task's own section is enough: a file for one's own data need not describe a whole run.
         config = load_config(
-            step.load_config(), preset=preset, path=arguments.config, overrides=overrides, section=step_name
+            task.load_config(), preset=preset, path=arguments.config, overrides=overrides, section=task.name
         )
-        inputs = source_inputs(config, Path.cwd()) if step_name == "curate" else {}
-        return run_step(store, step_name, config, inputs | given, mapper)
-
-    from worldline_core.pipeline.pipeline_config import PipelineConfig
-    from worldline_core.pipeline.plan import choose_node, plan, run_node
-
-    whole = load_config(PipelineConfig, preset=preset, path=arguments.config, overrides=overrides)
-    nodes = plan(whole, Path.cwd())
-    return run_node(choose_node(step_name, arguments.node, nodes), nodes, store, mapper, given)
+        if task.name == "curate":
+            given = {f"source.{n}": path for n, path in source_folders(cast("CurateConfig", config)).items()} | given
+        return task.run(store, config, given, mapper)
+    whole = PipelineConfig.load(preset, arguments.config, overrides)
+    calls = outline(load_chain(), whole)
+    call = find_call(calls, task.name, arguments.name)
+    task.check_inputs({**call.inputs, **given})
+    return task.run(store, call.config, ready_inputs(call, calls, store, given), mapper)
 
 
 def _parse_input(text: str) -> tuple[str, Path]:
@@ -99,13 +99,13 @@ def _parse_input(text: str) -> tuple[str, Path]:
     return name, Path(folder)
 
 
-def run_task_command(step_name: str) -> None:
-    """Entry point of ``python -m tasks.<step>``."""
-    parser = argparse.ArgumentParser(prog=f"python -m tasks.{step_name}", description=get_step(step_name).summary)
+def run_task_command(task: ArtifactTask) -> None:
+    """Entry point of ``python -m tasks.<name>``."""
+    parser = argparse.ArgumentParser(prog=f"python -m tasks.{task.name}", description=task.summary)
     add_task_arguments(parser)
     arguments = parser.parse_args()
     run_supervised(
-        lambda: exit_with_clear_errors(lambda: print_artifact(run_task(step_name, arguments), as_json=arguments.json)),
+        lambda: exit_with_clear_errors(lambda: print_artifact(run_task(task, arguments), as_json=arguments.json)),
         continues=True,
     )
 

@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-from tasks.temporary_server import set_up_temporary_server
+from tasks.execution.temporary_server import set_up_temporary_server
 from worldline_core.errors import UnavailableError, installing
 from worldline_core.scale.mapping import (
     RunnerConfig,
@@ -27,7 +27,7 @@ from worldline_core.scale.mapping import (
     WorkerDiedError,
     do_shard,
 )
-from worldline_core.scale.process_end import end_with_pool
+from worldline_core.scale.process import end_with_pool
 from worldline_core.store.remote import is_transient, process_cache
 from worldline_core.store.store import helper_lock
 

@@ -1,0 +1,84 @@
+"""The page of a run: `report/latest/index.html` in the store, from the first finished step to the report."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from tasks.execution.chain import TaskCall
+from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
+
+REFRESH_SECONDS = 10.0
+LATEST_REPORT = Path("report", "latest")
+"""The page's folder in the store."""
+
+
+class RunPage:
+    """Shows what is done, running and to come; written after every step and every ten seconds.
+
+    A context: when it is left, the page leads to the finished report, or shows the error that ended the run.
+
+    Args:
+        calls: all calls of the run, in order.
+        at_once: how many of them run side by side.
+    """
+
+    def __init__(self, artifacts: Path, calls: Mapping[str, TaskCall], at_once: int = 1) -> None:
+        self.folder = artifacts / LATEST_REPORT
+        self._calls = calls
+        self._at_once = at_once
+        self._running: dict[str, float] = {}
+        self._done: dict[str, FinishedStep] = {}
+        self._report: Path | None = None
+        self._began = time.monotonic()
+        self._change = threading.RLock()
+        self._over = threading.Event()
+        self._clock = threading.Thread(target=self._refresh, name="run page", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._start_ready()
+        self._clock.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._clock.join()
+        if error is not None:
+            self._write(failed=str(error) or type(error).__name__)
+        elif self._report is not None:
+            write_finished_page(self.folder, self._report)
+
+    def finished(self, call: TaskCall, folder: Path, *, cached: bool) -> None:
+        """Note that a call has its artifact."""
+        with self._change:
+            began = self._running.pop(call.name, time.monotonic())
+            seconds = 0.0 if cached else time.monotonic() - began
+            self._done[call.name] = FinishedStep(call.name, folder, seconds, cached)
+            if call.task.name == "report":
+                self._report = folder
+            self._start_ready()
+            self._write()
+
+    def _start_ready(self) -> None:
+        """Workers take calls in the order in which their inputs become ready."""
+        for name, call in self._calls.items():
+            ready = all(source.name in self._done for source in call.upstream)
+            if ready and name not in self._done and len(self._running) < self._at_once:
+                self._running.setdefault(name, time.monotonic())
+
+    def _refresh(self) -> None:
+        while not self._over.wait(REFRESH_SECONDS):
+            if self._done:
+                self._write()
+
+    def _write(self, failed: str = "") -> None:
+        with self._change:
+            to_come = [name for name in self._calls if name not in self._done and name not in self._running]
+            elapsed = time.monotonic() - self._began
+            write_progress_page(self.folder, list(self._done.values()), list(self._running), to_come, elapsed, failed)

@@ -1,0 +1,160 @@
+"""The chain: what feeds what, which calls need training, how a step run alone finds its inputs, and how a step is added."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from prefect import flow
+from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
+
+import tasks
+from flows.pipeline import chain, choose, evaluate, predict, prepare, prepare_banks
+from tasks.curate import curate
+from tasks.execution.artifact_task import find_task, task_names
+from tasks.execution.chain import TaskCall, find_artifacts, find_call, load_chain, outline, ready_inputs
+from tasks.execution.prefect_run import PrefectRun
+from worldline_core.config import load_config
+from worldline_core.errors import ArtifactError, ConfigError
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.scale.mapping import RunnerConfig
+from worldline_core.store.store import ArtifactStore
+
+
+@pytest.fixture(scope="module")
+def calls() -> dict[str, TaskCall]:
+    return outline(chain, PipelineConfig.load("tiny"))
+
+
+def nightly(config: PipelineConfig) -> None:
+    (_, data), banks = prepare(config), prepare_banks(config)
+    evaluate(config, data, predict(config, data, trained={}))
+    choose(config, banks, predict(config, banks, trained={}, banks=True))
+
+
+@pytest.mark.parametrize("preset", ["demo", "tiny", "smoke", "cosmos3-nano"])
+def test_every_preset_is_valid_and_every_input_comes_before_its_use(preset: str) -> None:
+    seen: set[str] = set()
+    for call in outline(chain, PipelineConfig.load(preset)).values():
+        assert {source.name for source in call.upstream} <= seen
+        seen.add(call.name)
+    assert {"curate", "filter", "train_stage1", "train_stage2", "distill", "evaluate_video", "report"} <= seen
+
+
+def test_the_chain_is_the_one_that_the_readme_draws(calls: dict[str, TaskCall]) -> None:
+    order = ["curate", "filter", "render_actions", "train_stage2", "distill", "rollout.causal"]
+    for name in order[1:]:
+        assert calls[name].upstream, name
+    arrows = {(source.name, call.name) for call in calls.values() for source in call.upstream}
+    assert set(pairwise(order)) <= arrows
+    evaluations = {"evaluate_video", "evaluate_policy", "evaluate_planning"}
+    assert {target for source, target in arrows if source.startswith("rollout.")} == evaluations | {"report"}
+    assert all((evaluation, "report") in arrows for evaluation in evaluations)
+
+
+def test_every_task_loads() -> None:
+    for name in task_names():
+        task = find_task(name)
+        assert task.name == name
+        assert callable(task.load_function())
+        assert task.load_config().model_config["extra"] == "forbid"
+
+
+def test_nightly_leaves_training_out_but_keeps_the_shipped_models() -> None:
+    calls = outline(nightly, PipelineConfig.load("tiny"))
+    assert {"rollout.shipped_stage2", "rollout.banks_shipped_causal", "evaluate_video", "evaluate_planning"} <= set(
+        calls
+    )
+    assert not set(calls) & {"train_stage1", "train_stage2", "distill", "rollout.stage2", "rollout.causal"}
+    assert "rollouts.stage2" not in calls["evaluate_video"].inputs
+    # The smoke preset predicts banks by its own model only: without training there is nothing to plan with.
+    assert "evaluate_planning" not in outline(nightly, PipelineConfig.load("smoke"))
+
+
+def test_labels_of_the_banks_are_not_an_input_of_curation(calls: dict[str, TaskCall]) -> None:
+    assert isinstance(calls["evaluate_planning"].inputs["sealed"], Path)
+    assert not any("sealed" in call.inputs for call in calls.values() if call.name != "evaluate_planning")
+
+
+def test_missing_artifacts_and_calls_are_named(calls: dict[str, TaskCall], tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path)
+    assert find_artifacts(calls, store) == {}
+    with pytest.raises(ArtifactError, match=r"worldline task curate"):
+        ready_inputs(calls["filter"], calls, store)
+    with pytest.raises(ConfigError, match=r"(?s)rollout occurs more than once.*rollout\.shipped_stage2"):
+        find_call(calls, "rollout")
+    with pytest.raises(ConfigError, match="filter does not occur"):
+        find_call(calls, "curate", "filter")
+    assert find_call(calls, "rollout", "rollout.causal") is calls["rollout.causal"]
+
+
+def test_a_folder_that_is_given_needs_no_artifact(calls: dict[str, TaskCall], tmp_path: Path) -> None:
+    assert ready_inputs(calls["filter"], calls, ArtifactStore(tmp_path), {"episodes": tmp_path}) == {
+        "episodes": tmp_path
+    }
+
+
+def test_shipped_rollout_needs_a_shipped_model() -> None:
+    with pytest.raises(ConfigError, match=r"rollouts\.shipped_stage2 needs models\.stage2"):
+        load_config(PipelineConfig, preset="tiny", overrides=["models.stage2=null"])
+
+
+def test_inputs_are_checked_where_a_task_is_called() -> None:
+    config = PipelineConfig.load("smoke")
+    with pytest.raises(ConfigError, match=r"missing \['episodes'\], unknown \['recordings'\]"):
+        outline(lambda: find_task("filter").submit(config.filter, recordings=curate.submit(config.curate)))
+    with pytest.raises(ConfigError, match="outside of a run"):
+        curate.submit(config.curate)
+
+
+def test_the_installed_chain_is_the_pipeline_s() -> None:
+    assert load_chain() is chain
+
+
+@pytest.mark.slow
+def test_a_step_needs_a_core_function_a_task_file_and_a_line(
+    prefect_server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "counting.py").write_text(
+        textwrap.dedent("""
+        from worldline_core.config import StrictModel
+
+        class CountConfig(StrictModel):
+            factor: int = 1
+
+        def count_files(config, inputs, output):
+            (output / "count").write_text(str(config.factor * len(list(inputs["episodes"].iterdir()))))
+            return {}
+    """)
+    )
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "count_files.py").write_text(
+        textwrap.dedent("""
+        from tasks.execution.artifact_task import ArtifactTask
+
+        count_files = ArtifactTask(
+            name="count_files", summary="count the files", version=1,
+            function="counting:count_files", config="counting:CountConfig", inputs=("episodes",),
+        )
+    """)
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(tasks, "__path__", [*tasks.__path__, str(tmp_path / "tasks")])
+    task = find_task("count_files")
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "episodes" / "one").write_text("1")
+
+    @flow
+    def longer_chain() -> Path:
+        with PrefectRun(tmp_path / "store", RunnerConfig()) as run:
+            first = task.submit(task.load_config()(factor=7), episodes=tmp_path / "episodes")
+            task.submit(task.load_config()(), "count_files.again", episodes=first)
+        return run.artifacts["count_files"].folder
+
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        assert (longer_chain() / "count").read_text() == "7"
+    assert "count_files" in task_names()
+    del sys.modules["tasks.count_files"], sys.modules["counting"]

@@ -1,0 +1,296 @@
+"""Calls of a run: started when their inputs are finished, side by side in processes, with a page that stays true."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import textwrap
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from prefect import flow
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import FlowFilter, FlowFilterName
+from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
+
+from flows.pipeline import prepare, prepare_banks
+from tasks.execution.chain import outline, variant
+from tasks.execution.prefect_artifacts import is_worth_saying, show_in_prefect
+from tasks.execution.prefect_run import ArtifactReference, PrefectRun
+from worldline_core.errors import ConfigError, DataError
+from worldline_core.pipeline.pipeline_config import PipelineConfig
+from worldline_core.scale.mapping import RunnerConfig
+
+
+@pytest.fixture
+def storage(prefect_server: None, tmp_path: Path) -> Iterator[Path]:
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        yield tmp_path / "store"
+
+
+@pytest.fixture
+def two_calls(declare: Any) -> Callable[[str], None]:
+    first, following = declare("write_first"), declare("write_next", "before")
+
+    def chain(second: str = "b") -> None:
+        one = first.submit(first.load_config()(text="a"))
+        following.submit(following.load_config()(text=second), "write_next.second", before=one)
+
+    return chain
+
+
+def run(store: Path, chain: Callable[..., None], *arguments: str, page: bool = False) -> dict[str, ArtifactReference]:
+    @flow(name=store.parent.name)
+    def some_calls() -> dict[str, ArtifactReference]:
+        page_of = outline(chain, *arguments) if page else None
+        with PrefectRun(store, RunnerConfig(), page_of) as run:
+            chain(*arguments)
+        return run.artifacts
+
+    return some_calls()
+
+
+def test_a_call_starts_when_its_inputs_are_finished_and_is_found_the_second_time(
+    storage: Path, two_calls: Callable[..., None], caplog: pytest.LogCaptureFixture
+) -> None:
+    done = run(storage, two_calls)
+    assert list(done) == ["write_first", "write_next.second"]
+    assert (done["write_next.second"].folder / "text").read_text() == "ab"
+    made = {path: path.stat().st_mtime_ns for path in storage.rglob("text")}
+    assert run(storage, two_calls) == done
+    assert {path: path.stat().st_mtime_ns for path in storage.rglob("text")} == made
+
+
+def test_equal_calls_are_one(declare: Any) -> None:
+    task = declare("write_first")
+    config = task.load_config()
+
+    def chain() -> None:
+        first = task.submit(config(text="a"))
+        with variant("other"):
+            assert task.submit(config(text="a")) is first
+            task.submit(config(text="b"))
+
+    assert list(outline(chain)) == ["write_first", "write_first.other"]
+    with pytest.raises(ConfigError, match="write_first"):
+        outline(lambda: [task.submit(config(text=text)) for text in "ab"])
+
+
+@pytest.mark.slow
+def test_prefect_shows_what_depends_on_what(storage: Path, two_calls: Callable[..., None]) -> None:
+    run(storage, two_calls)
+    runs = {run.name: run for run in task_runs(storage.parent.name, 2)}
+    waited_for = runs["write_next.second"].task_inputs["wait_for"]
+    assert [source.model_dump()["id"] for source in waited_for] == [runs["write_first"].id]
+
+
+@pytest.mark.slow
+def test_prefect_shows_the_report_and_the_metrics(prefect_server: None, tmp_path: Path) -> None:
+    success = {"mean": 0.75, "low": 0.5, "high": 1.0, "count": 9}
+    summary = {"methods": {"causal": {"budgets": {"32": {"success": success}}}}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    scores = ArtifactReference(step="evaluate_planning", path=tmp_path, digest="0" * 64)
+
+    pictures = [tmp_path / "worst.jpg", tmp_path / "second.jpg"]
+    for colour, picture in zip(("red", "blue"), pictures, strict=True):
+        Image.new("RGB", (8, 6), colour).save(picture)
+
+    @flow
+    def shown() -> None:
+        show_in_prefect(tmp_path / "latest", {"evaluate_planning": scores, "report": scores}, pictures)
+
+    shown()
+    with get_client(sync_client=True) as client:
+        found = {artifact.key: artifact.data for artifact in client.read_artifacts()}
+    assert (tmp_path / "latest" / "index.html").as_uri() in str(found["report"])
+    row = {"metric": "planning/N=32/causal/success", "mean": 0.75, "95 % from": 0.5, "to": 1.0, "trajectories": 9}
+    assert json.loads(str(found["metrics"])) == [row]
+    for key, picture in zip(("picture", "picture-1"), pictures, strict=True):
+        # A browser shows it wherever the page comes from: the picture itself is in its address.
+        with urllib.request.urlopen(str(found[key])) as reply:
+            assert (reply.headers["Content-type"], reply.read()) == ("image/jpeg", picture.read_bytes())
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_error_that_ended_the_run(storage: Path, two_calls: Callable[..., None]) -> None:
+    with pytest.raises(DataError, match="This task cannot work"):
+        run(storage, two_calls, "broken", page=True)
+    text = (storage / "report" / "latest" / "index.html").read_text()
+    assert "This task cannot work" in text
+    assert "write_first" in text
+
+
+FEW = """
+extends: smoke
+curate:
+  sources: [{kind: episode_set, path: artifacts/shipped/recordings, include: ["viperx_pearl-train-s1-0000[12]"]}]
+curate_banks:
+  sources: [{kind: episode_set, path: artifacts/shipped/banks, include: [bank_lift_viperx-000]}]
+"""
+
+
+@pytest.mark.slow
+def test_steps_side_by_side_give_the_artifacts_of_one_process(
+    prefect_server: None, tmp_path: Path, project_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(project_root)
+    (tmp_path / "few.yaml").write_text(FEW)
+    settings = PipelineConfig.load(None, tmp_path / "few.yaml")
+
+    def chain() -> None:
+        prepare(settings)
+        prepare_banks(settings)
+
+    @flow(name=tmp_path.name)
+    def side_by_side(at_once: int) -> dict[str, ArtifactReference]:
+        store = tmp_path / f"store{at_once}"
+        with PrefectRun(store, RunnerConfig(steps_at_once=at_once), outline(chain)) as run:
+            chain()
+        return run.artifacts
+
+    with temporary_settings({PREFECT_LOCAL_STORAGE_PATH: tmp_path / "prefect"}):
+        digests = [{name: made.digest for name, made in side_by_side(n).items()} for n in (1, 2)]
+    assert set(digests[0]) == {"curate", "filter", "render_actions", "curate.banks", "render_actions.banks"}
+    assert digests[0] == digests[1]
+    page = (tmp_path / "store2" / "report" / "latest" / "index.html").read_text()
+    assert all(name in page for name in digests[0])
+    runs = task_runs(tmp_path.name, 10)
+    names = {run.id: run.name for run in runs}
+    for run in runs:
+        sources = {names[source.model_dump()["id"]] for found in run.task_inputs.values() for source in found}
+        expected = {"filter": {"curate"}, "render_actions": {"filter"}, "render_actions.banks": {"curate.banks"}}
+        assert sources == expected.get(run.name, set()), run.name
+
+
+def task_runs(flow_name: str, count: int) -> list[Any]:
+    """Task runs of a flow; they reach the server as events, later."""
+    deadline = time.monotonic() + 60
+    with get_client(sync_client=True) as client:
+        while True:
+            found = client.read_task_runs(flow_filter=FlowFilter(name=FlowFilterName(any_=[flow_name])))
+            if len(found) >= count or time.monotonic() > deadline:
+                return found
+            time.sleep(0.2)
+
+
+# The pool's processes import this file, so that the line a minute is a line a step in them too.
+SIDE_BY_SIDE = """
+import sys
+from pathlib import Path
+from types import ModuleType
+from tasks.execution.artifact_task import ArtifactTask
+from worldline_core import progress
+from worldline_core.config import StrictModel
+
+class CountConfig(StrictModel):
+    last: int
+
+def count_up(config, inputs, output):
+    if config.last > 4:
+        raise ValueError("this task breaks")
+    return {"last": list(progress.with_progress(range(config.last), "counting", "number"))}
+
+count = ArtifactTask("count", "", 1, "tasks.count:count_up", "tasks.count:CountConfig", optional_inputs=("before",))
+module = sys.modules["tasks.count"] = ModuleType("tasks.count")
+module.count, module.count_up, module.CountConfig = count, count_up, CountConfig
+progress.LINE_SECONDS = 0.0
+
+if __name__ == "__main__":
+    from prefect import flow
+    from tasks.execution.prefect_run import PrefectRun
+    from worldline_core.scale.mapping import RunnerConfig
+
+    @flow
+    def both():
+        with PrefectRun(Path(sys.argv[1]), RunnerConfig(steps_at_once=2)):
+            count.submit(CountConfig(last=3))
+            more = count.submit(CountConfig(last=int(sys.argv[2])), "count.more")
+            count.submit(CountConfig(last=1), "count.last", before=more)
+
+    both()
+"""
+
+
+def side_by_side(folder: Path, project_root: Path, last: int) -> subprocess.CompletedProcess[str]:
+    (folder / "both.py").write_text(SIDE_BY_SIDE)
+    return subprocess.run(
+        [sys.executable, folder / "both.py", folder / "store", f"{last}"], cwd=project_root, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, check=False, timeout=250,
+        env={**os.environ, "PYTHONPATH": str(project_root), "PREFECT_API_URL": PREFECT_API_URL.value() or ""},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_steps_side_by_side_write_each_line_once_with_the_name_of_the_call(
+    prefect_server: None, project_root: Path, tmp_path: Path
+) -> None:
+    process = side_by_side(tmp_path, project_root, 4)
+    assert process.returncode == 0, process.stdout[-2000:]
+    assert "\r" not in process.stdout
+    assert "█" not in process.stdout
+    shown = [
+        line.partition(" - ")[2].partition(" numbers")[0] for line in process.stdout.splitlines() if "number" in line
+    ]
+    counted = {"count": 3, "count.more": 4, "count.last": 1}
+    expected = [f"{name}: counting: {n} of {last}" for name, last in counted.items() for n in range(1, last + 1)]
+    assert sorted(shown) == sorted(expected)
+
+
+@pytest.mark.slow
+def test_a_step_that_breaks_ends_the_run_with_its_own_error(
+    prefect_server: None, project_root: Path, tmp_path: Path
+) -> None:
+    process = side_by_side(tmp_path, project_root, 5)
+    assert process.returncode != 0
+    assert process.stdout.strip().splitlines()[-1] == "ValueError: this task breaks"
+    assert "count.last: counting" not in process.stdout
+
+
+@pytest.mark.parametrize(("error", "shown"), [(DataError("x"), False), (KeyError("x"), True)])
+def test_an_error_that_says_what_to_do_is_logged_without_a_traceback(error: Exception, *, shown: bool) -> None:
+    record = logging.LogRecord(
+        "prefect.flow_runs", logging.ERROR, "", 0, "failed: %r", (error,), (type(error), error, None)
+    )
+    assert is_worth_saying(record)
+    assert (record.exc_info is not None) == shown
+    record.msg, record.args = "Crash detected! Execution was aborted by a termination signal.", None
+    assert not is_worth_saying(record)
+
+
+@pytest.mark.slow
+def test_a_process_of_the_pool_ends_with_the_one_that_started_it(project_root: Path) -> None:
+    code = """
+        import multiprocessing, os, time
+        from worldline_core.scale.process import end_with_pool
+
+        def work(pid):
+            end_with_pool()
+            pid.value = os.getpid()
+            time.sleep(60)
+
+        if __name__ == "__main__":
+            context = multiprocessing.get_context("fork")
+            pid = context.Value("i", 0)
+            context.Process(target=work, args=(pid,)).start()
+            while not pid.value:
+                time.sleep(0.05)
+            print(pid.value, flush=True)
+            os._exit(0)
+    """
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], cwd=project_root, capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": str(project_root)}, timeout=120,
+    )  # fmt: skip
+    worker = int(result.stdout)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not Path(f"/proc/{worker}").exists()
