@@ -26,16 +26,14 @@ from tasks.train_stage2 import train_stage2
 from worldline_core.pipeline.pipeline_config import PipelineConfig, source_folders
 
 type Inputs = dict[str, TaskCall | Path]
+STORE = Path("artifacts")
 
 
 @flow(name="pipeline", flow_run_name="pipeline-{preset}", retries=0)
 def pipeline(
-    preset: str | None = "tiny",
-    config: Path | None = None,
-    overrides: tuple[str, ...] = (),
-    artifacts: Path = Path("artifacts"),
+    preset: str | None = "tiny", config: Path | None = None, overrides: tuple[str, ...] = (), artifacts: Path = STORE
 ) -> ArtifactReference:
-    """From recordings to the report. What is finished is not made again; ``artifacts/report/latest`` shows how far it is."""
+    """From recordings to the report. Finished steps are not repeated; ``artifacts/report/latest`` shows how far it is."""
     settings = PipelineConfig.load(preset, config, overrides)
     with PrefectRun(artifacts.resolve(), settings.runner, page_of=outline(chain, settings)) as run:
         chain(settings)
@@ -47,8 +45,8 @@ def chain(c: PipelineConfig) -> None:
     """The whole chain."""
     (curated, data), banks = prepare(c), prepare_banks(c)
     trained = train(c, data)
-    clips = c.clips_of(c.distill, trained.get("encode_latents")) | {"tokenizer": c.model_folders()["tokenizer"]}
-    trained["distill"] = distill.submit(c.distill, **data, **clips, stage2=trained["train_stage2"])
+    clips = {**data, **c.clips_of(c.distill, trained), "tokenizer": c.model_folders()["tokenizer"]}
+    trained["distill"] = distill.submit(c.distill, **clips, stage2=trained["train_stage2"])
     predicted, planned = predict(c, data, trained), predict(c, banks, trained, banks=True)
     scores = evaluate(c, data, predicted) | choose(c, banks, planned)
     made = {"curate": curated, "filter": data["episodes"], "render_actions": data["tracks"], **trained, **scores}
@@ -74,15 +72,15 @@ def prepare_banks(c: PipelineConfig) -> Inputs:
 def train(c: PipelineConfig, data: Inputs) -> Inputs:
     """Latents → Stage I → Stage II."""
     models, episodes, trained = c.model_folders(), data["episodes"], {}
-    start, teacher, latents = models.get("base"), models.get("teacher"), None
+    start, teacher = models.get("base"), models.get("teacher")
     if c.caches_latents:
-        latents = encode_latents.submit(c.encode_latents, episodes=episodes, tokenizer=models["tokenizer"])
-        trained["encode_latents"] = latents
+        tokenizer = models["tokenizer"]
+        trained["encode_latents"] = encode_latents.submit(c.encode_latents, episodes=episodes, tokenizer=tokenizer)
     if c.train_stage1 is not None:
-        clips = c.clips_of(c.train_stage1, latents)
-        start = trained["train_stage1"] = train_stage1.submit(c.train_stage1, episodes=episodes, **clips, base=start)
-    clips = c.clips_of(c.train_stage2, latents)
-    trained["train_stage2"] = train_stage2.submit(c.train_stage2, **data, **clips, stage1=start, teacher=teacher)
+        clips = {"episodes": episodes, **c.clips_of(c.train_stage1, trained)}
+        start = trained["train_stage1"] = train_stage1.submit(c.train_stage1, **clips, base=start)
+    clips = {**data, **c.clips_of(c.train_stage2, trained)}
+    trained["train_stage2"] = train_stage2.submit(c.train_stage2, **clips, stage1=start, teacher=teacher)
     return trained
 
 

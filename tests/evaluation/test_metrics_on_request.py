@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -124,7 +125,7 @@ def test_a_plan_asks_only_for_pairs_that_it_predicts(project_root: Path):
         assert calls["evaluate_video"].config == config.evaluate_video
     fewer = {name: run for name, run in config.rollouts.items() if name != "shipped_stage2_shuffled"}
     calls = outline(chain, config.model_copy(update={"rollouts": fewer}))
-    assert calls["evaluate_video"].config.model_dump()["changed_controls"] == {}
+    assert cast("VideoEvaluationConfig", calls["evaluate_video"].config).changed_controls == {}
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self, cast
 
@@ -92,11 +92,11 @@ class PipelineConfig(StrictModel):
         stages = (self.train_stage1, self.train_stage2, self.distill)
         return any(stage is not None and not isinstance(stage.input, FrameInput) for stage in stages)
 
-    def clips_of[T](self, stage: StageConfig | DistillConfig, latents: T) -> dict[str, T | Path]:
+    def clips_of[T](self, stage: StageConfig | DistillConfig, made: Mapping[str, T]) -> dict[str, T | Path]:
         """The input that gives a training its clips: cached latents, or the tokenizer that encodes the videos."""
         if isinstance(stage.input, FrameInput):
             return {"tokenizer": self.model_folders()["tokenizer"]}
-        return {"latents": latents}
+        return {"latents": made["encode_latents"]}
 
     def rollouts_of(self, *, banks: bool) -> list[tuple[str, RolloutRun]]:
         """Names and settings of the rollouts on recordings, or on candidate banks."""

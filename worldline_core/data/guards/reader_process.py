@@ -25,7 +25,7 @@ from pydantic import Field
 from worldline_core.config import StrictModel
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import UnavailableError
-from worldline_core.scale.process_end import end_with_parent
+from worldline_core.scale.process import end_with_parent
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _SECONDS_TO_END = 5.0
