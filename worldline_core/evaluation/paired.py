@@ -22,8 +22,7 @@ import pyarrow as pa
 
 from worldline_core.errors import ArtifactError
 from worldline_core.evaluation.metric_registry import METRICS, metric_of
-from worldline_core.evaluation.recordings import TRUE_METHOD
-from worldline_core.evaluation.scores import SCORES_FILE, Score, table_schema, write_table
+from worldline_core.evaluation.scores import SCORES_FILE, TRUE_METHOD, Score, table_schema, write_table
 from worldline_core.store.artifact_files import read_table
 
 Series = dict[str, dict[str, float]]

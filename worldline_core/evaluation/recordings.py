@@ -15,13 +15,13 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, DataError
+from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.rollout.rollout_set import RolloutSet
 
 if TYPE_CHECKING:
     from worldline_core.rollout.simulation import Simulation
 
 ROLLOUT_PREFIX = "rollouts."
-TRUE_METHOD = "true"
 HEAD = "head"
 
 

@@ -24,6 +24,8 @@ from worldline_core.store.atomic import atomic_path, write_json_atomic
 
 SCORES_FILE = "scores.parquet"
 SUMMARY_FILE = "summary.json"
+TRUE_METHOD = "true"
+"""The method whose videos are the recordings themselves."""
 _TYPES = {
     **dict.fromkeys(("seed", "run", "budget", "frame", "count", "answers", "malformed_answers"), pa.int32()),
     **dict.fromkeys(("value", "mean", "doubt", "disagreement", "new_controls", "new_setup", "trust"), pa.float64()),

@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
 
-TRUE_METHOD = "true"
 """Stands for the recorded videos among the methods of an evaluation: what is judged from them is a ceiling."""
 
 KINDS = {

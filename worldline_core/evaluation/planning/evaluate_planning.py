@@ -31,9 +31,10 @@ from worldline_core.evaluation.planning.bracket import (
     shown_order,
     shown_video,
 )
-from worldline_core.evaluation.recordings import TRUE_METHOD, open_rollouts, open_tracks, trajectory_of
+from worldline_core.evaluation.recordings import open_rollouts, open_tracks, trajectory_of
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
+    TRUE_METHOD,
     Score,
     bootstrap_mean,
     kept_part,

@@ -35,7 +35,6 @@ from worldline_core.evaluation.policy.trust import (
 )
 from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import (
-    TRUE_METHOD,
     open_rollouts,
     open_tracks,
     rows_of,
@@ -44,6 +43,7 @@ from worldline_core.evaluation.recordings import (
 )
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
+    TRUE_METHOD,
     Score,
     bootstrap_mean,
     kept_part,

@@ -20,7 +20,8 @@ from worldline_core.data.video.frames import VideoFrames, pieces
 from worldline_core.errors import DataError
 from worldline_core.evaluation.metric_registry import Metric
 from worldline_core.evaluation.metrics import end_effector_error, frame_iou, frames_to_unit, psnr, ssim
-from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, stride_of, tool_points
+from worldline_core.evaluation.recordings import HEAD, stride_of, tool_points
+from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
     OwnColour,

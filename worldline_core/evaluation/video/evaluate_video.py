@@ -29,9 +29,10 @@ from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ConfigError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VideoEvaluationConfig
 from worldline_core.evaluation.metric_registry import METRICS, requested
-from worldline_core.evaluation.recordings import HEAD, TRUE_METHOD, open_rollouts, rows_of, stride_of, tool_points
+from worldline_core.evaluation.recordings import HEAD, open_rollouts, rows_of, stride_of, tool_points
 from worldline_core.evaluation.scores import (
     SUMMARY_FILE,
+    TRUE_METHOD,
     Score,
     kept_part,
     part_file,
