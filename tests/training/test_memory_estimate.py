@@ -30,7 +30,6 @@ from worldline_core.pipeline.memory_estimate import (
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import Machine, SizeSheet
-from worldline_core.pipeline.steps import run_step
 from worldline_core.store.store import ArtifactStore
 from worldline_core.training.clip_config import ClipSampling
 from worldline_core.training.flow_matching import FlowMatchingObjective

@@ -43,7 +43,6 @@ from worldline_core.pipeline.memory_estimate import (
     weight_bytes,
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.pipeline.plan import caches_latents
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
 from worldline_core.shipped import project_path
@@ -130,7 +129,7 @@ class SizeSheet:
 
     def rows(self) -> Iterator[tuple[Estimate, str]]:
         """Every stage in the order of a run, and the setting with which it would fit; empty where it does."""
-        if caches_latents(self.config):
+        if self.config.caches_latents:
             yield self._row(self._encoding(), "a smaller image_size")
         for training in self.trainings():
             if training.title == "distill: trajectory regression":
