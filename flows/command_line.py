@@ -55,23 +55,17 @@ def build_parser() -> argparse.ArgumentParser:
     )
     record.add_argument("--output", type=Path, required=True, help="folder of the new EpisodeSet")
     record.set_defaults(run=_record)
-    inspect = commands.add_parser("inspect", help="say what an artifact holds, with pictures")
+    inspect = commands.add_parser("inspect", help="verify and describe an artifact, with a page of pictures")
     inspect.add_argument("artifact", type=Path)
-    inspect.add_argument(
-        "--output", type=Path, default=None, help="where the pictures go (default: the artifact's run/)"
-    )
+    inspect.add_argument("--output", type=Path, help="folder of the page (default: the artifact's run/inspect)")
     inspect.add_argument(
         "--episodes",
         type=Path,
         metavar="FOLDER",
         help="the EpisodeSet of tracks or predictions (default: see manifest)",
     )
-    inspect.add_argument("--episode", metavar="ID", help="which episode to show (default: several, or the first one)")
-    inspect.add_argument("--video", action="store_true", help="write an mp4 with the controls drawn over all views")
-    inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording (open it with: rerun FILE)")
-    inspect.add_argument(
-        "--page", nargs="?", type=int, const=12, metavar="N", help="write a page to browse N episodes (12; 0: all)"
-    )
+    inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
+    inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording of it (open with: rerun FILE)")
     inspect.add_argument("--json", action="store_true", help="print JSON")
     inspect.set_defaults(run=_inspect)
     verify = commands.add_parser("verify", help="compare the files of finished artifacts with what was written")
@@ -219,9 +213,7 @@ def _inspect(arguments: argparse.Namespace) -> None:
         arguments.output,
         episodes=arguments.episodes,
         episode_id=arguments.episode,
-        video=arguments.video,
         rerun=arguments.rerun,
-        page=arguments.page,
     )
     if arguments.json:
         import json

@@ -308,7 +308,7 @@ def test_verdicts_without_outcomes_are_trusted_as_verdicts_with_outcomes_taught(
     assert found["methods"]["good"]["all"]["predicted_success"]["mean"] == 0.5
     assert not pq.read_table(tmp_path / "scores.parquet").num_rows
     page = render("report/policy.html", evaluations=[policy_evaluation(found, list(after.values()))])
-    assert "Recordings whose outcome is not known" in page
+    assert "Recordings with unknown outcomes" in page
 
 
 @pytest.mark.slow
@@ -373,7 +373,7 @@ def test_the_page_shows_the_mark_the_calibration_and_what_went_wrong(known):
         "trust": {"settings": TrustConfig().model_dump(), "training_recordings": 600, "methods": {"model": found}},
     }
     page = str(render("report/policy.html", evaluations=[policy_evaluation(summary, shown)]))
-    for text in ("Wrong among marked", "AUROC", "600 training", "Confusion by task", "What is seen in videos of model"):
+    for text in ("Wrong among marked", "AUROC", "600 training", "What is seen in videos of model"):
         assert text in page
     summary["trust"]["methods"]["model"] = {"available": False, "reason": "all are right", "marked": 0}
     page = str(render("report/policy.html", evaluations=[policy_evaluation(summary)]))

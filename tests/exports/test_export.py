@@ -23,7 +23,7 @@ from worldline_core.exports.export import export, shown_tracks
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.publishing import set_files
-from worldline_core.report.inspect_pictures import write_pictures as inspect
+from worldline_core.report.inspect import inspect
 from worldline_core.store.artifact_files import write_manifest
 
 FRAMES = 20
@@ -139,7 +139,7 @@ def test_a_rerun_export_holds_the_tools_as_inspect_shows_them(tmp_path: Path, ca
             )  # fmt: skip
             writer.add(episode, {"head": np.full((6, 32, 48, 3), 90, np.uint8)})
     export(tmp_path / "set", tmp_path / "out", ["rrd"])
-    inspect("EpisodeSet", tmp_path / "set", tmp_path / "seen", None, "recorded", video=False, rerun=True, page=None)
+    inspect(tmp_path / "set", tmp_path / "seen", episode_id="recorded", rerun=True)
     exported, seen = (
         {chunk.entity_path: chunk.to_record_batch() for chunk in RrdReader(tmp_path / folder / "recorded.rrd").stream()}
         for folder in ("out", "seen")

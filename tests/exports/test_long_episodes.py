@@ -24,7 +24,7 @@ from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
 from worldline_core.exports.export import export, shown_tracks
 from worldline_core.pictures import write_side_by_side
-from worldline_core.report.inspect_pictures import rollout_sheet, write_pictures
+from worldline_core.report.inspect import inspect
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter
 
 SHORT, LONG = 80, 240
@@ -122,10 +122,8 @@ OUTPUTS: dict[str, Callable[[Recorded, Path], Any]] = {
     "worldarena": lambda recorded, output: export(
         recorded.root / "rollouts", output, ["worldarena"], episodes=recorded.root / "episodes"
     ),
-    "sheet of a rollout": lambda recorded, _: rollout_sheet(recorded.rollouts, None),
-    "inspect": lambda recorded, output: write_pictures(
-        "EpisodeSet", recorded.root / "episodes", output, None, "long", video=False, rerun=True, page=None
-    ),
+    "sheet of a rollout": lambda recorded, output: inspect(recorded.root / "rollouts", output),
+    "inspect": lambda recorded, output: inspect(recorded.root / "episodes", output, episode_id="long", rerun=True),
     "exact masks": measured,
     "curate": curated,
 }

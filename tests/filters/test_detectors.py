@@ -44,7 +44,7 @@ from worldline_core.filters.signals import picture_statistics, range_speed
 from worldline_core.filters.verdict import Finding, long_runs, runs
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
 from worldline_core.geometry.transforms import hand_eye_residual, mean_pose, rigid_inverse
-from worldline_core.report.inspect_filters import deciding_curve
+from worldline_core.report.inspect import deciding_curve
 
 FPS = 8.0
 

@@ -16,6 +16,7 @@ from worldline_core.evaluation.scores import Score, summarise, write_scores
 from worldline_core.evaluation.video.evaluate_video import write_by_frame
 from worldline_core.report.report import ReportConfig, report
 from worldline_core.rollout.rollout_set import RolloutSetWriter
+from worldline_core.store.artifact_files import write_manifest
 from worldline_core.store.atomic import write_json_atomic
 
 HOSTILE = "<script>alert('x')</script> & \"lift\" the <b>red</b> cube"
@@ -323,7 +324,6 @@ def write_all(root: Path) -> dict[str, Path]:
     manifest = {
         "step": "curate",
         "version": 1,
-        "digest": "0123456789abcdef0123",
         "config": {"note": HOSTILE},
         "seeds": {"seed": 7},
         "wall_seconds": 12.5,
@@ -337,5 +337,5 @@ def write_all(root: Path) -> dict[str, Path]:
             "git_commit": "abc",
         },
     }
-    write_json_atomic(inputs["curate"] / "manifest.json", manifest)
+    write_manifest(inputs["curate"], manifest)
     return inputs

@@ -19,8 +19,8 @@ from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.errors import DataError
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.report.dataset_card import write_card
-from worldline_core.report.dataset_facts import DatasetFacts
+from worldline_core.pages.page import markdown
+from worldline_core.report.dataset_card import DatasetFacts, write_card
 
 HOSTILE = "<script>alert('x')</script> | *lift* `it`"
 
@@ -99,7 +99,7 @@ def test_the_markdown_says_what_the_tables_say(curated: Path, tmp_path: Path) ->
     assert splits["train"][3:] == ["3", "2", "0"]
     assert ["room 0", "hall", "0"] in table(text, "Duplicates and leakage")
     assert "1 exact duplicates, 0 near duplicates" in text
-    assert [path.name for path in files] == ["README.md", "index.html", "source_00.jpg", "source_01.jpg"]
+    assert [path.name for path in files] == ["README.md", "source_00.jpg", "source_01.jpg"]
     for path in re.findall(r"\]\((\S+)\)", text):
         height, width, _ = cv2.imread(str(tmp_path / path)).shape
         assert height > 128
@@ -121,10 +121,9 @@ def test_the_hub_reads_the_header(curated: Path, tmp_path: Path) -> None:
 
 def test_recorded_text_cannot_break_the_card(curated: Path, tmp_path: Path) -> None:
     write_card(curated, tmp_path)
-    page, text = (tmp_path / "index.html").read_text(), (tmp_path / "README.md").read_text()
-    assert "alert" in page
-    assert "<script" not in page
-    assert not re.search(r"https?://", page)
+    text = (tmp_path / "README.md").read_text()
+    assert "<script" not in markdown(text)
+    assert not re.search(r"https?://", text)
     assert "\\<script\\>alert('x')\\</script\\> \\| \\*lift\\* \\`it\\`" in text
     assert all(len(row) == 2 for row in table(text, "Instructions"))
 
@@ -147,7 +146,7 @@ def test_a_filtered_set_shows_the_whole_way(curated: Path, tmp_path: Path) -> No
     assert facts.funnel[:2] == [("episodes found", 8), ("kept by curation", 6)]
     assert dict(facts.funnel)["kept by the filters"] == len({row.episode_index for row in facts.rows})
     assert [facts.label for facts in facts.sources] == ["kitchen", "lab"]
-    reasons = {(step, reason) for step, reason, _, _ in facts.reasons}
+    reasons = {(row[0], row[1]) for row in facts.reason_table.rows}
     assert ("curation", "nan_state") in reasons
     assert ("Stage II", "missing_view") in reasons or ("Stage II", "missing_calibration") in reasons
     write_card(filtered, tmp_path / "card")

@@ -193,13 +193,13 @@ def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifact
         found["evaluate_planning"] = run_artifacts["evaluate_planning"]  # its instructions are hostile, too
         compare_with_history(found, tmp_path / "history", f"{number} {hostile_text}")
     pages = {path.name: path.read_text() for path in sorted((tmp_path / "history").glob("*.html"))}
-    assert {"index.html", "quality.html", "planning.html"} <= set(pages)
+    assert {"index.html", "quality.html", "decisions.html"} <= set(pages)
     for text in pages.values():
         assert "<script>alert" not in text
         assert name not in text
     assert "Night 1 &lt;script&gt;" in pages["index.html"]
     assert "&lt;b onmouseover=alert(1)&gt;/robot_iou@head" in pages["index.html"]
-    assert "&lt;script&gt;alert(" in pages["planning.html"]
+    assert "&lt;script&gt;alert(" in pages["decisions.html"]
 
 
 @pytest.mark.parametrize(

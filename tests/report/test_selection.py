@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from worldline_core.report.filters import with_unit
-from worldline_core.report.video_scores import VideoScores, in_order, method
+from worldline_core.report.context import VideoScores, in_order, method
+from worldline_core.report.data import with_unit
 from worldline_core.report.videos import best_median_worst, choose_episodes
 
 
@@ -38,6 +38,7 @@ def test_order_is_long_trained_first_baselines_last() -> None:
 def test_median_best_and_worst() -> None:
     values = {"a": 0.9, "b": 0.1, "c": 0.5, "d": 0.4}
     assert best_median_worst(values) == [("median", "d", 0.4), ("best", "a", 0.9), ("worst", "b", 0.1)]
+    assert best_median_worst({"a": 0.9, "b": 0.1}) == [("median", "b", 0.1), ("best", "a", 0.9)]
     assert best_median_worst({"only": 0.3}) == [("median", "only", 0.3)]
     assert best_median_worst({}) == []
 

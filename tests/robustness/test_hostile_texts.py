@@ -20,7 +20,7 @@ from worldline_core.config import ConfigError, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import DataError
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.pages.page import Table, environment, markdown, render
+from worldline_core.pages.page import Table, environment, markdown
 from worldline_core.pictures import fit_text, text_width_px
 from worldline_core.report.dataset_card import markdown_table, plain
 from worldline_core.report.progress import write_progress_page
@@ -77,10 +77,7 @@ def test_pages_keep_their_elements_whatever_ids_and_reasons_say(text: str, tmp_p
         return check_page(CalibrationCheck((Finding(name, name, None, reason=name, detail=name),), (), tmp_path))
 
     def card(name: str) -> str:
-        body = markdown(
-            markdown_table((name, "b"), [(name, name)]) + f"\n\n# {plain(name)}\n", heading=1, pictures=True
-        )
-        return render("report/card.html", title=name, subtitle=name, funnel="", body=body)
+        return str(markdown(markdown_table(Table((name, "b"), [(name, name)])) + f"\n\n# {plain(name)}\n"))
 
     for make in (progress, checked, card):
         same_elements(make(text), make("harmless"))
@@ -88,9 +85,9 @@ def test_pages_keep_their_elements_whatever_ids_and_reasons_say(text: str, tmp_p
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 def test_a_cell_of_markdown_stays_one_cell_and_plain_text(text: str) -> None:
-    table = markdown_table(("Instruction", "Episodes"), [(text, 1)])
+    table = markdown_table(Table(("Instruction", "Episodes"), [(text, 1)]))
     assert len(table.splitlines()) == 3
-    shown_page = str(markdown(table, pictures=True))
+    shown_page = str(markdown(table))
     assert set(re.findall(r"<(\w+)", shown_page)) == {"div", "table", "thead", "tbody", "tr", "th", "td"}
 
 

@@ -61,22 +61,20 @@ def asset(name: str) -> Markup:
 
 
 @cache
-def _markdown_reader(pictures: bool) -> MarkdownIt:
-    reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink"])
-    if not pictures:
-        reader.disable("image")
+def _markdown_reader() -> MarkdownIt:
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink", "image"])
     reader.add_render_rule("table_open", lambda *_: '<div class="table-wrap"><div tabindex="0"><table>\n')
     reader.add_render_rule("table_close", lambda *_: "</table></div></div>\n")
     return reader
 
 
-def markdown(text: str, *, heading: int = 4, pictures: bool = False) -> Markup:
-    """Markdown as HTML: raw HTML and links stay text; pictures only of texts that this project wrote.
+def markdown(text: str, *, heading: int = 4) -> Markup:
+    """Markdown as HTML; raw HTML, links and pictures stay text.
 
     Args:
         heading: level of the text's first level of headings.
     """
-    reader = _markdown_reader(pictures)
+    reader = _markdown_reader()
     tokens = reader.parse(str(text))
     for token in tokens:
         if token.type in ("heading_open", "heading_close"):

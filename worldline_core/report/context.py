@@ -1,54 +1,219 @@
-"""What every section of the report is given, and what it gives back."""
+"""Shared by all pages of the report: configuration, inputs, names of methods, video scores, and the writing of pages."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from markupsafe import Markup
 from pydantic import Field
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.evaluation.scores import TRUE_METHOD
 from worldline_core.pages.page import render, render_macro
-from worldline_core.pictures import Picture, jpeg_bytes, png_bytes
-from worldline_core.report.video_scores import VideoScores
+from worldline_core.pictures import Picture, jpeg_bytes
 from worldline_core.rollout.rollout_set import RolloutSet
-from worldline_core.store.artifact_files import JsonObject, read_json
+from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
 from worldline_core.store.atomic import write_bytes_atomic
+
+KINDS = {
+    TRUE_METHOD: ("recorded videos (ceiling)", "c2"),
+    "stage2": ("Stage II", "c0"),
+    "causal": ("causal", "c1"),
+    "stage2_zero": ("Stage II, no actions", "c4"),
+    "stage2_shuffled": ("Stage II, shuffled actions", "c3"),
+    "causal_zero": ("causal, no actions", "c4"),
+    "causal_shuffled": ("causal, shuffled actions", "c3"),
+    "stage1": ("Stage I, text, no actions", "c7"),
+    "backbone": ("backbone, text, no actions", "c6"),
+    "copy": ("copy first frame", "c5"),
+    "other": ("", "c6"),
+}
+"""Label and colour of each kind of method, in the report's order."""
+GROUPS = {TRUE_METHOD: "", "shipped": "long-trained", "run": "this run", "baseline": ""}
+"""Origin of a method's weights, in the report's order."""
+STEPS_NAME = re.compile(r"(?:shipped_)?(?P<base>stage2|causal)_(?P<steps>\d+)_steps")
+ZERO_WORDS = frozenset({"zero", "zeroed", "none", "noaction", "noactions", "no"})
+SHUFFLED_WORDS = frozenset({"shuffled", "shuffle"})
+
+SPLIT_LABELS = {
+    "test": "held-out scenes",
+    "ood_test": "held-out embodiment",
+    "validation": "validation",
+    "train": "training scenes",
+    "bank": "candidate banks",
+}
+"""Labels of the splits, in the report's order."""
+IOU_METRICS = ("robot_iou_exact", "robot_iou")
+"""Most trustworthy first: against the recording's exact masks, against the segmenter's own masks of the truth."""
 
 
 class ReportConfig(StrictModel):
-    """What the report shows."""
+    """Options of the step `report`."""
 
-    title: str = Field(default="WorldLine: from robot recordings to an action-driven simulator", min_length=1)
-    subtitle: str = (
-        "What was recorded, kept, trained, predicted and chosen in this run, and how well: measured, with intervals."
-    )
     primary_method: str | None = Field(
-        default=None,
-        description="the method whose numbers head the page; none: the long-trained Stage II, else this run's",
+        default=None, description="the method that heads the page; none: the long-trained Stage II, else this run's"
     )
     tile_height: int = Field(
         default=256, ge=32, le=1080, description="height of one video in a side-by-side video, pixels"
     )
-    upscale: Literal["lanczos", "nearest"] = "lanczos"
-    max_columns: int = Field(
-        default=6, ge=2, le=12, description="columns of a side-by-side video, the truth among them"
-    )
-    contact_sheet_rows: int = Field(default=12, ge=1, le=64)
-    overlay_episodes: int = Field(default=4, ge=1, le=32)
     rerun: bool = Field(default=True, description="write a Rerun recording of every episode shown")
     mcap: bool = Field(default=True, description="write MCAP files of every episode shown")
 
 
 @dataclass(frozen=True)
+class Method:
+    """A method as the report shows it: model and controls (`kind`), and the origin of its weights (`group`)."""
+
+    name: str
+    kind: str
+    group: str
+
+    @property
+    def label(self) -> str:
+        found = STEPS_NAME.fullmatch(self.name)
+        if found:
+            return f"{KINDS[found['base']][0]}, {found['steps']} steps"
+        return KINDS[self.kind][0] or self.name.replace("_", " ")
+
+    @property
+    def long_label(self) -> str:
+        """Label with the group, for tables that mix weights of several origins."""
+        return f"{self.label} ({GROUPS[self.group]})" if GROUPS[self.group] else self.label
+
+    @property
+    def colour(self) -> str:
+        return KINDS[self.kind][1]
+
+    @property
+    def rank(self) -> tuple[int, int, str]:
+        return [*GROUPS].index(self.group), [*KINDS].index(self.kind), self.name
+
+
+def method(name: str) -> Method:
+    """The method of a name: `shipped_stage2_shuffled`, `causal`, `stage2.zero`, `copy_first_frame`, `true`, ..."""
+    words = set(re.split(r"[._\-\s]+", name.lower()))
+    if name == TRUE_METHOD:
+        return Method(name, TRUE_METHOD, TRUE_METHOD)
+    if "copy" in words:
+        return Method(name, "copy", "baseline")
+    # Another number of steps is another method, with a label of its own.
+    if "steps" not in words and (found := words & {"stage1", "backbone"}):
+        return Method(name, found.pop(), "baseline")
+    base = "causal" if "causal" in words else "stage2" if words & {"stage2", "stageii"} else ""
+    control = "_zero" if words & ZERO_WORDS else "_shuffled" if words & SHUFFLED_WORDS else ""
+    kind = f"{base}{control}" if base and "steps" not in words else "other"
+    return Method(name, kind, "shipped" if "shipped" in words else "run")
+
+
+def in_order(names: Iterable[str]) -> list[Method]:
+    """Recorded videos, long-trained weights, this run's, then baselines without actions."""
+    return sorted((method(name) for name in names), key=lambda m: m.rank)
+
+
+def predicting(names: Iterable[str]) -> list[Method]:
+    """All methods but the recorded videos, in the report's order."""
+    return [m for m in in_order(names) if m.name != TRUE_METHOD]
+
+
+@dataclass(frozen=True)
+class VideoScores:
+    """Summaries and tidy rows of `evaluate_video` artifacts, merged. Rows of the method `true` rate the segmenter."""
+
+    summaries: Sequence[JsonObject]
+    rows: Sequence[JsonObject]
+    by_frame: Sequence[JsonObject]
+
+    @classmethod
+    def read(cls, folders: Iterable[Path]) -> VideoScores:
+        paths = list(folders)
+        return cls(
+            [summary for path in paths if (summary := read_json(path / "summary.json"))],
+            [row for path in paths for row in read_rows(path / "scores.parquet")],
+            [row for path in paths for row in read_rows(path / "by_frame.parquet")],
+        )
+
+    @cached_property
+    def groups(self) -> list[str]:
+        """Splits that have scores, the held-out ones first."""
+        found = {g for s in self.summaries for g in s.get("metrics", {}) if "/" not in g}
+        order = [*SPLIT_LABELS]
+        return sorted(found, key=lambda g: (order.index(g) if g in order else 99, g))
+
+    def subgroups(self, split: str) -> list[str]:
+        """Groups within a split: embodiments and outcomes."""
+        return sorted({g for s in self.summaries for g in s.get("metrics", {}) if g.startswith(f"{split}/")})
+
+    def methods(self, group: str) -> list[Method]:
+        return in_order({m for s in self.summaries for m in s.get("metrics", {}).get(group, {})})
+
+    def names(self, group: str) -> set[str]:
+        """Measured metrics of any method of a group: ``psnr``, ``psnr@head``, ``robot_iou[colour]@head``, ..."""
+        return {n for s in self.summaries for found in s.get("metrics", {}).get(group, {}).values() for n in found}
+
+    def value(self, group: str, method: str, metric: str) -> JsonObject | None:
+        """`{"mean", "low", "high", "count"}` of a metric, or None."""
+        for summary in self.summaries:
+            found = summary.get("metrics", {}).get(group, {}).get(method, {}).get(metric)
+            if found is not None:
+                return found
+        return None
+
+    def difference(self, group: str, first: str, second: str, metric: str) -> JsonObject | None:
+        """Paired difference `first - second` over the trajectories that both have, or None."""
+        for summary in self.summaries:
+            for row in summary.get("differences", {}).get(group, []):
+                if row["metric"] != metric:
+                    continue
+                if (row["first"], row["second"]) == (first, second):
+                    return row
+                if (row["first"], row["second"]) == (second, first):
+                    return {**row, "mean": -row["mean"], "low": -row["high"], "high": -row["low"]}
+        return None
+
+    @cached_property
+    def unavailable(self) -> dict[str, str]:
+        """Reasons why metrics could not be measured."""
+        return {name: reason for summary in self.summaries for name, reason in summary.get("unavailable", {}).items()}
+
+    @cached_property
+    def segmenters(self) -> list[dict[str, Any]]:
+        """The segmenters used, each with its own accuracy on true frames."""
+        found: dict[str, dict[str, Any]] = {}
+        for summary in self.summaries:
+            for segmenter in summary.get("segmenters", []):
+                found.setdefault(segmenter["name"], segmenter)
+        return list(found.values())
+
+    def iou_metric(self, group: str, method: str) -> str | None:
+        """The most trustworthy IoU that a method has."""
+        return next((metric for metric in IOU_METRICS if self.value(group, method, f"{metric}@head")), None)
+
+    def per_episode(self, method: str, metric: str, view: str, split: str) -> dict[str, float]:
+        """Mean of a metric over seeds, by episode."""
+        values: dict[str, list[float]] = defaultdict(list)
+        for row in self.rows:
+            if (row["method"], row["metric"], row["view"], row["split"]) == (method, metric, view, split):
+                values[row["episode_id"]].append(row["value"])
+        return {name: sum(items) / len(items) for name, items in sorted(values.items())}
+
+    def primary(self, group: str, configured: str | None = None) -> Method | None:
+        """The method that heads the page: the configured one, or the first Stage II."""
+        methods = self.methods(group)
+        named = next((m for m in methods if m.name == configured), None)
+        return named or next((m for m in methods if m.kind == "stage2"), methods[0] if methods else None)
+
+
+@dataclass(frozen=True)
 class Section:
-    """One page of the report: its name, title, a sentence of introduction, and its content; or why it is missing."""
+    """One page: the stem of its file, title, introduction and content; or the reason why it is missing."""
 
     anchor: str
     title: str
@@ -63,12 +228,12 @@ class Section:
 
 @dataclass
 class ReportContext:
-    """The configuration, the inputs, and the folder that pages and media go to.
+    """Configuration, inputs, and the folder of pages and media.
 
     Attributes:
         inputs: artifact folders by name: a step (`curate`), or a step and a variant (`rollout.stage2`).
-        run_parts: what is not reproducible (times, devices, versions). It is written to `run/run.js`, outside of the
-            digested pages, and put into their slots when they are opened.
+        run_parts: times, devices and versions, which are not reproducible: written to `run/run.js`, outside of the digested pages,
+            and put into their slots when a page is opened.
     """
 
     config: ReportConfig
@@ -81,19 +246,8 @@ class ReportContext:
         found = {name.partition("."): path for name, path in sorted(self.inputs.items())}
         return {variant: path for (name, _, variant), path in found.items() if name == step}
 
-    def manifest(self, name: str) -> JsonObject:
-        """An artifact's manifest, or an empty object for a folder without one."""
-        return read_json(self.inputs[name] / "manifest.json") if name in self.inputs else {}
-
-    @cached_property
-    def media(self) -> Path:
-        folder = self.output / "media"
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
-
     @cached_property
     def video_scores(self) -> VideoScores:
-        """Scores of every video evaluation."""
         return VideoScores.read(self.variants("evaluate_video").values())
 
     def summaries(self, step: str) -> list[JsonObject]:
@@ -103,35 +257,39 @@ class ReportContext:
 
     @cached_property
     def rollouts(self) -> dict[str, RolloutSet]:
-        """Predicted videos by method, those of candidate banks apart."""
+        """Predicted videos by variant of the step `rollout`."""
         return {name: RolloutSet.open(path) for name, path in self.variants("rollout").items()}
 
     @cached_property
     def episodes(self) -> EpisodeSet | None:
         """The filtered episodes, or the curated ones when there are no filtered ones."""
-        folder = self.inputs.get("filter") or self.inputs.get("curate") or self.inputs.get("episodes")
+        folder = self.inputs.get("filter") or self.inputs.get("curate")
         return None if folder is None else EpisodeSet.open(folder)
 
-    def picture(self, name: str, picture: Picture, *, alt: str, photo: bool = False) -> Markup:
-        """Write a picture and return the element that shows it; photographs become JPEG, drawings PNG."""
-        path = self.media / f"{name}.{'jpg' if photo else 'png'}"
-        write_bytes_atomic(path, jpeg_bytes(picture) if photo else png_bytes(picture))
-        height, width = picture.shape[:2]
-        file = f"media/{path.name}"
-        return render_macro("pages/parts.html", "picture", file=file, alt=alt, width=width, height=height)
+    @property
+    def media(self) -> Path:
+        return self.output / "media"
 
-    def slot(self, name: str, content: Markup | str, fallback: str = "", *, inline: bool = False) -> Markup:
-        """A place in a page, or in a line of it, that is filled from `run/run.js`; `fallback` stands there until then."""
+    def picture(self, name: str, picture: Picture, *, alt: str) -> Markup:
+        """Write a picture as JPEG and return the element that shows it."""
+        path = self.media / f"{name}.jpg"
+        write_bytes_atomic(path, jpeg_bytes(picture))
+        height, width = picture.shape[:2]
+        return render_macro(
+            "pages/parts.html", "picture", file=f"media/{path.name}", alt=alt, width=width, height=height
+        )
+
+    def slot(self, name: str, content: Markup | str, fallback: str = "") -> Markup:
+        """A place in a page that is filled from `run/run.js` when it is opened."""
         self.run_parts[name] = Markup.escape(content)
-        tag = "span" if inline else "div"
-        return render_macro("pages/parts.html", "slot", name=name, fallback=fallback, tag=tag)
+        return render_macro("pages/parts.html", "slot", name=name, fallback=fallback)
 
     def section(self, anchor: str, title: str, lead: str = "", /, **values: object) -> Section:
-        """A section whose content is the template of its name, filled with values."""
+        """A page made from the template of its name."""
         return Section(anchor, title, lead, render(f"report/{anchor}.html", **values))
 
     def write_pages(self, home: Markup, sections: Sequence[Section]) -> None:
-        """Write `index.html`, one page per section, and what is filled in when they are opened."""
+        """Write `index.html`, one page per section, and `run/run.js`."""
         for section, following in zip(sections, [*sections[1:], None], strict=True):
             page = render("report/page.html", title=section.title, section=section, sections=sections, next=following)
             write_bytes_atomic(self.output / section.file, page.encode())

@@ -27,7 +27,7 @@ from worldline_core.report.comparison import (
     record_night,
 )
 from worldline_core.report.context import ReportConfig, ReportContext, Section
-from worldline_core.report.decisions import planning_section, policy_section
+from worldline_core.report.decisions import decisions_section
 from worldline_core.report.quality import quality_section
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import digest_value
@@ -65,7 +65,7 @@ def compare_with_history(
         history / "comparison.json", asdict(compared) | {"changes": changes, "regressions": compared.regressions}
     )
     context = ReportContext(ReportConfig(), scores, history)
-    sections = [make(context) for make in (quality_section, policy_section, planning_section)]
+    sections = [make(context) for make in (quality_section, decisions_section)]
     first = _page(context, compared, read_history(history))
     home = render("report/page.html", title=first.title, section=first, sections=sections, next=None)
     context.write_pages(home, sections)

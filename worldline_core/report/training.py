@@ -1,17 +1,18 @@
-"""Page "Training": loss curves of every stage, read from the lines that training wrote."""
+"""Pages "Training" and "Provenance": loss curves of every stage; weights, digests, configurations and times of every artifact."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from worldline_core.pages.charts import Dot, Series, interval_chart, line_chart
-from worldline_core.pages.page import Table, code, number, words
+from worldline_core.pages.page import Table, code, number, render, words
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.store.artifact_files import JsonObject, read_json_lines
+from worldline_core.store.artifact_files import JsonObject, read_json, read_json_lines
 
 TITLE = "Training"
 STAGES = {
@@ -40,13 +41,14 @@ CONDITIONS = {
     "_copy": ("copy first frame", "c5"),
 }
 NOT_A_PART = frozenset({"step", "learning_rate", "gradient_norm", "flow_matching", "scale_intra", "scale_cross"})
-MOST_PARTS = 6
+MOST_PARTS, MOST_POINTS = 6, 400
 
 Curve = tuple[list[float], list[float]]
+"""Steps and values."""
 
 
 def training_section(context: ReportContext) -> Section:
-    """Charts for every stage's losses and a table of what each stage did."""
+    """Charts of every stage's losses and a table of its first and last."""
     charts: list[Markup] = []
     missing: list[str] = []
     rows: list[list[object]] = []
@@ -68,8 +70,8 @@ def training_section(context: ReportContext) -> Section:
             "training", TITLE, missing="no training stage was given (inputs train_stage1, train_stage2, distill)."
         )
     lead = (
-        "What this run's own training did, starting from the base model. Pale: every logged mean; strong: running mean."
-        " Held-out losses always use the same clips, noise and noise levels, with the averaged weights."
+        "This run's own training, from the base model on. Pale: every logged mean; strong: running mean. Held-out losses always use"
+        " the same clips, noise and noise levels, with the averaged weights."
     )
     table = Table(("Stage", "Steps", "First loss", "Last loss", "Last held-out loss"), rows, range(1, 5))
     return context.section("training", TITLE, lead, missing=missing, table=table, charts=charts)
@@ -85,7 +87,7 @@ def read_phases(folder: Path) -> dict[str, list[JsonObject]]:
 
 
 def read_curves(rows: Sequence[JsonObject]) -> dict[str, Curve]:
-    """Steps and values of every logged number that is finite."""
+    """The curve of every logged number, finite values alone."""
     curves: dict[str, Curve] = {}
     for row in rows:
         for name, value in row.items():
@@ -131,26 +133,22 @@ def chart(title: str, y_label: str, series: Sequence[Series]) -> Markup:
 
 
 def smooth(label: str, curve: Curve, colour: str = "c0") -> list[Series]:
-    """The curve in pale and its running mean."""
-    steps, values = thin(*curve)
+    """The curve in pale, thinned to means over equal stretches, and its running mean."""
+    steps, values = curve
+    width = max(1, math.ceil(len(values) / MOST_POINTS))
+    starts = range(0, len(values), width)
+    means = [sum(values[i : i + width]) / len(values[i : i + width]) for i in starts]
+    at = [steps[min(i + width, len(steps)) - 1] for i in starts]
     return [
-        Series(label, steps, values, colour=colour, faint=True),
-        Series(label, steps, running_mean(values), colour=colour),
+        Series(label, at, means, colour=colour, faint=True),
+        Series(label, at, running_mean(means), colour=colour),
     ]
 
 
 def marked(label: str, curve: Curve, colour: str) -> Series:
-    """A curve of few points."""
+    """A curve, with markers where its points are few."""
     steps, values = curve
     return Series(label, steps, values, colour=colour, markers=len(steps) < 40)
-
-
-def thin(steps: Sequence[float], values: Sequence[float], most: int = 400) -> Curve:
-    """At most `most` points: means over equal stretches."""
-    width = max(1, math.ceil(len(values) / most))
-    starts = range(0, len(values), width)
-    means = [sum(values[i : i + width]) / len(values[i : i + width]) for i in starts]
-    return [steps[min(i + width, len(steps)) - 1] for i in starts], means
 
 
 def running_mean(values: Sequence[float]) -> list[float]:
@@ -168,3 +166,64 @@ def stage_row(title: str, phase: str, curves: Mapping[str, Curve]) -> list[objec
     shown = [*(means[:1] or [None]), *(means[-1:] or [None]), *(held_out[-1:] or [None])]
     name = Markup("{} {}").format(title, code(phase)) if phase else title
     return [name, int(max(steps)) if steps else None, *[None if v is None else number(v, 4) for v in shown]]
+
+
+def provenance_section(context: ReportContext) -> Section:
+    """The weights with their cards, and the origin of each artifact; times and versions are filled in when the page opens."""
+    if not context.inputs:
+        return Section("provenance", "Provenance", missing="no artifact was given.")
+    manifests = {name: read_json(folder / "manifest.json") for name, folder in sorted(context.inputs.items())}
+    models = {name: folder for name, folder in context.variants("models").items() if name}
+    cards = {
+        name: path.read_text(encoding="utf-8", errors="replace")
+        for name, folder in models.items()
+        if (path := folder / "MODEL_CARD.md").is_file()
+    }
+    weights = [
+        [name, number(sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) / 1e6, 1), "yes" if name in cards else "no"]
+        for name, folder in models.items()
+    ]  # fmt: skip
+    rows: list[list[object]] = []
+    for name, manifest in manifests.items():
+        seeds = ", ".join(f"{key} {json.dumps(value)}" for key, value in sorted((manifest.get("seeds") or {}).items()))
+        digest = code(str(manifest["digest"])[:16]) if manifest.get("digest") else None
+        rows.append([name, digest, str(manifest.get("version", "")) or None, seeds or None])
+    return context.section(
+        "provenance",
+        "Provenance",
+        "The same configuration on the same inputs gives the same digests.",
+        artifacts=Table(("Artifact", "Digest", "Version", "Seeds"), rows, caption="Artifacts that this report shows"),
+        machine=context.slot("machine", render("report/machine.html", **machine_facts(manifests)), "See run/run.js."),
+        configs={
+            name: escape(json.dumps(manifest["config"], indent=2, sort_keys=True, ensure_ascii=False))  # uncut
+            for name, manifest in manifests.items()
+            if manifest.get("config") is not None
+        },
+        weights=Table(("Weights", "Size, MB", "Card"), weights, [1]) if weights else None,
+        cards=cards,
+    )
+
+
+def machine_facts(manifests: Mapping[str, JsonObject]) -> dict[str, object]:
+    """Machines, packages, and wall time and commit by artifact."""
+    rows: list[list[object]] = []
+    packages: dict[str, set[str]] = {}
+    machines: set[str] = set()
+    for name, manifest in manifests.items():
+        if not manifest:
+            continue
+        environment = manifest.get("environment") or {}
+        for package, version in (environment.get("packages") or {}).items():
+            packages.setdefault(package, set()).add(str(version))
+        if environment:
+            known = {key: environment.get(key, "?") for key in ("platform", "cpu_count", "python")}
+            machines.add("{platform}, {cpu_count} cores, Python {python}".format(**known))
+        seconds, commit = manifest.get("wall_seconds"), environment.get("git_commit")
+        shown = number(float(seconds), 1) if isinstance(seconds, (int, float)) else None
+        resumed = "yes" if manifest.get("resumed") else "no"
+        rows.append([name, shown, resumed, manifest.get("finished_at"), code(commit) if commit else None])
+    return {
+        "machines": "; ".join(sorted(machines)) or "not recorded",
+        "packages": ", ".join(f"{n} {'/'.join(sorted(v))}" for n, v in sorted(packages.items())) or "not recorded",
+        "times": Table(("Artifact", "Seconds", "Resumed", "Finished", "Commit"), rows, [1]) if rows else None,
+    }

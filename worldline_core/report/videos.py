@@ -18,24 +18,23 @@ import numpy as np
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frames import Frames, VideoFrames
-from worldline_core.errors import DataError
+from worldline_core.data.video.frames import VideoFrames
 from worldline_core.exports.export import export_rollout
 from worldline_core.pages.page import words
-from worldline_core.pictures import draw_tag, side_by_side, write_side_by_side, write_video
-from worldline_core.report.context import ReportContext, Section
-from worldline_core.report.video_scores import SPLIT_LABELS, Method, VideoScores, in_order
+from worldline_core.pictures import Picture, draw_tag, side_by_side, write_side_by_side, write_video
+from worldline_core.report.context import SPLIT_LABELS, Method, ReportContext, Section, VideoScores, in_order
 
 TITLE = "Predicted videos"
 GROUP_CAPTIONS = {
     "shipped": "Long-trained: the checkpoints that ship with the project",
     "run": "This run: what its own training reached",
 }
+MOST_COLUMNS = 6
 
 
 @dataclass(frozen=True)
 class ChosenEpisode:
-    """An episode and why it is shown."""
+    """An episode, the reason why it is shown, and its score."""
 
     episode_id: str
     reason: str
@@ -45,15 +44,10 @@ class ChosenEpisode:
 def best_median_worst(values: Mapping[str, float]) -> list[tuple[str, str, float]]:
     """(label, episode, value) of the median, best and worst of a score where higher is better; ties by name."""
     ranked = sorted(values.items(), key=lambda item: (item[1], item[0]))
-    if not ranked:
-        return []
-    places = [("median", (len(ranked) - 1) // 2), ("best", len(ranked) - 1), ("worst", 0)]
-    chosen: list[tuple[str, str, float]] = []
-    for label, place in places:
-        name, value = ranked[place]
-        if name not in {episode for _, episode, _ in chosen}:
-            chosen.append((label, name, value))
-    return chosen
+    chosen: dict[tuple[str, float], str] = {}
+    for label, place in (("median", (len(ranked) - 1) // 2), ("best", -1), ("worst", 0)) if ranked else ():
+        chosen.setdefault(ranked[place], label)
+    return [(label, *item) for item, label in chosen.items()]
 
 
 def choose_episodes(scores: VideoScores, primary: str | None, available: Sequence[str]) -> list[ChosenEpisode]:
@@ -74,8 +68,7 @@ def choose_episodes(scores: VideoScores, primary: str | None, available: Sequenc
         ranked = best_median_worst(values)
         where = SPLIT_LABELS.get(group, group)
         for label, episode, value in ranked if not chosen else ranked[:1]:
-            reason = f"{label} of {len(values)} on {where}"
-            chosen.append(ChosenEpisode(episode, reason, value))
+            chosen.append(ChosenEpisode(episode, f"{label} of {len(values)} on {where}", value))
     if chosen or not available:
         return chosen
     ordered = sorted(known)
@@ -86,7 +79,7 @@ def choose_episodes(scores: VideoScores, primary: str | None, available: Sequenc
 
 
 def chosen_episodes(context: ReportContext) -> list[ChosenEpisode]:
-    """The episodes shown in video, the same for every page; the first is the median of the held-out ones."""
+    """The episodes shown in video; the first is the median of the held-out ones."""
     if context.episodes is None:
         return []
     known = {row.episode_id for row in context.episodes.rows}
@@ -109,19 +102,18 @@ def videos_section(context: ReportContext) -> Section:
             " The episodes are not chosen by hand: they are the median, the best and the worst by the robot IoU of the first"
             " model's prediction."
         )
-    return context.section(
-        "videos", TITLE, lead, cards=[card(context, context.episodes, item, i) for i, item in enumerate(chosen)]
-    )
+    cards = [card(context, context.episodes, item, number) for number, item in enumerate(chosen)]
+    return context.section("videos", TITLE, lead, cards=cards)
 
 
 def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> dict[str, Any]:
-    """One episode: what it is, its videos by view, and the recordings beside it."""
+    """One episode: its description, its videos by view, and the recordings beside it."""
     row = episodes.rows[episodes.position(item.episode_id)]
     views = [view for view in VIEWS if view in row.views]
     wanted = [(view, group) for view in views for group in GROUP_CAPTIONS]
     # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        videos = list(pool.map(lambda place: video(context, item, place[0], place[1], number), wanted))
+        videos = list(pool.map(lambda place: video(context, episodes, item, *place, number), wanted))
     panels = []
     for view in views:
         made = [found for (of, _), found in zip(wanted, videos, strict=True) if of == view and found is not None]
@@ -130,7 +122,8 @@ def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, numb
             panels.append((view, [{**found, "share": found["video"].width / widest} for found in made]))
     return {
         "item": item, "row": row, "number": number, "panels": panels,
-        "tone": {"success": "good", "failure": "bad"}.get(row.outcome, ""), "recordings": recordings(context, item, number),
+        "tone": {"success": "good", "failure": "bad"}.get(row.outcome, ""),
+        "recordings": recordings(context, episodes, item, number),
     }  # fmt: skip
 
 
@@ -138,57 +131,35 @@ def methods_of_group(context: ReportContext, episode_id: str, group: str) -> lis
     """Methods with a prediction of this episode: those with the group's weights, then baselines without any."""
     methods = in_order([name for name, rollout in context.rollouts.items() if episode_id in rollout.episode_ids])
     own = [m for m in methods if m.group == group]
-    return [*own, *[m for m in methods if m.group == "baseline"]][: context.config.max_columns - 1] if own else []
+    return [*own, *[m for m in methods if m.group == "baseline"]][: MOST_COLUMNS - 1] if own else []
 
 
-def video(context: ReportContext, item: ChosenEpisode, view: str, group: str, number: int) -> dict[str, Any] | None:
-    """Truth and one group's predictions of one view, with a caption; None when the group has none.
-
-    What is found to be unreadable while it is written is left out, and named.
-    """
-    episodes, name = context.episodes, item.episode_id
+def video(
+    context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, view: str, group: str, number: int
+) -> dict[str, Any] | None:
+    """Truth and one group's predictions of one view, with a caption; None when the group has none."""
+    name = item.episode_id
     methods = [m for m in methods_of_group(context, name, group) if view in context.rollouts[m.name].views(name)]
-    if episodes is None or not methods:
+    if not methods:
         return None
     index = episodes.position(name)
-    path, fps = context.media / f"episode{number}_{group}_{view}.mp4", episodes.rows[index].fps
-    shape = {"tile_height": context.config.tile_height, "upscale": context.config.upscale}
     columns = {"true": VideoFrames(episodes.clip(index, view))}
     columns |= {method.label: VideoFrames(context.rollouts[method.name].clip(name, view)) for method in methods}
-    unreadable: dict[str, str] = {}
-    try:
-        made = write_side_by_side(path, columns, fps, **shape)
-    except DataError:
-        unreadable = {
-            label: fault for label, frames in columns.items() if label != "true" and (fault := _fault(frames))
-        }
-        if not unreadable:
-            raise
-        columns = {label: frames for label, frames in columns.items() if label not in unreadable}
-        made = write_side_by_side(path, columns, fps, **shape)
+    path = context.media / f"episode{number}_{group}_{view}.mp4"
+    made = write_side_by_side(path, columns, episodes.rows[index].fps, tile_height=context.config.tile_height)
     caption = f"{GROUP_CAPTIONS[group]} ({words(view)} view, {made.num_frames} frames). Columns: {', '.join(columns)}."
-    return {"video": made, "caption": caption, "unreadable": [f"{label}: {what}" for label, what in unreadable.items()]}
+    return {"video": made, "caption": caption}
 
 
-def _fault(frames: Frames) -> str | None:
-    """What is wrong with a video that cannot be read to its end."""
-    try:
-        for _ in frames:
-            pass
-    except DataError as error:
-        return error.what
-    return None
-
-
-def recordings(context: ReportContext, item: ChosenEpisode, number: int) -> list[str]:
+def recordings(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, number: int) -> list[str]:
     """Names of the Rerun and MCAP files written below run/recordings (a Rerun recording's bytes are not reproducible)."""
     formats = [name for name, wanted in (("rrd", context.config.rerun), ("mcap", context.config.mcap)) if wanted]
     shown = {m.name for group in GROUP_CAPTIONS for m in methods_of_group(context, item.episode_id, group)}
-    if context.episodes is None or not formats:
+    if not formats:
         return []
     folder = context.inputs.get("render_actions")
     written = export_rollout(
-        {name: rollout for name, rollout in context.rollouts.items() if name in shown}, context.episodes,
+        {name: rollout for name, rollout in context.rollouts.items() if name in shown}, episodes,
         None if folder is None else ActionTracks.open(folder), item.episode_id, context.output / "run" / "recordings",
         formats=formats, name=f"episode{number}",
     )  # fmt: skip
@@ -207,7 +178,7 @@ def overview_video(context: ReportContext) -> dict[str, Any] | None:
     method = next((m for m in methods if m.name == context.config.primary_method), methods[0])
     index = episodes.position(item.episode_id)
     row = episodes.rows[index]
-    rows: list[Iterator[np.ndarray]] = []
+    rows: list[Iterator[Picture]] = []
     count = row.video_frames
     rollout = context.rollouts[method.name]
     for view in [v for v in VIEWS if v in row.views and v in rollout.views(item.episode_id)]:

@@ -1,4 +1,4 @@
-"""What the filters did with each episode, and the page "Filters": the funnel, each reason's count, and an example of each."""
+"""Page "Data and filters": recorded episodes, what the filters did with each, and the controls over the pictures."""
 
 from __future__ import annotations
 
@@ -10,36 +10,42 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from PIL import Image
 
-from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.actions.overlays import draw_overlay
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
+from worldline_core.actions.overlay_views import overlay_sheet
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.errors import DataError
 from worldline_core.pages.charts import funnel_chart
-from worldline_core.pages.page import Table, code
+from worldline_core.pages.page import Table, code, number, percent, with_note, words
 from worldline_core.pictures import Picture, SheetRow, contact_sheet, evenly_spaced
 from worldline_core.report.context import ReportContext, Section
-from worldline_core.store.artifact_files import JsonObject, read_rows
+from worldline_core.report.dataset_card import DatasetFacts, choose_rows, sheet_rows
+from worldline_core.store.artifact_files import JsonObject, read_json, read_rows
 
-TITLE = "Filters"
+TITLE = "Data and filters"
+SHEET_ROWS = 12
+OVERLAYS = 4
 MOMENTS = 5
 SHOWN_HEIGHT = 128
 QUARANTINED, NOT_STAGE2, CUT = EFFECTS = ("quarantined", "kept for Stage I only", "frames cut")
-
 KEPT = "kept"
 NUMBERS_SHOWN = 6
 UNITS = {"_rad_s": " rad/s", "_deg": "°", "_rad": " rad", "_px": " px", "_s": " s", "_m": " m"}
 """Longest suffixes first."""
+CAUSES = ("valid", "behind_camera", "outside_image", "invalid_calibration")
 
 
 @dataclass(frozen=True)
 class FilteredEpisode:
-    """One curated episode and what became of it.
+    """One curated episode after the filters.
 
     Attributes:
-        dropped: why it was dropped whole; None for a kept one.
+        dropped: the reason why it was dropped whole; None for a kept one.
         kept: its segments in the filtered set.
         findings: rows of findings.parquet, their numbers parsed.
     """
@@ -51,12 +57,12 @@ class FilteredEpisode:
 
     @property
     def stage2_reason(self) -> str | None:
-        """Why a kept one is barred from Stage II."""
+        """The reason why a kept one is barred from Stage II."""
         return next((row.stage2_reason or "unfit for Stage II" for row in self.kept if not row.stage2_ok), None)
 
     @property
     def cut_by(self) -> Counter[str]:
-        """Reasons that cut frames out of a kept episode, and how many."""
+        """Frames cut out of a kept episode, by reason."""
         counts: Counter[str] = Counter()
         for finding in self.findings if self.dropped is None else ():
             counts[finding["detector"]] += finding["cut_frames"]
@@ -64,7 +70,7 @@ class FilteredEpisode:
 
     @property
     def reasons(self) -> list[str]:
-        """Every reason that it is an example of; `kept` for one that nothing happened to."""
+        """Every reason that it is an example of; `kept` for one without any."""
         if self.dropped is not None:
             return [self.dropped.reason]
         return list(dict.fromkeys([*self.cut_by, *filter(None, [self.stage2_reason])])) or [KEPT]
@@ -113,10 +119,7 @@ def with_unit(key: str, value: float | str) -> str:
 
 @dataclass(frozen=True)
 class Refusal:
-    """One episode, the reason, what became of it, and the numbers that show it.
-
-    `view` is where the finding was made, None when it concerns no single view.
-    """
+    """One episode, the reason, its effect, and the numbers that show it; `view` is None where no single view is concerned."""
 
     step: str
     reason: str
@@ -128,7 +131,7 @@ class Refusal:
 
 
 def filter_refusals(episode: FilteredEpisode) -> list[Refusal]:
-    """That the filters dropped an episode, or barred it from Stage II and cut frames out of it."""
+    """Refusals of one episode: dropped whole, barred from Stage II, frames cut."""
     name, dropped = episode.episode_id, episode.dropped
     if dropped is not None:
         view = next((f["view"] for f in episode.findings if f["detector"] == dropped.reason), None)
@@ -147,41 +150,57 @@ def filter_refusals(episode: FilteredEpisode) -> list[Refusal]:
     return found
 
 
-def filters_section(context: ReportContext) -> Section:
-    """Found, curated, kept, fit for each stage; and why the others were not."""
+def data_section(context: ReportContext) -> Section:
+    """Counts of the curated episodes, the way from source to training, reasons with examples, overlays."""
     curated, filtered = context.inputs.get("curate"), context.inputs.get("filter")
-    if curated is None and filtered is None:
-        return Section("filters", TITLE, missing="neither the curated nor the filtered EpisodeSet was given.")
+    folder = curated or filtered
+    if folder is None:
+        return Section("data", TITLE, missing="no EpisodeSet was given (inputs curate or filter).")
+    facts = DatasetFacts.read(folder)
+    rows, unreadable = sheet_rows(EpisodeSet.open(folder), choose_rows(facts.rows, range(len(facts.rows)), SHEET_ROWS))
+    sheet = context.picture("contact_sheet", contact_sheet(rows), alt="Recorded episodes") if rows else None
     stages: list[tuple[str, int]] = []
     refusals: list[Refusal] = []
     kept = None
     if curated is not None:
-        readable, refused = read_index(curated), read_quarantine(curated)
-        stages += [("found in the sources", len(readable) + len(refused)), ("readable and complete", len(readable))]
+        refused = read_quarantine(curated)
+        stages = [("found in the sources", len(facts.rows) + len(refused)), ("readable and complete", len(facts.rows))]
         refusals += [Refusal("curate", r.reason, QUARANTINED, r.episode_id, r.detail, r.numbers) for r in refused]
     if filtered is not None:
         outcomes = read_outcomes(filtered).values()
         episodes = [episode.kept for episode in outcomes if episode.kept]
-        stages.append(("kept, fit for Stage I", sum(rows[0].stage1_ok for rows in episodes)))
-        stages.append(("fit for Stage II", sum(rows[0].stage2_ok for rows in episodes)))
+        stages.append(("kept, fit for Stage I", sum(segments[0].stage1_ok for segments in episodes)))
+        stages.append(("fit for Stage II", sum(segments[0].stage2_ok for segments in episodes)))
         refusals += [refusal for episode in outcomes for refusal in filter_refusals(episode)]
-        kept = (len(episodes), sum(map(len, episodes)), sum(row.num_frames for rows in episodes for row in rows))
-    lead = (
-        "Nothing is dropped silently: every input that did not get through is in quarantine with a reason code and the"
-        " evidence; kept and quarantined together are what was found. Stage II needs three views, valid calibration,"
-        " aligned clocks and a projection that agrees with the pictures; what fails only there stays for Stage I."
-    )
-    cards, without_picture = examples(context, refusals)
+        frames = sum(row.num_frames for segments in episodes for row in segments)
+        kept = (len(episodes), sum(map(len, episodes)), frames)
+    overlays, problems = overlay_pictures(context)
     return context.section(
-        "filters",
+        "data",
         TITLE,
-        lead,
+        facts.summary,
+        facts=facts,
+        scenes=scene_table(facts),
+        sheet=sheet,
         chart=funnel_chart(stages, title="Episodes from source to training"),
         kept=kept,
         reasons=reason_table(refusals),
-        examples=cards,
-        without_picture=without_picture,
+        examples=examples(context, refusals),
+        overlays=overlays,
+        samples=sample_table(context),
+        problems=[*(f"No picture of {line}" for line in unreadable), *problems],
     )
+
+
+def scene_table(facts: DatasetFacts) -> Table:
+    """Every scene with its robots and splits."""
+    counts = facts.count_table("Scene", lambda row: row.scene)
+    rows = []
+    for scene, _, *numbers in counts.rows:
+        own = [row for row in facts.rows if row.scene == scene]
+        robots, splits = sorted({row.embodiment for row in own}), sorted({words(row.split) for row in own})
+        rows.append([scene, ", ".join(robots), ", ".join(splits), *numbers])
+    return Table(("Scene", "Embodiments", "Split", *counts.headings[2:]), rows, range(3, 8))
 
 
 def reason_table(refusals: Sequence[Refusal]) -> Table | None:
@@ -195,21 +214,17 @@ def reason_table(refusals: Sequence[Refusal]) -> Table | None:
     return Table(("Reason", "Step", "Effect", "Episodes", "For example"), rows, [3], "Reasons") if rows else None
 
 
-def examples(context: ReportContext, refusals: Sequence[Refusal]) -> tuple[list[dict[str, object]], list[str]]:
-    """One picture for each reason whose episode can still be shown; and the reasons without one."""
+def examples(context: ReportContext, refusals: Sequence[Refusal]) -> list[dict[str, object]]:
+    """One picture for each reason whose episode can still be decoded."""
     cards: dict[str, dict[str, object]] = {}
-    unseen: set[str] = set()
     for item in sorted(refusals, key=lambda r: (EFFECTS.index(r.effect), r.reason, r.episode_id)):
         if item.reason in cards:
             continue
         picture = example_picture(context, item)
-        if picture is None:
-            unseen.add(item.reason)
-            continue
-        name = f"refused_{''.join(c if c.isalnum() else '_' for c in item.reason)}"
-        image = context.picture(name, picture, alt=f"Example for {item.reason}", photo=True)
-        cards[item.reason] = {"image": image, "item": item, "numbers": numbers_text(item.numbers)}
-    return list(cards.values()), sorted(unseen - set(cards))
+        if picture is not None:
+            image = context.picture(f"refused_{safe_stem(item.reason)}", picture, alt=f"Example for {item.reason}")
+            cards[item.reason] = {"image": image, "item": item, "numbers": numbers_text(item.numbers)}
+    return list(cards.values())
 
 
 def example_picture(context: ReportContext, item: Refusal) -> Picture | None:
@@ -230,9 +245,7 @@ def example_picture(context: ReportContext, item: Refusal) -> Picture | None:
 
 
 def moments(context: ReportContext, item: Refusal) -> Picture:
-    """A row of moments of a curated episode.
-
-    Where calibration or clocks are at fault, the projected tools are drawn: that is where the fault shows.
+    """A row of moments of a curated episode, with the projected tools where calibration or clocks are at fault.
 
     Raises:
         DataError: the set does not hold the episode, or cannot decode it.
@@ -251,3 +264,61 @@ def moments(context: ReportContext, item: Refusal) -> Picture:
                 drawn = zip(frames, chosen, strict=True)
                 frames = np.stack([draw_overlay(f, found, n, view, tile_height=SHOWN_HEIGHT) for f, n in drawn])
     return contact_sheet([SheetRow("", frames)], tile_height=SHOWN_HEIGHT, column_titles=[f"frame {i}" for i in chosen])
+
+
+def episode_overlay(
+    episodes: EpisodeSet, index: int, tracks: EpisodeTracks, sigma_px_ref: float, title: str | None = None
+) -> Picture:
+    """Four moments of an episode in every view, with its tracks drawn over them.
+
+    Raises:
+        DataError: the episode has no view with a track, or its frames cannot be decoded.
+    """
+    row = episodes.rows[index]
+    chosen = evenly_spaced(min(tracks.num_frames, row.video_frames), 4)
+    frames = {view: np.asarray(episodes.frames(index, view, chosen)) for view in tracks.views if view in row.views}
+    return overlay_sheet(frames, tracks, chosen, style=OverlayStyle(sigma_px_ref), title=title)
+
+
+def overlay_pictures(context: ReportContext) -> tuple[list[tuple[Markup, EpisodeRow]], list[str]]:
+    """The controls over one episode of each embodiment, held-out scenes preferred; and a line on each unreadable one."""
+    folder, episodes = context.inputs.get("render_actions"), context.episodes
+    if folder is None or episodes is None:
+        return [], ["No action tracks were given (input render_actions)."]
+    tracks = ActionTracks.open(folder)
+    first: dict[str, int] = {}
+    order = sorted(range(len(episodes)), key=lambda i: episodes.rows[i].episode_id)
+    for index in sorted(order, key=lambda i: episodes.rows[i].split not in ("test", "ood_test")):
+        row = episodes.rows[index]
+        if row.bank is None and len(row.views) > 1:
+            first.setdefault(row.embodiment, index)
+    shown: list[tuple[Markup, EpisodeRow]] = []
+    unreadable: list[str] = []
+    for _, index in sorted(first.items())[:OVERLAYS]:
+        row = episodes.rows[index]
+        if row.episode_id not in tracks:
+            continue
+        try:
+            picture = episode_overlay(episodes, index, tracks.tracks(row.episode_id), tracks.sigma_px_ref)
+        except DataError as error:
+            unreadable.append(f"No overlay of {row.episode_id}: {error.what}")
+            continue
+        alt = f"Action maps over {row.episode_id}"
+        shown.append((context.picture(f"actions_{len(shown)}", picture, alt=alt), row))
+    return shown, unreadable
+
+
+def sample_table(context: ReportContext) -> Table | None:
+    """Valid samples (frame, view, arm) of the action tracks, and the causes of the others, by embodiment."""
+    folder = context.inputs.get("render_actions")
+    counts = {} if folder is None else read_json(folder / "summary.json").get("by_embodiment", {})
+    causes = [cause for cause in CAUSES if any(cause in numbers for numbers in counts.values())]
+    rows = []
+    for name, numbers in sorted(counts.items()):
+        found = [numbers.get(cause, 0) for cause in causes]
+        total = sum(found) or 1
+        shares = [with_note(number(count), percent(count / total)) for count in found]
+        rows.append([name, numbers.get("episodes"), *shares])
+    headings = ["Embodiment", "Episodes", *[words(cause).capitalize() for cause in causes]]
+    caption = "Samples of the action maps (one per frame, view and arm). Only valid ones are drawn; the others are masked to zero."
+    return Table(headings, rows, range(1, len(headings)), caption) if causes else None
