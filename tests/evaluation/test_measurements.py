@@ -7,15 +7,16 @@ import pytest
 
 from tests.evaluation.conftest import make_film  # pyright: ignore[reportMissingImports]
 from worldline_core.evaluation.policy.evidence import establishes_success, route
-from worldline_core.evaluation.policy.measured_judge import facts, measure, score
-from worldline_core.evaluation.policy.measurements import (
+from worldline_core.evaluation.policy.measured_judge import (
     LATE_COUNT,
     PressMeasurement,
+    facts,
+    measure,
     measure_lift,
     measure_press,
     measure_push,
+    score,
 )
-from worldline_core.evaluation.segmenters.colour import ColourSegmenter
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
     OwnColour,
@@ -24,6 +25,7 @@ from worldline_core.evaluation.segmenters.coloured_things import (
     named_things,
     own_colour,
 )
+from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter
 
 CUBE = ColouredThing("red", "cube")
 

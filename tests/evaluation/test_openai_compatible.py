@@ -9,10 +9,9 @@ import pytest
 
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
-from worldline_core.evaluation.policy.vlm_judge import VLMJudge
+from worldline_core.evaluation.policy.judge import VLMJudge
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import Image, Text, UnansweredMessageError
-from worldline_core.evaluation.vlm_models import OpenAICompatibleModel, open_vlm
+from worldline_core.evaluation.vlm import Image, OpenAICompatibleModel, Text, UnansweredMessageError, open_vlm
 
 
 class Server:

@@ -14,10 +14,9 @@ from transformers import LogitsProcessor, LogitsProcessorList
 from worldline_core.errors import UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.policy.evidence import GraspEvidence, MotionEvidence, establishes_success
-from worldline_core.evaluation.policy.vlm_judge import VLMJudge
+from worldline_core.evaluation.policy.judge import VLMJudge
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, Text, Video
-from worldline_core.evaluation.vlm_models import Qwen3VLModel, open_vlm
+from worldline_core.evaluation.vlm import MAX_NEW_TOKENS, Image, Qwen3VLModel, Text, Video, open_vlm
 from worldline_core.rehearsal.outside_models import write_qwen3_vl
 
 HEIGHT_PX = 64

@@ -9,11 +9,15 @@ import torch
 from worldline_core.errors import ArtifactError, DataError, UnavailableError
 from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import video_iou
-from worldline_core.evaluation.segmenters.colour import ColourSegmenter
-from worldline_core.evaluation.segmenters.learned import LearnedSegmenter, UNet
-from worldline_core.evaluation.segmenters.sam3 import Sam3Segmenter
-from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-from worldline_core.evaluation.segmenters.train_segmenter import MaskBatch, MaskObjective, augment, train_segmenter
+from worldline_core.evaluation.segmenters.learned import (
+    LearnedSegmenter,
+    MaskBatch,
+    MaskObjective,
+    UNet,
+    augment,
+    train_segmenter,
+)
+from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter, Sam3Segmenter, open_segmenter
 from worldline_core.rehearsal.outside_models import write_sam3
 from worldline_core.training import trainer
 

@@ -20,7 +20,7 @@ from worldline_core.data.mcap.exported import read_exported_episode
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.video.clip import Picture
 from worldline_core.data.video.frames import VideoFrames, packed_images, pieces, unpacked_images
-from worldline_core.evaluation.segmenters.colour import ColourSegmenter
+from worldline_core.evaluation.segmenters.segmenter import ColourSegmenter
 from worldline_core.evaluation.video.episode_measurement import EpisodeMeasurement
 from worldline_core.exports.export import export, shown_tracks
 from worldline_core.pictures import write_side_by_side

@@ -16,9 +16,8 @@ import pytest
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.evaluation.evaluation_config import VLMConfig
 from worldline_core.evaluation.policy.evidence import GraspEvidence
-from worldline_core.evaluation.vlm import Text, parse_answer
+from worldline_core.evaluation.vlm import OpenAICompatibleModel, Text, parse_answer
 from worldline_core.evaluation.vlm import ask as ask_model
-from worldline_core.evaluation.vlm_models import OpenAICompatibleModel
 
 KEY = "key-of-the-judge"
 OK = b"HTTP/1.1 200 OK\r\n"

@@ -43,7 +43,7 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-from worldline_core.evaluation.vlm_models import open_vlm
+from worldline_core.evaluation.vlm import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic

@@ -24,7 +24,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.evaluation_config import PolicyEvaluationConfig
 from worldline_core.evaluation.policy.agreement import policy_agreement, require_policies
-from worldline_core.evaluation.policy.judge import Judge, confidence_of, judge_trajectory
+from worldline_core.evaluation.policy.judge import Judge, VLMJudge, confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.trust import (
     TRUST_COLUMNS,
@@ -33,7 +33,6 @@ from worldline_core.evaluation.policy.trust import (
     assess_trust,
     content_digest,
 )
-from worldline_core.evaluation.policy.vlm_judge import VLMJudge
 from worldline_core.evaluation.recordings import (
     open_rollouts,
     open_tracks,
@@ -53,7 +52,7 @@ from worldline_core.evaluation.scores import (
     write_table,
 )
 from worldline_core.evaluation.segmenters.segmenter import open_segmenter
-from worldline_core.evaluation.vlm_models import open_vlm
+from worldline_core.evaluation.vlm import open_vlm
 from worldline_core.progress import with_progress
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.atomic import write_json_atomic
