@@ -29,12 +29,18 @@ import numpy as np
 from benchmarks.harness import RECORDINGS, command_line, print_table
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, Residual
-from worldline_core.calibration.motion_fit import PARAMETERS, moved_camera
-from worldline_core.calibration.observation import Observation, observe, small_gray
-from worldline_core.calibration.reading import read
-from worldline_core.calibration.residual import KINDS, combined, estimate_residuals, standing_out
-from worldline_core.calibration.source_diagnosis import diagnose_set
+from worldline_core.calibration.camera_errors import (
+    ERROR_KINDS,
+    PARAMETERS,
+    CameraError,
+    combine,
+    estimate_camera_errors,
+    moved_camera,
+    significant,
+)
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Conclusion, Diagnosis, diagnose_source
+from worldline_core.calibration.evidence import MIN_IMAGE_PAIRS
+from worldline_core.calibration.observation import Observation, observe, read, small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions, applicable
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
@@ -139,14 +145,14 @@ def healthy(root: Path, splits: set[str], every: int, disturb: bool) -> Iterator
         yield Healthy(episode, as_tool_poses(episode, robot), gray, robot)
 
 
-def observable(name: str, episode: Healthy, diagnosis: Diagnosis, config: CalibrationDoctorConfig) -> bool:
+def observable(name: str, episode: Healthy, diagnosis: Diagnosis) -> bool:
     """True if a recording holds anything that this mistake would make recognisably wrong."""
     if name == "image_lag_frames":
-        return min(len(images) for images in episode.gray.values()) > config.min_image_pairs
+        return min(len(images) for images in episode.gray.values()) > MIN_IMAGE_PAIRS
     if name == "tool_offset_z_m":  # a wrist camera whose mount is stated
         return any(arm.wrist_camera is not None for arm in episode.kinematics.embodiment.arms)
     if name == "gripper":  # moves, before a camera or against an object
-        return any(term.startswith(("fingers", "stopped")) for term in diagnosis.none.evidence)
+        return any(term.startswith(("fingers", "stopped")) for term in diagnosis.as_recorded.evidence)
     return True
 
 
@@ -176,7 +182,18 @@ def injected(episode: Healthy, choice: int) -> Iterator[tuple[str, Episode, Reco
             yield name, base, conventions
 
 
-def named(diagnosis: Diagnosis) -> str:
+def examine(
+    episode: Healthy, base: Episode, conventions: RecordedConventions, config: CalibrationDoctorConfig, mounts: bool
+) -> Diagnosis:
+    """Diagnosis of a healthy episode, `base` as joints or tool poses, after these conventions have spoiled it."""
+    images = corrupted_image_frames(base.num_frames, conventions)
+    gray = {view: values[images] for view, values in episode.gray.items()}
+    return diagnose(
+        corrupt(base, conventions), gray, episode.kinematics if mounts else without_mounts(episode.kinematics), config
+    )
+
+
+def named(diagnosis: Conclusion) -> str:
     return diagnosis.best.mistake if diagnosis.verdict == "explained" else diagnosis.verdict
 
 
@@ -206,14 +223,11 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
         for name, base, conventions in injected(episode, number):
             if wanted and name not in wanted:
                 continue
-            images = corrupted_image_frames(base.num_frames, conventions)
-            gray = {view: values[images] for view, values in episode.gray.items()}
-            kinematics = without_mounts(episode.kinematics) if arguments.without_mounts else episode.kinematics
             start = time.process_time()
-            diagnosis = diagnose(corrupt(base, conventions), gray, kinematics, config)
+            diagnosis = examine(episode, base, conventions, config, not arguments.without_mounts)
             spent, count = spent + time.process_time() - start, count + 1
             found = named(diagnosis)
-            if not observable(name, episode, diagnosis, config):
+            if not observable(name, episode, diagnosis):
                 unobservable[f"{name}: {found}"] += 1
                 continue
             confusion[name][found] += 1
@@ -228,7 +242,7 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
                 truth[name, episode.joints.embodiment] = conventions
     set_correct: dict[str, list[bool]] = defaultdict(list)
     for (name, embodiment), diagnoses in sets.items():
-        summed = diagnose_set(embodiment, diagnoses, config)
+        summed = diagnose_source(embodiment, diagnoses, config)
         set_correct[name].append(right(name, truth[name, embodiment], named(summed), summed.best.conventions))
     report(confusion, correct, set_correct, lag_errors)
     for case, times in unobservable.items():
@@ -240,14 +254,12 @@ def measure_mistakes(items: Iterator[Healthy], arguments: argparse.Namespace) ->
 
 
 def collect_typical(name: str, diagnosis: Diagnosis, values: dict[str, list[float]]) -> None:
-    """Margins of the rival readings and measures of each view of a healthy episode."""
+    """Margins of the rival readings of a healthy episode, and the flow of each view."""
     for mistake, score in {e.mistake: e.score for e in reversed(diagnosis.ranked)}.items():
-        values[f"{name}: margin of {mistake}"].append(score - diagnosis.none.score)
-    for view in diagnosis.measures:
-        kind = f"{name}: {'wrist' if view.view.endswith('wrist') else 'still'} "
-        for measure in ("flow_agreement", "motion_overlap", "finger_flow"):
-            if getattr(view, measure) is not None:
-                values[kind + measure].append(getattr(view, measure))
+        values[f"{name}: margin of {mistake}"].append(score - diagnosis.as_recorded.score)
+    for view, measures in diagnosis.measures.items():
+        if "flow" in measures:
+            values[f"{name}: {'wrist' if view.endswith('wrist') else 'fixed'} flow"].append(measures["flow"])
 
 
 def report(
@@ -301,7 +313,7 @@ def errors(seed: int, view: str) -> Iterator[tuple[str, float, np.ndarray]]:
     """(kind, size in its unit, parameters): of each case one direction."""
     random = np.random.default_rng([seed, len(view)])
     for name, sizes in CASES["wrist" if view.endswith("wrist") else view]:
-        kind = KINDS[name]
+        kind = ERROR_KINDS[name]
         direction = random.normal(size=kind.parameters.stop - kind.parameters.start)
         for size in sizes:
             theta = np.zeros(PARAMETERS)
@@ -310,29 +322,29 @@ def errors(seed: int, view: str) -> Iterator[tuple[str, float, np.ndarray]]:
 
 
 def count(
-    tally: Tally, kind: str, episodes: Sequence[tuple[Residual, ...]], config: CalibrationDoctorConfig, seed: int
+    tally: Tally, kind: str, episodes: Sequence[tuple[CameraError, ...]], config: CalibrationDoctorConfig, seed: int
 ) -> None:
     """Add what is found in single episodes, and in sources drawn from them."""
     for residuals in episodes:
-        tally.alone.append(bool(standing_out(residuals, config.off_alone)))
-        tally.unseen_alone += [r.within for r in residuals if r.kind == kind]
+        tally.alone.append(bool(significant(residuals, config.off_alone)))
+        tally.unseen_alone += [r.bound for r in residuals if r.kind == kind]
     random = np.random.default_rng(seed)
     for _ in range(DRAWS):
         drawn = random.choice(len(episodes), min(TOGETHER, len(episodes)), replace=False)
-        residuals = combined([episodes[i] for i in drawn])
-        off = standing_out(residuals, config.off_together)
+        residuals = combine([episodes[i] for i in drawn])
+        off = significant(residuals, config.off_together)
         tally.together.append(bool(off))
         tally.named.update(residual.kind for residual in off)
-        tally.unseen_together += [r.within for r in residuals if r.kind == kind]
+        tally.unseen_together += [r.bound for r in residuals if r.kind == kind]
 
 
 def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
     config = CalibrationDoctorConfig()
     observations = [observe(item.joints, item.gray, item.kinematics) for item in items]
 
-    def estimated(observed: Observation) -> tuple[Residual, ...]:
+    def estimated(observed: Observation) -> tuple[CameraError, ...]:
         reading = read(observed, RecordedConventions())
-        return () if reading is None else estimate_residuals(observed, reading, config)
+        return () if reading is None else estimate_camera_errors(observed, reading)
 
     start = time.process_time()
     clean = [estimated(observed) for observed in observations]
@@ -350,7 +362,7 @@ def measure_cameras(items: Sequence[Healthy], seeds: Sequence[int]) -> None:
             for seed in seeds:
                 for kind, size, theta in errors(seed, view):
                     found = [estimated(spoiled(observations[i], view, theta)) for i in shown]
-                    count(tallies[f"{view}: {kind} {size:g} {KINDS[kind].unit}"], kind, found, config, seed)
+                    count(tallies[f"{view}: {kind} {size:g} {ERROR_KINDS[kind].unit}"], kind, found, config, seed)
             yield from (row(name, tally) for name, tally in tallies.items())
         yield exchanged_wrist_videos(items)
 
@@ -367,7 +379,7 @@ def exchanged_wrist_videos(items: Sequence[Healthy]) -> tuple[str, ...]:
             gray = item.gray | {one: item.gray[two] for one, two in (views, views[::-1])}
             found.append(diagnose(item.joints, gray, item.kinematics, FilterDoctorConfig()))
     alone = np.mean([diagnosis.best.mistake == "wrist_videos" for diagnosis in found])
-    together = diagnose_set("exchanged", found).best.mistake
+    together = diagnose_source("exchanged", found).best.mistake
     return "wrist videos exchanged", f"{100 * alone:.0f} % of {len(found)}", "", f"all together: {together}", "", ""
 
 

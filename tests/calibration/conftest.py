@@ -67,7 +67,7 @@ def images() -> dict[str, np.ndarray]:
 def benchmark(project_root: Path) -> ModuleType:
     """The benchmark's injection, so that tests and benchmark measure the same."""
     spec = importlib.util.spec_from_file_location(
-        "calibration_doctor_benchmark", project_root / "benchmarks" / "calibration_doctor.py"
+        "calibration_benchmark", project_root / "benchmarks" / "calibration.py"
     )
     assert spec is not None
     assert spec.loader is not None

@@ -10,15 +10,14 @@ import pytest
 from tools.corrupted.conventions import corrupt, corrupted_image_frames
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.calibration import pictures
-from worldline_core.calibration.diagnosis import Diagnosis, Explanation, VerdictName, ViewMeasures
+from worldline_core.calibration.diagnosis import Diagnosis, Explanation, VerdictName
 from worldline_core.calibration.pictures import (
     MIN_WIDTH,
-    departures_text,
     diagnosis_picture,
+    differing_moments,
     headline,
     measures_note,
     recorded_tracks,
-    telling_moments,
 )
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
@@ -28,10 +27,9 @@ from worldline_core.errors import DataError
 def diagnosis_of(conventions: RecordedConventions, verdict: VerdictName = "explained") -> Diagnosis:
     none = Explanation(RecordedConventions(), -80.0, {"hand_eye right_wrist": -80.0})
     best = Explanation(conventions, -1.0, {"hand_eye right_wrist": -1.0})
-    measures = (ViewMeasures("right_wrist", hand_eye_m=0.2, hand_eye_deg=31.4, camera_lag_frames=-2.0),)
-    if not conventions.departures:
-        return Diagnosis("synthetic/0", verdict, none, (none,), measures, ())
-    return Diagnosis("synthetic/0", verdict, best, (best, none), measures, ())
+    measures = {"right_wrist": {"hand_eye_m": 0.2, "hand_eye_deg": 31.4, "flow": 0.5}}
+    ranked = (best, none) if conventions.departures else (none,)
+    return Diagnosis(episode_id="synthetic/0", verdict=verdict, best=ranked[0], ranked=ranked, measures=measures)
 
 
 def by_hand(episode: Episode, view: str, n: int) -> np.ndarray:
@@ -74,15 +72,15 @@ def test_moments_are_those_at_which_the_readings_differ(episode: Episode) -> Non
     other = replace(tracks, uv=tracks.uv.copy(), valid=tracks.valid.copy())
     other.uv[[4, 13, 20], 0, 0] += 9.0
     other.uv[[2, 10, 22], 0, 0] += 2.0
-    assert telling_moments(tracks, other, 0, 24, 3) == [4, 13, 20]
+    assert differing_moments(tracks, other, 0, 24, 3) == [4, 13, 20]
     # Frame n of the first is frame n - 2 of the second.
     shifted = replace(other, uv=other.uv[2:], valid=other.valid[2:], capsules=other.capsules[2:], depth=other.depth[2:])
-    assert telling_moments(tracks, shifted, 2, 24, 3) == [4, 13, 20]
+    assert differing_moments(tracks, shifted, 2, 24, 3) == [4, 13, 20]
     # A tool that leaves the picture counts for more than one that moves in it.
     other.valid[6, 0, 0] = False
-    assert telling_moments(tracks, other, 0, 24, 3)[0] == 6
+    assert differing_moments(tracks, other, 0, 24, 3)[0] == 6
     # Only frames with images can be shown.
-    assert telling_moments(tracks, other, 0, 2, 3) == [0, 1]
+    assert differing_moments(tracks, other, 0, 2, 3) == [0, 1]
 
 
 def test_an_explained_episode_is_shown_twice(episode: Episode, images: dict[str, np.ndarray]) -> None:
@@ -193,9 +191,10 @@ def test_what_cannot_be_drawn_says_why(episode: Episode, images: dict[str, np.nd
 def test_texts_say_the_verdict_and_the_numbers() -> None:
     found = diagnosis_of(RecordedConventions(intrinsics_size=(480, 640)))
     assert headline(found).startswith("explained by intrinsics_size: score -1.0, as recorded -80.0")
-    assert departures_text(found.best.conventions) == ["intrinsics_size: [480, 640]"]
-    assert measures_note(found.measures[0]) == "camera against hand 200.0 mm, 31.4 deg  ·  camera lag -2.0 frames"
-    assert measures_note(None) == ""
+    assert (
+        measures_note(found.measures["right_wrist"]) == "camera against hand 200.0 mm, 31.4 deg  ·  flow agreement 0.50"
+    )
+    assert measures_note({}) == ""
     for verdict, word in (
         ("unexplained", "worst are hand_eye right_wrist -80.0"),
         ("consistent", "consistent"),

@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Typical
-from worldline_core.calibration.image_evidence import (
+from worldline_core.calibration.calibration_doctor import camera_lags, intrinsics_sizes, tool_offset
+from worldline_core.calibration.evidence import (
+    Typical,
     correlation_log_likelihood,
     finger_flow,
+    hand_eye_log_likelihood,
+    pose_terms,
+    rms_hand_eye,
     still_view_agreement,
     stopped_share,
     wrist_flow_agreement,
 )
-from worldline_core.calibration.measures import camera_lags, intrinsics_sizes, refined_peak, tool_offset
-from worldline_core.calibration.observation import cell_centres, cell_means, observe, small_gray
-from worldline_core.calibration.pose_evidence import hand_eye_log_likelihood, pose_terms, rms_hand_eye
-from worldline_core.calibration.reading import read
+from worldline_core.calibration.observation import cell_centres, cell_means, observe, read, small_gray
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import rigid_inverse
 
-CONFIG = CalibrationDoctorConfig()
 COUNT, HEIGHT, WIDTH = 30, 64, 96
 K = np.array([[80.0, 0, 47.5], [0, 80.0, 31.5], [0, 0, 1]])
 MOUNT = np.eye(4)
@@ -184,7 +184,7 @@ def test_fingers_that_part_mean_opening() -> None:
     inverted = read(observation, RecordedConventions(gripper="inverted"))
     assert as_written is not None
     assert inverted is not None
-    right, wrong = (finger_flow(observation, reading, 0, CONFIG) for reading in (as_written, inverted))
+    right, wrong = (finger_flow(observation, reading, 0) for reading in (as_written, inverted))
     assert right is not None
     assert wrong is not None
     assert right > 0.6
@@ -192,7 +192,7 @@ def test_fingers_that_part_mean_opening() -> None:
     still = observe(episode(), pictures, None)
     resting = read(still, RecordedConventions())
     assert resting is not None
-    assert finger_flow(still, resting, 0, CONFIG) is None
+    assert finger_flow(still, resting, 0) is None
 
 
 def test_an_object_stops_a_closing_gripper_never_an_opening_one() -> None:
@@ -218,7 +218,7 @@ def test_lag_of_camera_poses() -> None:
     observation = observe(replace(recording, cameras={"right_wrist": replace(wrist, T_base_camera=late)}), {}, None)
     reading = read(observation, RecordedConventions())
     assert reading is not None
-    assert camera_lags(observation, reading, CONFIG)[0] == 3
+    assert camera_lags(observation, reading)[0] == 3
     mount, metres, degrees = rms_hand_eye(reading.tools[:-3, 0], late[3:])
     assert np.allclose(mount, MOUNT, atol=1e-9)
     assert (metres, degrees) == pytest.approx((0.0, 0.0), abs=1e-4)
@@ -242,7 +242,7 @@ def test_pose_terms_blame_the_right_thing() -> None:
         observation = observe(episode(), {}, None)
         reading = read(observation, RecordedConventions.model_validate(mistake))
         assert reading is not None
-        return pose_terms(observation, reading, CONFIG)
+        return pose_terms(observation, reading)
 
     assert min(terms().values()) > -0.5
     assert terms(pose_unit="mm")["hand-eye right_wrist"] < -30
@@ -258,7 +258,7 @@ def test_pose_terms_blame_the_right_thing() -> None:
     observation = observe(replace(large, T_base_ee=scaled), {}, None)
     reading = read(observation, RecordedConventions())
     assert reading is not None
-    assert pose_terms(observation, reading, CONFIG)["workspace"] == -40.0
+    assert pose_terms(observation, reading)["workspace"] == -40.0
 
 
 def test_no_stated_mount_no_offset() -> None:
@@ -277,11 +277,5 @@ def test_log_likelihoods_fall_with_disagreement() -> None:
         == correlation_log_likelihood(0.0, typical)
         == pytest.approx(10 * np.log(1 - 0.81))
     )
-    assert hand_eye_log_likelihood(0.0, 0.0, CONFIG) == 0.0
-    assert hand_eye_log_likelihood(100.0, 90.0, CONFIG) == -60.0
-
-
-def test_peaks_between_frames() -> None:
-    assert refined_peak({k: -((k - 1.3) ** 2) for k in range(-3, 4)}) == pytest.approx(1.3)
-    assert refined_peak({-1: 0.0, 0: 0.1, 1: 0.0}) is None  # too flat to mean anything
-    assert refined_peak({k: float(k) for k in range(-3, 4)}) == 3.0
+    assert hand_eye_log_likelihood(0.0, 0.0) == 0.0
+    assert hand_eye_log_likelihood(100.0, 90.0) == -60.0

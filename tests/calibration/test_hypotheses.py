@@ -16,8 +16,7 @@ from worldline_core.calibration import calibration_doctor
 from worldline_core.calibration.calibration_doctor import diagnose
 from worldline_core.calibration.check import ListedEpisode, check_command, repairing_lines
 from worldline_core.calibration.check_report import table_text
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis
-from worldline_core.calibration.source_diagnosis import diagnose_set
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, diagnose_source
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import LoadedEpisode
@@ -64,7 +63,7 @@ def test_another_robot_than_declared_is_named(healthy: list, truth: str, declare
     robot = item.joints.embodiment
     assert (diagnosis.verdict, diagnosis.best.other) == ("explained", ("embodiment", robot))
     assert any(f"fits {robot}, not the declared {declared}" in note for note in diagnosis.notes)
-    together = diagnose_set("source", [diagnosis, diagnosis], CONFIG)
+    together = diagnose_source("source", [diagnosis, diagnosis], CONFIG)
     assert (together.verdict, together.best.text) == ("explained", f"embodiment: {robot}")
     listed = ListedEpisode("e", "source", lambda: None, "curate.sources[1].conventions", declares_robot=True)  # type: ignore[arg-type,return-value]
     assert repairing_lines(listed, together.best) == (f"curate.sources[1].embodiment: {robot}",)
@@ -78,7 +77,7 @@ def test_a_reading_that_leaves_the_recording_ill_does_not_win(healthy: list, mon
     assert diagnosis.verdict == "unexplained"
     assert "angle_unit: deg" in diagnosis.nearest[0]
     assert "still wrong hand-eye" in diagnosis.nearest[0]
-    together = diagnose_set("source", [diagnosis] * 3, CONFIG)
+    together = diagnose_source("source", [diagnosis] * 3, CONFIG)
     assert (together.verdict, together.best.mistake) == ("unexplained", "none")
     assert any("angle_unit: deg: healthy in 0 of 3 episodes" in near for near in together.nearest)
 
@@ -88,7 +87,7 @@ def test_flange_poses_do_not_turn_the_wrist_cameras(shared_data: Path) -> None:
     diagnoses = [diagnose(item.episode, pictures(item), None, CONFIG) for item in loaded]
     assert {diagnosis.verdict for diagnosis in diagnoses} == {"unexplained"}
     assert all("camera_axes: opengl" in diagnosis.nearest[0] for diagnosis in diagnoses)
-    together = diagnose_set("agibot", diagnoses, CONFIG)
+    together = diagnose_source("agibot", diagnoses, CONFIG)
     assert together.verdict == "unexplained"
     assert "healthy in 0 of 2 episodes" in together.nearest[0]
 
@@ -112,7 +111,7 @@ def test_what_nothing_recorded_tells_apart_is_not_claimed(shared_data: Path) -> 
     for diagnosis in diagnoses:
         assert diagnosis.verdict == "unexplained"
         assert any("equally well" in note and "wrist_extrinsics: exchanged" in note for note in diagnosis.notes)
-    together = diagnose_set("agibot", diagnoses, CONFIG)
+    together = diagnose_source("agibot", diagnoses, CONFIG)
     assert together.verdict == "unexplained"
     assert {near.split(": ")[0] for near in together.nearest} >= {"arms", "wrist_extrinsics"}
 
@@ -127,7 +126,7 @@ def test_inverse_and_late(healthy: list, late: str) -> None:
     gray = {view: values[images] for view, values in item.gray.items()}
     diagnosis = diagnose(corrupt(item.joints, conventions), gray, item.kinematics, CONFIG)
     assert (diagnosis.verdict, diagnosis.best.conventions) == ("explained", conventions)
-    together = diagnose_set("source", [diagnosis] * 2, CONFIG)
+    together = diagnose_source("source", [diagnosis] * 2, CONFIG)
     assert (together.verdict, together.best.conventions) == ("explained", conventions)
 
 
@@ -142,10 +141,10 @@ def test_one_good_and_one_bad_episode_prescribe_nothing_for_both(benchmark: Modu
     for mistake in mistakes:
         wrong = benchmark.examine(bad, bad.joints, RecordedConventions.model_validate(mistake), CONFIG, True)
         assert (fine.verdict, wrong.verdict) == ("consistent", "explained")
-        together = diagnose_set("source", [fine, wrong], CONFIG)
+        together = diagnose_source("source", [fine, wrong], CONFIG)
         assert (together.verdict, together.best.mistake) == ("mixed", "none")
-        assert diagnose_set("source", [fine] * 10 + [wrong], CONFIG).verdict == "consistent"
-        assert diagnose_set("source", [fine] + [wrong] * 10, CONFIG).best.mistake == next(iter(mistake))
+        assert diagnose_source("source", [fine] * 10 + [wrong], CONFIG).verdict == "consistent"
+        assert diagnose_source("source", [fine] + [wrong] * 10, CONFIG).best.mistake == next(iter(mistake))
 
 
 def test_what_the_cameras_may_follow_is_printed(shared_data: Path, tmp_path: Path) -> None:

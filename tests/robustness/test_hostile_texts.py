@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from safetensors import SafetensorError
 
+from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck
 from worldline_core.calibration.check_report import page as check_page
-from worldline_core.calibration.diagnosis import CalibrationCheck, Finding
 from worldline_core.config import ConfigError, load_config
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.errors import DataError
@@ -74,7 +74,7 @@ def test_pages_keep_their_elements_whatever_ids_and_reasons_say(text: str, tmp_p
         return write_progress_page(tmp_path, [], [name], [name], 1.0, failed=name).read_text()
 
     def checked(name: str) -> str:
-        return check_page(CalibrationCheck((Finding(name, name, None, reason=name, detail=name),), (), tmp_path))
+        return check_page(CalibrationCheck((EpisodeCheck(name, name, None, reason=name, detail=name),), (), tmp_path))
 
     def card(name: str) -> str:
         return str(markdown(markdown_table(Table((name, "b"), [(name, name)])) + f"\n\n# {plain(name)}\n"))

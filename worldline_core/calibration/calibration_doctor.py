@@ -1,7 +1,7 @@
-"""The calibration doctor: reads an episode under every usual mistake and names the one that explains what it shows.
+"""The calibration doctor reads an episode under every usual mistake and names the one that explains what it shows.
 
-From top to bottom: an episode is observed, read as it was recorded and under one mistake at a time, every reading is
-scored by its evidence (`_Search`), and the scores decide (`verdict`).
+An episode is observed, read as recorded and under one mistake at a time, and every reading is scored by its evidence
+(`_Search`). Most mistakes have one fixed value; a lag, an image size or a tool offset is estimated first.
 """
 
 from __future__ import annotations
@@ -12,42 +12,67 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, Explanation
-from worldline_core.calibration.image_evidence import gripper_terms, image_terms, inversion_gain, observable_views
-from worldline_core.calibration.measures import (
-    camera_lags,
-    conventions_to_try,
-    image_lags,
-    notes_on,
-    tool_offset,
-    view_measures,
+from worldline_core.calibration.camera_errors import estimate_camera_errors
+from worldline_core.calibration.diagnosis import (
+    COMPLEXITY,
+    DEFAULT_CONFIG,
+    SUSPICION,
+    CalibrationDoctorConfig,
+    Diagnosis,
+    Explanation,
+    bad_terms,
+    decide,
+    nearest_texts,
+    term_limits,
+    with_camera_errors,
 )
-from worldline_core.calibration.observation import Observation, arms_of, observe
-from worldline_core.calibration.pose_evidence import pose_terms
-from worldline_core.calibration.reading import Reading, read
-from worldline_core.calibration.residual import with_residuals
-from worldline_core.calibration.verdict import bad_terms, decide, limits, nearest_texts
-from worldline_core.data.episodes.conventions import RecordedConventions
-from worldline_core.data.episodes.episode import Episode
+from worldline_core.calibration.evidence import (
+    MIN_IMAGE_PAIRS,
+    finger_flow,
+    gripper_terms,
+    hand_eye_log_likelihood,
+    image_terms,
+    in_view_share,
+    inversion_gain,
+    observable_views,
+    pose_terms,
+    rms_hand_eye,
+    still_view_agreement,
+    stopped_share,
+    wrist_flow_agreement,
+)
+from worldline_core.calibration.observation import Observation, Reading, arms_of, observe, read
+from worldline_core.data.episodes.conventions import RecordedConventions, applicable
+from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry.embodiment import Embodiment, embodiment_names, load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
+from worldline_core.geometry.transforms import rigid_inverse
 
-DEFAULT_CONFIG = CalibrationDoctorConfig()
 PAIRED_MISTAKES = 4
-"""So many of the mistakes that explain most alone are tried together with others."""
+"""Number of the best single mistakes that are also tried in pairs."""
+MAX_LAG_FRAMES = 6
 MIN_TRAVEL_M = 0.02
 """A tool that moves less over the episode leaves no trace of a mistake."""
-NOTHING = Explanation(RecordedConventions(), 0.0, {})
-WHAT_TO_DO = {
+EXCHANGED_DOUBT = 3.0
+"""Wrist videos that fit worse by more in exchanged places are in their own."""
+INTRINSICS_SNAP, SAME_INTRINSICS_SIZE = 0.02, 0.1
+"""Relative distance within which a usual image size is taken; log distance within which the size is as recorded."""
+MIN_TOOL_OFFSET_M, MAX_TOOL_OFFSET_M = 0.01, 0.5
+COMMANDS_FIT_RATIO, NOTICEABLE_M = 3.0, 0.001
+"""Camera poses follow the commands when their residual against the states is larger by this ratio, and noticeable."""
+REMEDIES = {
     "embodiment": "The recording fits {0}, not the declared {1}: name the robot that it is of",
     "wrist_extrinsics": "Each wrist camera has the other's extrinsics: exchange the two where the source is written",
     "wrist_videos": "Each wrist video is the other hand's: exchange the two where the source is written",
 }
-EXCHANGED_DOUBT = 3.0
-"""Wrist videos that fit worse by more when they change places are each its own hand's."""
 _CAMERA_FIELDS = ("extrinsics", "camera_axes", "extrinsics_unit", "intrinsics_size")
+_COMMON_SIZES = (
+    (1080, 1920), (1200, 1920), (720, 1280), (800, 1280), (960, 1280), (768, 1024), (600, 960), (600, 800), (540, 960),
+    (480, 848), (480, 640), (400, 640), (384, 640), (360, 640), (384, 512), (270, 480), (240, 424), (240, 320),
+    (192, 320), (180, 320), (256, 256), (224, 224), (128, 128), (120, 160), (128, 192), (96, 128), (64, 96),
+)  # fmt: skip
 
 
 def diagnose(
@@ -56,53 +81,59 @@ def diagnose(
     kinematics: ArmKinematics | None,
     config: CalibrationDoctorConfig = DEFAULT_CONFIG,
 ) -> Diagnosis:
-    """Whether an episode's calibration is consistent and, if not, which usual mistake explains it.
+    """Whether an episode's calibration is consistent and, if not, the usual mistake that explains it.
 
     Args:
         frames: images by view, uint8 (H, W, 3) RGB or (h, w) grey, gone through once; views without images are judged by poses.
         kinematics: of the embodiment; None where unknown (tool poses must then be recorded).
 
-    Returns:
-        A diagnosis; verdict too_little_evidence where nothing can be compared.
-
     Raises:
         DataError: images or kinematics do not fit the episode.
     """
     observation = observe(episode, frames, kinematics)
+    name = episode.episode_id
     recorded = read(observation, RecordedConventions())
     if recorded is None or not episode.cameras:
         missing = "tool poses (no kinematics for its joints)" if recorded is None else "camera calibration"
-        note = f"The recording has no {missing}: nothing can be compared"
-        return Diagnosis(episode.episode_id, "too_little_evidence", NOTHING, (NOTHING,), (), (note,))
+        notes = (f"The recording has no {missing}: nothing can be compared",)
+        return Diagnosis(verdict="too_little_evidence", notes=notes, episode_id=name, measures={})
     search = _Search(observation, recorded, config)
     if config.search == "when_suspicious" and (quick := search.unsuspicious()) is not None:
-        quickly = Diagnosis(episode.episode_id, "consistent", quick, (quick,), (), ())
-        return with_residuals(quickly, observation, recorded, config)
-    none = search.none
-    moves = float(np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max())
-    measures = view_measures(observation, recorded, config)
-    notes = notes_on(observation, recorded, measures, config)
-    ranked = sorted([none, *search.singles()], key=lambda e: -e.score)
-    if bad_terms(none, config):
-        if search.residual(ranked[0]):
+        quickly = Diagnosis(verdict="consistent", best=quick, ranked=(quick,), episode_id=name, measures={})
+        return with_camera_errors(quickly, estimate_camera_errors(observation, recorded), config.off_alone)
+    as_recorded = search.as_recorded
+    notes = notes_on(observation, recorded)
+    ranked = sorted([as_recorded, *search.singles()], key=lambda e: -e.score)
+    if bad_terms(as_recorded, config):
+        if search.is_suspicious(ranked[0]):
             beating = [pair for pair in search.pairs(ranked) if pair.score > ranked[0].score + config.min_margin]
             ranked = sorted([*ranked, *beating], key=lambda e: -e.score)
-        if bad_terms(ranked[0], config, none):
+        if bad_terms(ranked[0], config, as_recorded):
             ranked = sorted([*ranked, *search.other_robots()], key=lambda e: -e.score)
-    verdict, best, rivals = decide(none, ranked, config)
+    verdict, best, rivals = decide(as_recorded, ranked, config)
     if rivals:
         notes = (*notes, f"These explain it equally well, nothing recorded tells which: {'; '.join(rivals)}")
     if best.other is not None:
-        notes = (*notes, WHAT_TO_DO[best.other[0]].format(best.other[1], episode.embodiment))
+        notes = (*notes, REMEDIES[best.other[0]].format(best.other[1], episode.embodiment))
     if best.conventions.camera_lag_frames < 0 and recorded.action_tools is None:
         notes = (*notes, "The camera poses lead the states; they may follow the commands: give the kinematics to see")
-    if verdict == "consistent" and moves < MIN_TRAVEL_M and not observable_views(observation, config):
+    travel = np.linalg.norm(np.diff(recorded.tools[..., :3, 3], axis=0), axis=-1).sum(axis=0).max()
+    if verdict == "consistent" and travel < MIN_TRAVEL_M and not observable_views(observation):
         verdict = "too_little_evidence"
         notes = (*notes, "No tool moves and no picture changes: a mistake would leave no trace")
-    nearest = nearest_texts(ranked, none, config) if verdict == "unexplained" else ()
-    diagnosis = Diagnosis(episode.episode_id, verdict, best, tuple(ranked), measures, notes, nearest)
+    diagnosis = Diagnosis(
+        verdict=verdict,
+        best=best,
+        ranked=tuple(ranked),
+        notes=notes,
+        nearest=nearest_texts(ranked, as_recorded, config) if verdict == "unexplained" else (),
+        episode_id=name,
+        measures={view: measures_of(observation, recorded, view) for view in recorded.cameras},
+    )
     reading = search.read(best.conventions) if best.other is None else None
-    return diagnosis if reading is None else with_residuals(diagnosis, observation, reading, config)
+    if reading is None:
+        return diagnosis
+    return with_camera_errors(diagnosis, estimate_camera_errors(observation, reading), config.off_alone)
 
 
 class _Search:
@@ -110,45 +141,51 @@ class _Search:
 
     def __init__(self, observation: Observation, recorded: Reading, config: CalibrationDoctorConfig) -> None:
         self.observation, self.recorded, self.config = observation, recorded, config
-        self.recorded_poses = pose_terms(observation, recorded, config)
+        self.recorded_poses = pose_terms(observation, recorded)
+
+    @classmethod
+    def as_written(cls, observation: Observation, config: CalibrationDoctorConfig) -> _Search | None:
+        """The search in a recording as written; None where no tool poses are known."""
+        recorded = read(observation, RecordedConventions())
+        return None if recorded is None else cls(observation, recorded, config)
 
     def terms(self, reading: Reading, poses: Mapping[str, float] | None = None) -> dict[str, float]:
-        """All evidence of a reading; `poses` where its pose terms are known, since lags of images do not change them."""
+        """All evidence of a reading; `poses` where its pose terms are known, since image lags do not change them."""
         return {
-            **(pose_terms(self.observation, reading, self.config) if poses is None else poses),
-            **image_terms(self.observation, reading, self.config),
-            **gripper_terms(self.observation, reading, self.config),
+            **(pose_terms(self.observation, reading) if poses is None else poses),
+            **image_terms(self.observation, reading),
+            **gripper_terms(self.observation, reading),
         }
 
     def explain(self, reading: Reading, terms: dict[str, float], other: tuple[str, str] | None = None) -> Explanation:
-        """A reading with its score: the sum of its terms, less what departing from the contract costs."""
+        """A reading with its score: the sum of its terms, less the cost of departing from the contract."""
         found = Explanation(reading.conventions, float(sum(terms.values())), terms, other)
-        cost = self.config.complexity * (len(found.departures) + (reading.conventions.views is not None) / 2)
+        cost = COMPLEXITY * (len(found.departures) + (reading.conventions.views is not None) / 2)
         return replace(found, score=found.score - cost)
 
     @cached_property
-    def none(self) -> Explanation:
+    def as_recorded(self) -> Explanation:
         """The recording as written."""
         return self.explain(self.recorded, self.terms(self.recorded, self.recorded_poses))
 
     def unsuspicious(self) -> Explanation | None:
-        """The recording as written where nothing speaks against it, from what is quick to compute; else None."""
-        observation, config = self.observation, self.config
-        images = image_terms(observation, self.recorded, config, wrist_flow=False)
+        """The recording as written if no cheap evidence speaks against it, else None."""
+        observation = self.observation
+        images = image_terms(observation, self.recorded, wrist_flow=False)
         found = self.explain(self.recorded, {**self.recorded_poses, **images})
-        if min(self.recorded_poses.values(), default=0.0) < config.suspicion or bad_terms(found, config):
+        if min(self.recorded_poses.values(), default=0.0) < SUSPICION or bad_terms(found, self.config):
             return None
-        if inversion_gain(observation, self.recorded, config) > 0:
+        if inversion_gain(observation, self.recorded) > 0:
             return None
         score = sum(images.values())
-        for lag in image_lags(observation, config):
-            other = image_terms(observation, self.recorded.with_image_lag(lag), config, wrist_flow=False)
+        for lag in image_lags(observation):
+            other = image_terms(observation, self.recorded.with_image_lag(lag), wrist_flow=False)
             if sum(other.values()) > score:
                 return None
         return None if self.fits_exchanged_wrists(images) else found
 
     def fits_exchanged_wrists(self, images: Mapping[str, float]) -> bool:
-        """Whether the pictures fit better if the wrist videos change places; flow is compared where the rest leaves doubt.
+        """Whether the pictures fit better with exchanged wrist videos; flow is compared where the rest leaves doubt.
 
         Args:
             images: the image terms as recorded, without the flow in wrist views.
@@ -156,10 +193,10 @@ class _Search:
         exchanged = self.observation.with_exchanged_wrists()
         if exchanged is None:
             return False
-        quick = image_terms(exchanged, self.recorded, self.config, wrist_flow=False)
+        quick = image_terms(exchanged, self.recorded, wrist_flow=False)
         if sum(quick.values()) < sum(images.values()) - EXCHANGED_DOUBT:
             return False
-        both = (image_terms(o, self.recorded, self.config) for o in (exchanged, self.observation))
+        both = (image_terms(o, self.recorded) for o in (exchanged, self.observation))
         gain, written = (sum(terms.values()) for terms in both)
         return gain > written
 
@@ -172,15 +209,14 @@ class _Search:
 
     def singles(self) -> list[Explanation]:
         """Every usual mistake, one at a time."""
-        tried = map(self.read, conventions_to_try(self.observation, self.recorded, self.config))
+        tried = map(self.read, conventions_to_try(self.observation, self.recorded))
         found = [self.in_views_that_improve(reading) for reading in tried if reading is not None]
-        lagging = [self.recorded.with_image_lag(lag) for lag in image_lags(self.observation, self.config)]
+        lagging = [self.recorded.with_image_lag(lag) for lag in image_lags(self.observation)]
         found += [self.explain(late, self.terms(late, self.recorded_poses)) for late in lagging]
         return [*found, *self.exchanged_wrist_cameras()]
 
     def exchanged_wrist_cameras(self) -> Iterator[Explanation]:
-        """Two wrist cameras that bear each other's poses, or each other's videos; rarer than exchanged arms, and where
-        there are no pictures as rigid."""
+        """Two wrist cameras with each other's poses, or each other's videos."""
         views = [arm.wrist_view for arm in self.observation.arms]
         episode = self.observation.episode
         if len(views) != 2 or not all(view in episode.cameras for view in views):
@@ -191,18 +227,18 @@ class _Search:
             views[1]: replace(two, T_base_camera=one.T_base_camera),
         }
         exchanged = replace(episode, cameras=dict(episode.cameras) | cameras)
-        read_so = {"wrist_extrinsics": replace(self.observation, episode=exchanged, _stands={})}
+        observations = {"wrist_extrinsics": replace(self.observation, episode=exchanged, _stands={})}
         if (videos := self.observation.with_exchanged_wrists()) is not None:
-            read_so["wrist_videos"] = videos
-        for name, observation in read_so.items():
-            other = _Search.of(observation, self.config)
+            observations["wrist_videos"] = videos
+        for name, observation in observations.items():
+            other = _Search.as_written(observation, self.config)
             if other is not None:
-                yield self.explain(other.recorded, dict(other.none.evidence), (name, "exchanged"))
+                yield self.explain(other.recorded, dict(other.as_recorded.evidence), (name, "exchanged"))
 
     def other_robots(self) -> Iterator[Explanation]:
-        """The recording as written, of another robot than declared: those with the same arms, if it has joints.
+        """The recording as written, with the other robots that have the same arms, if it has joints.
 
-        What another robot's description does not state (the mount of a camera) counts as for the declared one.
+        Terms that another robot's description does not determine (the mount of a camera) are those of the declared one.
         """
         observation, kinematics = self.observation, self.observation.kinematics
         if kinematics is None or observation.episode.state_kind != "joints":
@@ -213,46 +249,40 @@ class _Search:
                 continue
             episode = replace(observation.episode, embodiment=name)
             arms = arms_of(episode, robot)
-            other = _Search.of(replace(observation, episode=episode, arms=arms, kinematics=robot), self.config)
+            other = _Search.as_written(replace(observation, episode=episode, arms=arms, kinematics=robot), self.config)
             if other is not None:
-                found = self.explain(other.recorded, dict(other.none.evidence), ("embodiment", name))
-                unknown = sum(value for term, value in self.none.evidence.items() if term not in found.evidence)
+                found = self.explain(other.recorded, dict(other.as_recorded.evidence), ("embodiment", name))
+                unknown = sum(v for term, v in self.as_recorded.evidence.items() if term not in found.evidence)
                 yield replace(found, score=found.score + unknown)
 
-    @classmethod
-    def of(cls, observation: Observation, config: CalibrationDoctorConfig) -> _Search | None:
-        """Of a recording as written; None where no tool poses are known."""
-        recorded = read(observation, RecordedConventions())
-        return None if recorded is None else cls(observation, recorded, config)
-
     def in_views_that_improve(self, reading: Reading) -> Explanation:
-        """The mistake in those views which it improves: one camera of a rig may be written unlike the others."""
-        terms, none = self.terms(reading), self.none.evidence
+        """The mistake in those views that it improves: one camera of a rig may be written unlike the others."""
+        terms, written = self.terms(reading), self.as_recorded.evidence
         if reading.conventions.departures[0] not in _CAMERA_FIELDS:
             return self.explain(reading, terms)
+
+        def of_view(evidence: Mapping[str, float], view: str) -> float:
+            return sum(value for name, value in evidence.items() if name.endswith(f" {view}"))
+
         views = list(reading.cameras)
-        better = [view for view in views if _of_view(terms, view) > _of_view(none, view) + 1.0]
+        better = tuple(view for view in views if of_view(terms, view) > of_view(written, view) + 1.0)
         if not better or len(better) == len(views):
             return self.explain(reading, terms)
-        others = [view for view in views if view not in better]
-        merged = {name: none[name] if _view_of(name, others) else value for name, value in terms.items()}
-        partial = self.read(reading.conventions.model_copy(update={"views": tuple(better)}))
+        others = tuple(f" {view}" for view in views if view not in better)
+        merged = {name: written[name] if name.endswith(others) else value for name, value in terms.items()}
+        partial = self.read(reading.conventions.model_copy(update={"views": better}))
         return self.explain(reading if partial is None else partial, merged)
 
-    def residual(self, explanation: Explanation) -> bool:
+    def is_suspicious(self, explanation: Explanation) -> bool:
         """Whether a reading leaves anything suspicious."""
-        judged = limits(self.config)
+        limits = term_limits(self.config)
         return any(
-            value < self.config.suspicion and judged.get(name.split(" ")[0], 0.0) > -np.inf
+            value < SUSPICION and limits.get(name.split(" ")[0], 0.0) > -np.inf
             for name, value in explanation.evidence.items()
         )
 
     def pairs(self, ranked: list[Explanation]) -> list[Explanation]:
-        """Two mistakes at once: one of those that explain most alone, and what is found where it is undone.
-
-        A lag or an offset cannot be estimated before the other mistake is undone. States that are late against both
-        camera poses and images count as one mistake, with two lags.
-        """
+        """Two mistakes at once: one of the best single ones, with another or with the numbers estimated beside it."""
         first: dict[str, Explanation] = {}
         for explanation in ranked:
             if explanation.mistake != "none" and explanation.other is None:
@@ -272,22 +302,25 @@ class _Search:
         return list(found.values())
 
     def numbers_beside(self, undone: Reading) -> Iterator[RecordedConventions]:
-        """Lags and offset as they are estimated under a reading that undoes another mistake."""
-        lags = camera_lags(self.observation, undone, self.config)
+        """Lags and offset, which can only be estimated under a reading that undoes the other mistake.
+
+        States that are late against both camera poses and images count as one mistake, with two lags.
+        """
+        lags = camera_lags(self.observation, undone)
         yield from (RecordedConventions(camera_lag_frames=lag) for lag in lags)
         yield from (RecordedConventions(camera_lag_frames=lag, image_lag_frames=lag) for lag in lags)
         scores = {
-            lag: sum(image_terms(self.observation, undone.with_image_lag(lag), self.config, wrist_flow=False).values())
-            for lag in (0, *image_lags(self.observation, self.config))
+            lag: sum(image_terms(self.observation, undone.with_image_lag(lag), wrist_flow=False).values())
+            for lag in (0, *image_lags(self.observation))
         }
-        if late := max(scores, key=lambda lag: (scores[lag], -abs(lag))):
+        if late := _best_lag(scores):
             yield RecordedConventions(image_lag_frames=late)
         if offset := tool_offset(self.observation, undone):
             yield RecordedConventions(tool_offset_z_m=round(offset, 4))
 
 
 def _together(one: RecordedConventions, two: RecordedConventions) -> RecordedConventions | None:
-    """Both mistakes; None where they are of the same field, or no declaration can name the views of each."""
+    """Both mistakes; None if they are of the same field, or of cameras in different views."""
     if set(one.departures) & set(two.departures):
         return None
     of_cameras = [c.views for c in (one, two) if set(c.departures) & set(_CAMERA_FIELDS)]
@@ -303,7 +336,7 @@ def _layout(embodiment: Embodiment) -> tuple[tuple[str, int], ...]:
 
 @lru_cache(maxsize=4)
 def robots_like(layout: tuple[tuple[str, int], ...]) -> tuple[ArmKinematics, ...]:
-    """The robots with these arms (view of the wrist camera, number of joints) whose descriptions are here."""
+    """The available robots with these arms (view of the wrist camera, number of joints)."""
     found = []
     for name in embodiment_names():
         try:
@@ -315,9 +348,150 @@ def robots_like(layout: tuple[tuple[str, int], ...]) -> tuple[ArmKinematics, ...
     return tuple(found)
 
 
-def _of_view(terms: Mapping[str, float], view: str) -> float:
-    return sum(value for name, value in terms.items() if _view_of(name, [view]))
+def conventions_to_try(observation: Observation, recorded: Reading) -> list[RecordedConventions]:
+    """One mistake each, without image lags (see `image_lags`), most of them with a fixed value."""
+    fixed = [
+        RecordedConventions(extrinsics="base_to_camera"),
+        RecordedConventions(camera_axes="opengl"),
+        RecordedConventions(extrinsics_unit="mm"),
+        RecordedConventions(pose_unit="mm"),
+        RecordedConventions(quaternion="wxyz"),
+        RecordedConventions(euler="moving_xyz"),
+        RecordedConventions(angle_unit="deg"),
+        RecordedConventions(arms="exchanged"),
+        RecordedConventions(gripper="inverted"),
+    ]
+    episode, kinematics = observation.episode, observation.kinematics
+    found = [c for c in fixed if applicable(episode, c.departures[0])]
+    if kinematics is not None and episode.state_kind == "joints":
+        unequal = len({len(arm.joints) for arm in kinematics.embodiment.arms}) > 1
+        found = [c for c in found if not (unequal and c.arms == "exchanged")]
+    found += [RecordedConventions(intrinsics_size=size) for size in intrinsics_sizes(episode.cameras)]
+    found += [RecordedConventions(camera_lag_frames=lag) for lag in camera_lags(observation, recorded)]
+    offset = tool_offset(observation, recorded)
+    if offset is not None:
+        found.append(RecordedConventions(tool_offset_z_m=round(offset, 4)))
+    return found
 
 
-def _view_of(name: str, views: list[str]) -> bool:
-    return any(name.endswith(f" {view}") for view in views)
+def image_lags(observation: Observation) -> list[int]:
+    """Lags to try, by size; at most a third of the pictures is given up."""
+    largest = min(MAX_LAG_FRAMES, observation.num_images // 3)
+    return [lag for size in range(1, largest + 1) for lag in (size, -size)]
+
+
+def camera_lags(observation: Observation, recorded: Reading) -> list[int]:
+    """The lags at which moving wrist cameras are most rigid against states and commands, and their neighbours."""
+    lags: list[int] = []
+    for tools in (recorded.tools, recorded.action_tools):
+        scores = {} if tools is None else _camera_lag_scores(observation, recorded, tools)
+        if scores:
+            best = _best_lag(scores)
+            lags += [lag for lag in (best, best - 1, best + 1) if lag in scores]
+    return [lag for lag in dict.fromkeys(lags) if lag != 0]
+
+
+def _best_lag(scores: Mapping[int, float]) -> int:
+    return max(scores, key=lambda lag: (scores[lag], -abs(lag)))
+
+
+def _camera_lag_scores(observation: Observation, recorded: Reading, tools: np.ndarray) -> dict[int, float]:
+    """Log-likelihood of the hand-eye residuals at each shift of the camera poses after the tools' (n, a, 4, 4)."""
+    largest = min(MAX_LAG_FRAMES, len(tools) // 3)
+    scores: dict[int, float] = {}
+    for view, i in observation.wrists.items():
+        camera = recorded.cameras.get(view)
+        if camera is None or not camera.moving:
+            continue
+        for lag in range(-largest, largest + 1):
+            _, metres, degrees = rms_hand_eye(*lagged(tools[:, i], camera.T_base_camera, lag))
+            scores[lag] = scores.get(lag, 0.0) + hand_eye_log_likelihood(metres, degrees)
+    return scores
+
+
+def lagged(first: np.ndarray, second: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """The entries of two series that belong together where the second trails the first by `lag` frames."""
+    return first[max(0, -lag) : len(first) - max(0, lag)], second[max(0, lag) : len(second) - max(0, -lag)]
+
+
+def intrinsics_sizes(cameras: Mapping[str, CameraTrack]) -> list[tuple[int, int]]:
+    """Image sizes (height, width) that would centre a camera's principal point, where it is elsewhere."""
+    sizes: list[tuple[int, int]] = []
+    for camera in cameras.values():
+        K = camera.K
+        height, width = 2 * K[1, 2] + 1, 2 * K[0, 2] + 1
+        same = abs(np.log(max(height, 1.0) / camera.height)) + abs(np.log(max(width, 1.0) / camera.width))
+        if not np.isfinite(K).all() or min(height, width) < 8 or same < SAME_INTRINSICS_SIZE:
+            continue
+        common = [s for s in _COMMON_SIZES if max(abs(s[0] / height - 1), abs(s[1] / width - 1)) < INTRINSICS_SNAP]
+        size = min(common, key=lambda s: abs(s[0] / height - 1) + abs(s[1] / width - 1), default=None)
+        size = size or (round(height), round(width))
+        if size not in sizes:
+            sizes.append(size)
+    return sizes
+
+
+def tool_offset(observation: Observation, recorded: Reading) -> float | None:
+    """Distance of the fingertips beyond the recorded tool poses along +z [m], None if unknown or within usual scatter.
+
+    From the joints' kinematics where the recording has both, else from wrist cameras with a stated mount. Without recorded
+    poses the tool is the embodiment's, and moves with its stated mount.
+    """
+    offsets: list[float] = []
+    if observation.episode.T_base_ee is None:
+        return None
+    if recorded.kinematic_tools is not None:
+        apart = rigid_inverse(recorded.tools) @ recorded.kinematic_tools
+        offsets = [float(np.median(apart[:, i, 2, 3])) for i in range(apart.shape[1])]
+    else:
+        for i, arm in enumerate(observation.arms):
+            camera = recorded.cameras.get(arm.wrist_view)
+            if arm.T_tool_mount is None or camera is None:
+                continue
+            mount, _, _ = rms_hand_eye(recorded.tools[:, i], camera.poses(np.arange(len(recorded.tools))))
+            offsets.append(float(mount[2, 3] - arm.T_tool_mount[2, 3]))
+    if not offsets:
+        return None
+    offset = float(np.median(offsets))
+    return offset if MIN_TOOL_OFFSET_M <= abs(offset) <= MAX_TOOL_OFFSET_M else None
+
+
+def measures_of(observation: Observation, recorded: Reading, view: str) -> dict[str, float]:
+    """The measures of a view, as in `Diagnosis`."""
+    camera, arm = recorded.cameras[view], observation.wrists.get(view)
+    measures = {"in_view": in_view_share(recorded, camera)}
+    seen = view in observable_views(observation)
+    if arm is not None:
+        poses = camera.poses(np.arange(len(recorded.tools)))
+        _, measures["hand_eye_m"], measures["hand_eye_deg"] = rms_hand_eye(recorded.tools[:, arm], poses)
+        if seen:
+            measures["flow"] = wrist_flow_agreement(observation, recorded, view)
+    elif seen:
+        measures["flow"] = still_view_agreement(observation, recorded, view)[0]
+    return measures
+
+
+def notes_on(observation: Observation, recorded: Reading) -> tuple[str, ...]:
+    """Limits of the evidence, and other facts for a person."""
+    notes = []
+    for view, i in observation.wrists.items():
+        camera, commands = recorded.cameras.get(view), recorded.action_tools
+        if camera is None or commands is None:
+            continue
+        poses = camera.poses(np.arange(len(commands)))
+        states_m, commands_m = (rms_hand_eye(tools[:, i], poses)[1] for tools in (recorded.tools, commands))
+        if states_m > NOTICEABLE_M and states_m > COMMANDS_FIT_RATIO * commands_m:
+            notes.append(
+                f"{view}: the camera poses follow the commands ({1e3 * commands_m:.1f} mm), "
+                f"not the states ({1e3 * states_m:.1f} mm)"
+            )
+    for view in recorded.cameras:
+        count = len(observation.gray.get(view, ()))
+        if count <= MIN_IMAGE_PAIRS:
+            notes.append(f"{view}: {count} pictures, too few to compare motion with; judged by poses alone")
+    if recorded.gripper is None:
+        notes.append("gripper: the state names no gripper columns, polarity is not judged")
+    for i, arm in enumerate(observation.arms if recorded.gripper is not None else ()):
+        if finger_flow(observation, recorded, i) is None and stopped_share(recorded, i) is None:
+            notes.append(f"gripper {arm.name}: does not move enough to be seen, polarity is not judged")
+    return tuple(notes)

@@ -1,7 +1,7 @@
 """`worldline calibrate check`: every episode of a source or a set diagnosed, pictured, and summed up.
 
-Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here: the
-result is a line for the source's configuration (`repairing_lines`).
+Writes `diagnoses.json`, `index.html` and `pictures/<episode>.jpg` into one folder. Nothing is repaired here: the result
+is a line for the source's configuration (`repairing_lines`).
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check_report import as_json, page
-from worldline_core.calibration.diagnosis import CalibrationCheck, Explanation, Finding, SetDiagnosis
+from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, as_json, page
+from worldline_core.calibration.diagnosis import Explanation, SourceDiagnosis, diagnose_source
 from worldline_core.calibration.pictures import diagnosis_picture
-from worldline_core.calibration.source_diagnosis import diagnose_set
 from worldline_core.config import apply_overrides, read_yaml, validate
 from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.episode_checks import check_camera, check_times, check_values
@@ -40,9 +39,9 @@ from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 logger = logging.getLogger(__name__)
 
-ADDING = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
+ADDITIVE = ("tool_offset_z_m", "camera_lag_frames", "image_lag_frames")
 """Conventions that add up when they are declared and found again."""
-UNDOING = ("extrinsics", "camera_axes", "arms", "gripper")
+SELF_INVERSE = ("extrinsics", "camera_axes", "arms", "gripper")
 """Conventions that undo themselves when applied twice."""
 OUTPUT_ROOT = Path("artifacts") / "calibration"
 TIME_TOLERANCE_FRAMES = 0.25
@@ -50,9 +49,10 @@ TIME_TOLERANCE_FRAMES = 0.25
 
 @dataclass(frozen=True)
 class ListedEpisode:
-    """An episode to check: where it comes from, and what its source's configuration declares already.
+    """An episode to check, and the configuration of its source.
 
     Attributes:
+        declared: conventions that the configuration declares already.
         declares_robot: whether the configuration names the robot, not the recording.
     """
 
@@ -65,18 +65,16 @@ class ListedEpisode:
 
 
 def combined_conventions(declared: RecordedConventions, found: RecordedConventions) -> RecordedConventions:
-    """What a source must declare when `found` was seen on episodes that were read with `declared`.
-
-    Lengths and lags add up; what undoes itself when done twice, found again, turns back to the contract.
+    """The declaration for a source in which `found` was seen after reading it with `declared`.
 
     Raises:
-        ConfigError: no single declaration says both, for example because they speak of different views.
+        ConfigError: no single declaration is equivalent, for example because the two are of different views.
     """
     if not declared.departures:
         return found
     if found.departures and declared.views != found.views:
         raise ConfigError(
-            "What is declared and what was found speak of different views",
+            "Declared and found conventions are of different views",
             expected=f"views {declared.views}",
             got=f"views {found.views}",
             next_step="remove the declared conventions and check again",
@@ -86,13 +84,13 @@ def combined_conventions(declared: RecordedConventions, found: RecordedConventio
         was, now, contract = (getattr(item, name) for item in (declared, found, default))
         if was == contract:
             values[name] = now
-        elif name in ADDING:
+        elif name in ADDITIVE:
             values[name] = was + now
-        elif name in UNDOING and was == now:
+        elif name in SELF_INVERSE and was == now:
             values[name] = contract
         else:
             raise ConfigError(
-                "What was found cannot be declared on top of what is declared",
+                "A found convention cannot be declared on top of a declared one",
                 where=f"conventions.{name}",
                 expected=str(contract),
                 got=f"{was} is declared, and {now} was found",
@@ -102,8 +100,8 @@ def combined_conventions(declared: RecordedConventions, found: RecordedConventio
 
 
 def repairing_lines(item: ListedEpisode, explanation: Explanation) -> tuple[str, ...]:
-    """What the source's configuration must say if the explanation holds; nothing for the recording as written, or
-    where no line of the configuration repairs it.
+    """Lines for the source's configuration if the explanation holds; none for the recording as written, or where no line
+    repairs it.
 
     Raises:
         ConfigError: as `combined_conventions`.
@@ -189,7 +187,7 @@ def check_calibration(
     descriptions: Mapping[str, str] | None = None,
     pictures: bool = True,
 ) -> CalibrationCheck:
-    """Diagnose episodes one after another and write what was found.
+    """Diagnoses episodes one after another and writes the result.
 
     An episode that cannot be read or judged is listed with its reason; the others are not touched by it.
 
@@ -200,25 +198,25 @@ def check_calibration(
     if not listed:
         raise DataError("There are no episodes to check", got="an EpisodeSet without rows")
     kinematics = KinematicsByName(descriptions or {})
-    findings: list[Finding] = []
+    checked: list[EpisodeCheck] = []
     with Progress("calibrate check", len(listed), "episode") as progress:
         for item in listed:
             try:
-                findings.append(_check_one(item, output, kinematics, pictures))
+                checked.append(_check_one(item, output, kinematics, pictures))
             except Exception as error:
                 if ends_the_run(error):
                     raise
                 evidence = crash_evidence(error)
                 detail = f"{evidence['type']}: {evidence['message']} ({evidence['trace'][-1]}); report this bug"
-                findings.append(Finding(item.episode_id, item.source, None, "crashed", detail))
-            progress.advance(verdict=findings[-1].verdict)
-    check = CalibrationCheck(tuple(findings), tuple(_sum_up(listed, findings)), output)
+                checked.append(EpisodeCheck(item.episode_id, item.source, None, "crashed", detail))
+            progress.advance(verdict=checked[-1].verdict)
+    check = CalibrationCheck(tuple(checked), tuple(_sum_up(listed, checked)), output)
     write_json_atomic(output / "diagnoses.json", as_json(check))
     write_bytes_atomic(output / "index.html", page(check).encode())
     return check
 
 
-def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, pictures: bool) -> Finding:
+def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, pictures: bool) -> EpisodeCheck:
     try:
         loaded = item.load()
         episode = loaded.episode
@@ -231,9 +229,9 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, 
         notes = (note,) if note else ()
         diagnosis = diagnose(episode, frames, arms)
     except RejectedInputError as error:
-        return Finding(item.episode_id, item.source, None, error.reason, _one_line(error))
+        return EpisodeCheck(item.episode_id, item.source, None, error.reason, _one_line(error))
     except DataError as error:
-        return Finding(item.episode_id, item.source, None, "unreadable", _one_line(error))
+        return EpisodeCheck(item.episode_id, item.source, None, "unreadable", _one_line(error))
     lines: tuple[str, ...] = ()
     try:
         lines = repairing_lines(item, diagnosis.best)
@@ -246,7 +244,7 @@ def _check_one(item: ListedEpisode, output: Path, kinematics: KinematicsByName, 
             write_bytes_atomic(output / picture, jpeg_bytes(drawn))
         except DataError as error:
             picture, notes = None, (*notes, f"no picture: {error.what}")
-    return Finding(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
+    return EpisodeCheck(item.episode_id, item.source, diagnosis, config_lines=lines, picture=picture, notes=notes)
 
 
 def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmKinematics | None, str]:
@@ -262,7 +260,7 @@ def _kinematics_of(episode: Episode, kinematics: KinematicsByName) -> tuple[ArmK
 
 
 def _images(loaded: LoadedEpisode, view: str) -> MadeFrames:
-    """A view's pictures, read each time somebody goes through them: an episode may be too long to be held."""
+    """A view's pictures, read anew by each iteration: an episode may be too long for memory."""
     expected = loaded.episode.num_video_frames
 
     def counted() -> Iterator[np.ndarray]:
@@ -281,14 +279,14 @@ def _one_line(error: DataError) -> str:
     return "; ".join([error.what, *(f"{name} {value}" for name, value in details if value is not None)])
 
 
-def _sum_up(listed: Sequence[ListedEpisode], findings: Sequence[Finding]) -> Iterator[SetDiagnosis]:
+def _sum_up(listed: Sequence[ListedEpisode], checked: Sequence[EpisodeCheck]) -> Iterator[SourceDiagnosis]:
     """A conclusion for each source that more than one episode could be diagnosed of."""
     for source in dict.fromkeys(item.source for item in listed):
         of_source = next(item for item in listed if item.source == source)
-        diagnoses = [f.diagnosis for f in findings if f.source == source and f.diagnosis is not None]
+        diagnoses = [f.diagnosis for f in checked if f.source == source and f.diagnosis is not None]
         if len(diagnoses) < 2:
             continue
-        summed = diagnose_set(source, diagnoses)
+        summed = diagnose_source(source, diagnoses)
         try:
             yield replace(summed, config_lines=repairing_lines(of_source, summed.best))
         except ConfigError as error:

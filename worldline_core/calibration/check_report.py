@@ -1,18 +1,18 @@
-"""What a calibration check found: a table for the terminal, JSON, and a page with a picture of every episode."""
+"""Results of a calibration check: a table for the terminal, JSON, and a page with a picture of every episode."""
 
 from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from pydantic_core import to_jsonable_python
 
-from worldline_core.calibration.diagnosis import CalibrationCheck, Diagnosis, Finding, SetDiagnosis
-from worldline_core.calibration.residual import bounds_lines, consistent_text, off_text
+from worldline_core.calibration.diagnosis import Conclusion, Diagnosis, SourceDiagnosis
 from worldline_core.pages.page import Table, render, words
 
 MEANINGS = {
@@ -29,85 +29,102 @@ TONES = {
     "too_little_evidence": "",
     "consistent": "good",
 }
-MEASURES = ("hand-eye", "camera lag", "image lag", "in view", "flow")
+COLUMNS = ("Episode", "Verdict", "Best explanation", "Score", "As recorded")
 DETAIL_LETTERS = 160
-"""Of what is wrong with an episode, in its line of the table; the page and diagnoses.json have all of it."""
+"""Length of an error in its line of the table; the page and diagnoses.json have all of it."""
 _READINGS_SHOWN, _GROUPS_SHOWN = 6, 12
 
 
-def measures_shown(diagnosis: Diagnosis) -> dict[str, str]:
-    """The worst of each key measure over the views, as text; a dash where nothing was measured."""
+@dataclass(frozen=True)
+class EpisodeCheck:
+    """Result for one episode: a diagnosis, or why there is none.
 
-    def worst(values: Iterable[float | None], pick: Callable[[list[float]], float], shown: str) -> str:
-        known = [value for value in values if value is not None]
-        return shown.format(pick(known)) if known else "-"
+    Attributes:
+        reason: quarantine reason code of an episode that cannot be read, with `detail`; None for one that can.
+        config_lines: what the source's configuration must say, in place of what it says now.
+        picture: path relative to the output folder.
+        notes: of the check itself, beside the diagnosis' own.
+    """
 
-    def largest(values: list[float]) -> float:
-        return max(values, key=abs)
+    episode_id: str
+    source: str
+    diagnosis: Diagnosis | None
+    reason: str | None = None
+    detail: str = ""
+    config_lines: tuple[str, ...] = ()
+    picture: str | None = None
+    notes: tuple[str, ...] = ()
 
-    views = diagnosis.measures
-    metres = worst((None if m.hand_eye_m is None else 1e3 * m.hand_eye_m for m in views), max, "{:.1f} mm")
-    degrees = worst((m.hand_eye_deg for m in views), max, " {:.1f} deg")
-    return {
-        "hand-eye": metres + degrees if metres != "-" else metres,
-        "camera lag": worst((m.camera_lag_frames for m in views), largest, "{:+.1f}"),
-        "image lag": worst((m.image_lag_frames for m in views), largest, "{:+.1f}"),
-        "in view": worst((m.in_view_share for m in views), min, "{:.0%}"),
-        "flow": worst((m.flow_agreement for m in views), min, "{:.2f}"),
-    }
+    @property
+    def verdict(self) -> str:
+        return "unreadable" if self.diagnosis is None else self.diagnosis.verdict
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Cells of COLUMNS."""
+        found = self.diagnosis
+        if found is None:
+            return (self.episode_id, self.verdict, str(self.reason), "", "")
+        scores = f"{found.best.score:.1f}", f"{found.as_recorded.score:.1f}"
+        return (self.episode_id, verdict_text(found), found.best.mistake, *scores)
 
 
-def verdict_text(diagnosis: Diagnosis) -> str:
-    """The verdict, with the camera that is off, or how far a camera could be turned unseen."""
-    if diagnosis.verdict == "off":
-        return f"off: {off_text(diagnosis.off[0])}"
-    if diagnosis.verdict != "consistent":
-        return words(diagnosis.verdict)
-    return consistent_text(diagnosis.residuals)
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """All results, and the folder that they were written to."""
+
+    episodes: tuple[EpisodeCheck, ...]
+    sources: tuple[SourceDiagnosis, ...]
+    output: Path
+
+    @property
+    def consistent(self) -> bool:
+        """Whether some episode is consistent, and nothing is wrong with any other."""
+        verdicts = {episode.verdict for episode in self.episodes}
+        sound = not verdicts & {"off", "explained", "unexplained", "unreadable"}
+        return sound and "consistent" in verdicts and all(s.verdict not in ("off", "explained") for s in self.sources)
+
+    @property
+    def counted(self) -> dict[str, int]:
+        """Episodes by verdict, the worst first."""
+        counts = Counter(episode.verdict for episode in self.episodes)
+        return {name: counts[name] for name in MEANINGS if counts[name]}
+
+
+def verdict_text(found: Conclusion) -> str:
+    """The verdict, with the camera that is off, or the largest turn of a camera that could have gone unseen."""
+    if found.verdict == "off":
+        return f"off: {found.off[0]}"
+    return found.consistent_within if found.verdict == "consistent" else words(found.verdict)
 
 
 def table_text(check: CalibrationCheck) -> str:
     """The table of episodes, the conclusion over each source, and the lines that repair it."""
-    header = ["episode", "verdict", "best explanation", "score", "as recorded", *MEASURES]
-    rows = [header, *(_table_row(finding) for finding in check.findings)]
+    rows = [tuple(name.lower() for name in COLUMNS), *(episode.row for episode in check.episodes)]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = []
-    for finding, row in zip((None, *check.findings), rows, strict=True):
+    for episode, row in zip((None, *check.episodes), rows, strict=True):
         cells = [cell.ljust(w) if i < 3 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
-        if finding is not None and finding.diagnosis is None:
-            # The reason of an episode that cannot be read takes the place of all that was not measured.
-            cells[2:] = [textwrap.shorten(f"{finding.reason}: {finding.detail}", DETAIL_LETTERS, placeholder=" ...")]
+        if episode is not None and episode.diagnosis is None:
+            # The reason of an unreadable episode takes the place of its scores.
+            cells[2:] = [textwrap.shorten(f"{episode.reason}: {episode.detail}", DETAIL_LETTERS, placeholder=" ...")]
         lines.append("  ".join(cells).rstrip())
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join([*lines, "", *conclusion_lines(check)])
 
 
-def _table_row(finding: Finding) -> list[str]:
-    diagnosis = finding.diagnosis
-    if diagnosis is None:
-        return [finding.episode_id, finding.verdict, *[""] * (3 + len(MEASURES))]
-    scores = [f"{diagnosis.best.score:.1f}", f"{diagnosis.none.score:.1f}"]
-    shown = measures_shown(diagnosis)
-    return [
-        finding.episode_id,
-        verdict_text(diagnosis),
-        diagnosis.best.mistake,
-        *scores,
-        *(shown[name] for name in MEASURES),
-    ]
-
-
 def conclusion_lines(check: CalibrationCheck) -> list[str]:
     """What all episodes say together."""
-    counted = Counter(finding.verdict for finding in check.findings)
-    parts = [f"{counted[name]} {words(name)}" for name in MEANINGS if counted[name]]
-    lines = [f"{len(check.findings)} episodes: {', '.join(parts)}"]
-    for found in check.sets:
-        lines += ["", set_headline(found), f"  single episodes say: {votes_text(found)}"]
+    parts = [f"{count} {words(name)}" for name, count in check.counted.items()]
+    lines = [f"{len(check.episodes)} episodes: {', '.join(parts)}"]
+    for found in check.sources:
+        lines += ["", source_headline(found), f"  single episodes say: {votes_text(found)}"]
         lines += [f"  {caution}" for caution in cautions(found)]
-        lines += [f"  {off_text(residual)}" for residual in found.off]
-        lines += [f"  {line}" for line in bounds_lines(found.residuals)]
-        own = [note for finding in check.findings if finding.source == found.source for note in finding.notes]
+        lines += [f"  {error}" for error in found.off]
+        for view in dict.fromkeys(error.view for error in found.camera_errors):
+            bounds = [f"{e.kind} {e.bound:.1f} {e.unit}" for e in found.camera_errors if e.view == view]
+            lines.append(f"  {view} within: {', '.join(bounds)}")
+        own = [note for episode in check.episodes if episode.source == found.source for note in episode.notes]
         lines += [f"  note: {note}" for note in dict.fromkeys((*found.notes, *own))]
         lines += [f"  near: {near}" for near in found.nearest]
         if found.config_lines:
@@ -118,18 +135,18 @@ def conclusion_lines(check: CalibrationCheck) -> list[str]:
 
 
 def _single_episodes(check: CalibrationCheck) -> list[str]:
-    """Episodes that no conclusion over their source speaks for: what repairs them, or what comes nearest."""
-    together = {found.source: found for found in check.sets}
+    """Episodes that the conclusion over their source does not cover: what repairs them, or what comes nearest."""
+    together = {found.source: found for found in check.sources}
     groups: dict[tuple[str, ...], list[str]] = {}
-    for finding in check.findings:
-        found, diagnosis = together.get(finding.source), finding.diagnosis
+    for episode in check.episodes:
+        found, diagnosis = together.get(episode.source), episode.diagnosis
         if diagnosis is None or diagnosis.verdict not in ("explained", "unexplained"):
             continue
-        if found is not None and found.verdict == diagnosis.verdict and found.config_lines == finding.config_lines:
+        if found is not None and (found.verdict, found.config_lines) == (diagnosis.verdict, episode.config_lines):
             continue
-        notes = (*diagnosis.notes, *finding.notes) if found is None else ()  # else printed with the source
+        notes = (*diagnosis.notes, *episode.notes) if found is None else ()  # else printed with the source
         said = [f"note: {note}" for note in notes] + [f"near: {near}" for near in diagnosis.nearest]
-        groups.setdefault((*said, *finding.config_lines), []).append(finding.episode_id)
+        groups.setdefault((*said, *episode.config_lines), []).append(episode.episode_id)
     lines = ["", "single episodes (give those that differ a source of their own, by `include`):"] if groups else []
     for group, names in list(groups.items())[:_GROUPS_SHOWN]:
         lines.append(f"  {', '.join(names[:4])}{f' and {len(names) - 4} more' if len(names) > 4 else ''}:")
@@ -139,28 +156,26 @@ def _single_episodes(check: CalibrationCheck) -> list[str]:
     return lines
 
 
-def set_headline(found: SetDiagnosis) -> str:
+def source_headline(found: SourceDiagnosis) -> str:
     """The conclusion over a source in one line."""
-    as_recorded = next(e.score for e in found.ranked if e.mistake == "none")
-    start = f"source {found.source}, {found.num_episodes} episodes together: {words(found.verdict)}"
-    if found.verdict == "explained":
-        named = found.best.mistake if found.best.other is None else found.best.text
-        return f"{start} by {named} (score {found.best.score:.1f}, as recorded {as_recorded:.1f})"
+    score = f"score as recorded {found.as_recorded.score:.1f}"
+    said = verdict_text(found) if found.verdict == "consistent" else words(found.verdict)
     if found.verdict == "mixed":
-        return f"{start}: its episodes were not written the same way, no line is right for all of them"
-    if found.verdict == "consistent":
-        start = start.replace("consistent", consistent_text(found.residuals))
-    return f"{start} (score as recorded {as_recorded:.1f})"
+        said += ": its episodes were not written the same way, no line is right for all of them"
+    elif found.verdict == "explained":
+        said += f" by {found.best.mistake if found.best.other is None else found.best.text}"
+        score = f"score {found.best.score:.1f}, as recorded {found.as_recorded.score:.1f}"
+    return f"source {found.source}, {found.num_episodes} episodes together: {said} ({score})"
 
 
-def votes_text(found: SetDiagnosis) -> str:
+def votes_text(found: SourceDiagnosis) -> str:
     """What the episodes say one by one, the most frequent first."""
     ordered = sorted(found.votes.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{words(name)} {count}" for name, count in ordered) or "nothing"
 
 
-def cautions(found: SetDiagnosis) -> list[str]:
-    """What to mind before a whole source is changed for what only some of its episodes say by themselves."""
+def cautions(found: SourceDiagnosis) -> list[str]:
+    """A warning where a whole source would be changed for a minority of its episodes."""
     mistakes = set(found.best.departures)
     agreeing = sum(count for name, count in found.votes.items() if mistakes <= set(name.split("+")))
     if found.verdict != "explained" or 2 * agreeing >= found.num_episodes:
@@ -172,142 +187,97 @@ def cautions(found: SetDiagnosis) -> list[str]:
 
 
 def as_json(check: CalibrationCheck) -> dict[str, Any]:
-    """Everything, in plain values."""
-    return plain(
-        {
-            "consistent": check.consistent,
-            "episodes": [_finding_json(finding) for finding in check.findings],
-            "sources": [
-                {
-                    "source": found.source,
-                    "episodes": found.num_episodes,
-                    "verdict": found.verdict,
-                    "mistake": found.best.mistake,
-                    "score": found.best.score,
-                    "ranked": [{"mistake": e.mistake, "score": e.score, "reading": e.text} for e in found.ranked],
-                    "votes": found.votes,
-                    "notes": found.notes,
-                    "nearest": found.nearest,
-                    "config_lines": found.config_lines,
-                    "residuals": _residuals_json(found),
-                }
-                for found in check.sets
-            ],
-        }
-    )
-
-
-def _finding_json(finding: Finding) -> dict[str, Any]:
-    content: dict[str, Any] = {
-        "episode_id": finding.episode_id,
-        "source": finding.source,
-        "verdict": finding.verdict,
-        "config_lines": finding.config_lines,
-        "picture": finding.picture,
-        "notes": finding.notes,
-    }
-    diagnosis = finding.diagnosis
-    if diagnosis is None:
-        return content | {"reason": finding.reason, "detail": finding.detail}
-    return content | {
-        "mistake": diagnosis.best.mistake,
-        "score": diagnosis.best.score,
-        "score_as_recorded": diagnosis.none.score,
-        "ranked": [
-            {
-                "mistake": e.mistake,
-                "score": e.score,
-                "evidence": e.evidence,
-                "conventions": {name: getattr(e.conventions, name) for name in e.conventions.departures},
-                "reading": e.text,
-            }
-            for e in diagnosis.ranked
-        ],
-        "measures": [asdict(measures) for measures in diagnosis.measures],
-        "notes": (*diagnosis.notes, *finding.notes),
-        "nearest": diagnosis.nearest,
-        "residuals": _residuals_json(diagnosis),
-    }
-
-
-def _residuals_json(found: Diagnosis | SetDiagnosis) -> list[dict[str, Any]]:
-    return [
-        {
-            "view": r.view,
-            "kind": r.kind,
-            "unit": r.unit,
-            "estimate": list(r.estimate),
-            "size": r.size,
-            "error_95": r.error,
-            "within_95": r.within,
-            "off": r in found.off,
-        }
-        for r in found.residuals
+    """Everything in plain values; numbers that are not finite become null."""
+    episodes = []
+    for each in check.episodes:
+        names = ("episode_id", "source", "verdict", "config_lines", "picture", "notes")
+        content: dict[str, Any] = {name: getattr(each, name) for name in names}
+        if each.diagnosis is None:
+            content |= {"reason": each.reason, "detail": each.detail}
+        else:
+            content |= _conclusion_json(each.diagnosis) | {"measures": each.diagnosis.measures}
+            content["notes"] = (*each.diagnosis.notes, *each.notes)
+        episodes.append(content)
+    names = ("source", "votes", "config_lines")
+    sources = [
+        {name: getattr(found, name) for name in names} | {"episodes": found.num_episodes} | _conclusion_json(found)
+        for found in check.sources
     ]
+    content = {"consistent": check.consistent, "episodes": episodes, "sources": sources}
+    return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: np.asarray(value).tolist())
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON knows it: NumPy numbers become plain ones, what is not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+def _conclusion_json(found: Conclusion) -> dict[str, Any]:
+    return {
+        "verdict": found.verdict,
+        "mistake": found.best.mistake,
+        "score": found.best.score,
+        "score_as_recorded": found.as_recorded.score,
+        "ranked": [
+            {"mistake": e.mistake, "reading": e.text, "score": e.score, "evidence": e.evidence} for e in found.ranked
+        ],
+        "notes": found.notes,
+        "nearest": found.nearest,
+        "camera_errors": [
+            {
+                "view": e.view,
+                "kind": e.kind,
+                "unit": e.unit,
+                "estimate": e.estimate,
+                "size": e.size,
+                "half_interval_95": e.half_interval,
+                "bound_95": e.bound,
+                "off": e in found.off,
+            }
+            for e in found.camera_errors
+        ],
+    }
 
 
 def page(check: CalibrationCheck) -> str:
     """The page: conclusions first, then a table, then a picture of each episode, the worst first."""
     order = list(MEANINGS)
-    counted = Counter(finding.verdict for finding in check.findings)
-    findings = sorted(check.findings, key=lambda finding: (order.index(finding.verdict), finding.episode_id))
+    episodes = sorted(check.episodes, key=lambda episode: (order.index(episode.verdict), episode.episode_id))
     return render(
         "calibration/check_page.html",
         title="Calibration check",
-        subtitle=f"{len(check.findings)} episodes, judged by what they show.",
+        subtitle=f"{len(episodes)} episodes, judged by what they show.",
         check=check,
-        findings=findings,
-        counted={name: counted[name] for name in order if counted[name]},
+        episodes=episodes,
         meanings=MEANINGS,
         tones=TONES,
-        headline=set_headline,
+        headline=source_headline,
         votes=votes_text,
         cautions=cautions,
         readings=_readings,
-        residuals=_residuals,
-        episodes=Table(
-            ("Episode", "Verdict", "Best explanation", "Score", "As recorded", *MEASURES),
-            [_page_row(finding) for finding in findings],
-            numeric=range(3, 5 + len(MEASURES)),
+        camera_errors=_camera_errors,
+        table=Table(
+            COLUMNS,
+            [_page_row(episode) for episode in episodes],
+            numeric=(3, 4),
             caption="Log-likelihood scores: 0 is as a healthy recording, lower is worse.",
         ),
     )
 
 
-def _page_row(finding: Finding) -> list[object]:
-    said = words(finding.verdict) if finding.diagnosis is None else verdict_text(finding.diagnosis)
-    tag = Markup('<span class="tag {}">{}</span>').format(TONES[finding.verdict], said)
-    if finding.diagnosis is None:
-        return [finding.episode_id, tag, finding.reason, *[None] * (2 + len(MEASURES))]
-    link = Markup('<a href="#{0}">{0}</a>').format(finding.episode_id)
-    return [link, tag, *_table_row(finding)[2:]]
+def _page_row(episode: EpisodeCheck) -> list[object]:
+    name, verdict, *rest = episode.row
+    tag = Markup('<span class="tag {}">{}</span>').format(TONES[episode.verdict], verdict)
+    return [name if episode.diagnosis is None else Markup('<a href="#{0}">{0}</a>').format(name), tag, *rest]
 
 
-def _residuals(found: Diagnosis | SetDiagnosis) -> Table:
+def _camera_errors(found: Conclusion) -> Table:
     """Each camera's estimated errors, each as if it were the only one."""
     rows = []
-    for r in found.residuals:
-        mark = "off" if r in found.off else ""
-        values = ", ".join(f"{value:+.1f}" for value in r.estimate)
-        rows.append([r.view, r.kind, f"{values} {r.unit}", f"{r.size:.1f} +- {r.error:.1f}", f"{r.within:.1f}", mark])
+    for e in found.camera_errors:
+        values = ", ".join(f"{value:+.1f}" for value in e.estimate)
+        size = f"{e.size:.1f} +- {e.half_interval:.1f}"
+        rows.append([e.view, e.kind, f"{values} {e.unit}", size, f"{e.bound:.1f}", "off" if e in found.off else ""])
     return Table(("View", "Error", "Estimate", "Size", "Unseen up to", ""), rows, numeric=range(3, 5))
 
 
 def _readings(diagnosis: Diagnosis) -> Table:
-    """The best readings that were tried, with the terms that cost each the most."""
+    """The best readings, with the terms that cost each the most."""
     rows = []
     for explanation in diagnosis.ranked[:_READINGS_SHOWN]:
         worst = sorted(explanation.evidence.items(), key=lambda item: item[1])[:4]

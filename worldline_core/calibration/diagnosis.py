@@ -1,122 +1,89 @@
-"""What the calibration doctor is told and what it says: thresholds, diagnoses of episodes and sources, a check's result.
+"""Diagnoses: what the scores of an episode's readings decide, and the sum over the episodes of a source.
 
-Terms of a score are log-likelihoods: 0 is as a healthy recording typically is, lower is worse.
+The episodes of a source were written the same way, so their scores are added up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from worldline_core.calibration.camera_errors import CameraError, ErrorLimits, combine, significant
+from worldline_core.calibration.evidence import (
+    ARM_FLOW,
+    correlation_log_likelihood,
+    hand_eye_log_likelihood,
+    turn_log_likelihood,
+)
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.conventions import RecordedConventions
 
-VerdictName = Literal["consistent", "off", "explained", "unexplained", "too_little_evidence"]
-SetVerdictName = Literal["consistent", "off", "explained", "unexplained", "mixed", "too_little_evidence"]
+VerdictName = Literal["consistent", "off", "explained", "unexplained", "mixed", "too_little_evidence"]
 
-
-class Typical(StrictModel):
-    """A correlation that healthy recordings reach, and how many independent samples it stands for."""
-
-    value: float = Field(gt=0, lt=1)
-    samples: float = Field(gt=0)
-
-
-class Spread(StrictModel):
-    """A correlation that healthy recordings reach, and how much it scatters."""
-
-    value: float = Field(gt=0, lt=1)
-    spread: float = Field(gt=0)
-
-
-class ResidualLimits(StrictModel):
-    """From when on an estimated error of a camera is a finding: as large as this, and so many deviations from zero."""
-
-    deviations: float = Field(gt=0)
-    rotation: float = Field(gt=0, description="degrees")
-    translation: float = Field(gt=0, description="millimetres")
-    focal_length: float = Field(gt=0, description="percent")
-    principal_point: float = Field(gt=0, description="percent of the image side")
-    lag: float = Field(gt=0, description="frames")
+MIN_TERM = -9.0
+"""A term below this is bad: no healthy recording has one."""
+SUSPICION = -4.0
+"""A term below this starts the search."""
+MIN_FLOW, MAX_FLOW_TURN_DEG = 0.6, 25.0
+"""Agreement of arm flow below which, and its turn above which, a view is bad."""
+COMPLEXITY = 2.0
+"""Cost of a reading for each departure from the contract."""
+RIVAL_MARGIN = 1.0
+"""Another mistake with a score this near explains the recording as well."""
+MAX_GAIN = 20.0
+"""Most that one episode can contribute to a reading of its whole source."""
+CONTRADICTING_SHARE = 0.1
+"""Of the episodes that fit by themselves, those that a reading of the whole source may break."""
+FEWEST_TOGETHER = 5
+"""From this many episodes on, their scatter measures their common uncertainty."""
+ESTIMATED = {"intrinsics_size", "tool_offset_z_m", "embodiment"}
+"""Tried only where an episode suggests them: one that fits as written and does not is evidence against them."""
+NEAREST_SHOWN, TERMS_SHOWN = 3, 3
 
 
 class CalibrationDoctorConfig(StrictModel):
-    """Lengths in metres, angles in degrees, scores in units of log-likelihood.
-
-    The typical values are medians over the healthy training episodes of the shipped recordings
-    (`benchmarks/calibration.py mistakes --typical` prints them); they hold for other recordings as far as these
-    resemble them, so the decisions rest on differences between readings.
-    """
+    """Limits of the calibration doctor's decisions."""
 
     search: Literal["always", "when_suspicious"] = Field(
         default="always", description="when_suspicious: try other readings only if the recorded one looks bad"
     )
-    min_margin: float = Field(default=2.5, gt=0, description="by which a mistake must beat the recording as written")
-    max_gain: float = Field(
-        default=20.0, gt=0, description="that one episode can lend to a reading of its whole source"
+    min_margin: float = Field(
+        default=2.5, gt=0, description="log-likelihood by which a mistake must beat the recording as written"
     )
-    min_term: float = Field(
-        default=-9.0, lt=0, description="a pose term below this is bad: no healthy recording has one"
-    )
-    min_flow: float = Field(default=0.6, gt=0, lt=1, description="agreement of arm flow below which it is bad")
-    flow_turn_deg: float = Field(
-        default=8.0, gt=0, description="spread of the angle between measured and predicted flow"
-    )
-    max_flow_turn_deg: float = Field(default=25.0, gt=0, description="a larger angle is bad")
-    suspicion: float = Field(default=-4.0, lt=0, description="a term below this starts the search")
-    complexity: float = Field(default=2.0, ge=0, description="cost of a reading that departs from the contract")
-    max_lag_frames: int = Field(default=6, ge=1, le=60)
-    samples: float = Field(default=20.0, gt=0, description="independent frames that a hand-eye residual stands for")
-    hand_eye_m: float = Field(default=0.002, gt=0, description="hand-eye residual of a camera that is mounted")
-    hand_eye_deg: float = Field(default=0.7, gt=0)
-    max_hand_eye_m: float = Field(default=0.012, gt=0, description="a larger residual is bad, whatever the reading")
-    mount_m: float = Field(default=0.01, gt=0, description="spread of cameras around the stated mount")
-    mount_deg: float = Field(default=3.0, gt=0)
-    kinematics_m: float = Field(default=0.005, gt=0, description="spread of recorded poses around forward kinematics")
-    kinematics_deg: float = Field(default=2.0, gt=0)
-    principal_point: float = Field(default=0.03, gt=0, description="spread around the image centre, share of the side")
-    max_reach_m: float = Field(default=2.5, gt=0, description="of a tool from its base")
-    max_camera_m: float = Field(default=5.0, gt=0, description="of a camera from the base")
-    max_wrist_camera_m: float = Field(default=0.5, gt=0, description="of a wrist camera from its tool")
-    min_image_pairs: int = Field(default=8, ge=2, description="fewer pictures are no evidence")
-    arm_flow: Typical = Typical(value=0.92, samples=20)
-    arm_change: Typical = Typical(value=0.74, samples=20)
-    tool_flow: Typical = Typical(value=0.96, samples=14)
-    tool_change: Typical = Typical(value=0.5, samples=14)
-    wrist_flow: Typical = Typical(value=0.55, samples=12)
-    wrist_energy: Typical = Typical(value=0.8, samples=8)
-    fingers: Spread = Spread(value=0.75, spread=0.4)
-    finger_links: Spread = Spread(value=0.5, spread=0.3)
-    off_alone: ResidualLimits = Field(
-        default=ResidualLimits(
+    max_hand_eye_m: float = Field(default=0.012, gt=0, description="a larger hand-eye residual is bad in any reading")
+    off_alone: ErrorLimits = Field(
+        default=ErrorLimits(
             deviations=5.0, rotation=3.5, translation=80.0, focal_length=9.0, principal_point=7.0, lag=0.6
         ),
         description="for one episode",
     )
-    off_together: ResidualLimits = Field(
-        default=ResidualLimits(
+    off_together: ErrorLimits = Field(
+        default=ErrorLimits(
             deviations=3.0, rotation=1.25, translation=25.0, focal_length=2.2, principal_point=2.0, lag=0.3
         ),
         description="for all episodes of a source",
     )
 
 
+DEFAULT_CONFIG = CalibrationDoctorConfig()
+
+
 @dataclass(frozen=True)
 class Explanation:
-    """One way to read the recording.
+    """One reading of the recording.
 
     Attributes:
-        conventions: how the source would have written its numbers; `apply_conventions` repairs the episode with it.
-        score: log-likelihood of everything measured, under this reading; 0 is as a healthy recording typically is,
-            lower is worse. Differences between readings of one episode mean something, and add up over episodes.
+        conventions: the source's way of writing its numbers; `apply_conventions` repairs the episode with it.
+        score: log-likelihood of all evidence under this reading; 0 is as in a healthy recording, lower is worse.
+            Differences between readings of one episode are meaningful, and add up over episodes.
         evidence: the terms of the score by name ("hand-eye left_wrist", ...); each at most 0.
-        other: (name, value) of a mistake that no convention speaks of: ("embodiment", the robot that fits),
-            ("wrist_extrinsics", "exchanged").
+        other: (name, value) of a mistake without a convention: ("embodiment", the robot that fits),
+            ("wrist_extrinsics", "exchanged"), ("wrist_videos", "exchanged").
     """
 
     conventions: RecordedConventions
@@ -126,207 +93,325 @@ class Explanation:
 
     @property
     def departures(self) -> tuple[str, ...]:
-        """What is read otherwise than it was written."""
+        """Names of the mistakes."""
         return self.conventions.departures if self.other is None else (*self.conventions.departures, self.other[0])
 
     @property
     def mistake(self) -> str:
-        """ "none", or what departs: fields of `RecordedConventions` or `other`, joined by "+"."""
+        """The departures joined by "+"; "none" for the recording as written."""
         return "+".join(self.departures) or "none"
 
     @property
     def text(self) -> str:
-        """What departs, with values: "camera_axes: opengl, views: [head]"."""
+        """The departures with their values: "camera_axes: opengl, views: [head]"."""
         lines = [line.removeprefix(".") for line in self.conventions.config_lines("")]
         return ", ".join(lines + ([": ".join(self.other)] if self.other is not None else [])) or "as recorded"
 
 
-@dataclass(frozen=True)
-class ViewMeasures:
-    """What was measured of one view, as recorded; None where the recording does not let it be measured.
+NOTHING_TRIED = Explanation(RecordedConventions(), 0.0, {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conclusion:
+    """Conclusion over an episode or a source.
 
     Attributes:
-        hand_eye_m, hand_eye_deg: root mean square deviation of a moving camera from a fixed place in its tool's frame.
-        hand_eye_action_m, hand_eye_action_deg: the same against the tool poses of the commands.
-        mount_offset_m, mount_offset_deg: from the mount that the embodiment states.
-        camera_lag_frames: by how much the camera's poses trail the states (refined below a frame).
-        image_lag_frames: by how much the images trail the states.
-        in_view_share: share of frames with a tool in the picture and in front of the camera.
-        flow_agreement: correlation (-1..1) of measured image motion with the motion that calibration predicts.
-        flow_turn_deg: angle by which measured image motion is turned against the predicted one.
-        motion_overlap: correlation (-1..1) of the picture's change with the predicted motion of the arms.
-        finger_flow: correlation (-1..1) of flow away from the tool's axis with the growth of the gripper's opening.
-        principal_point_offset: distance of the principal point from the image's centre, share of the image side.
-    """
-
-    view: str
-    hand_eye_m: float | None = None
-    hand_eye_deg: float | None = None
-    hand_eye_action_m: float | None = None
-    hand_eye_action_deg: float | None = None
-    mount_offset_m: float | None = None
-    mount_offset_deg: float | None = None
-    camera_lag_frames: float | None = None
-    image_lag_frames: float | None = None
-    in_view_share: float | None = None
-    flow_agreement: float | None = None
-    flow_turn_deg: float | None = None
-    motion_overlap: float | None = None
-    finger_flow: float | None = None
-    principal_point_offset: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """By how much one camera is off in one way, if in no other: what to change so that the pictures fit best.
-
-    Attributes:
-        kind: rotation, translation (of the camera, in its own frame), focal length, principal point, lag (of the pictures).
-        estimate: (k,) in `unit` (% of the focal length, or of the image's sides). information: (k, k) of it.
-        gain: log-likelihood of the pictures with it, less that of the recording as written.
-        prior: standard deviation of each value before anything is seen. shared: error that more episodes do not reduce.
-    """
-
-    view: str
-    kind: str
-    unit: str
-    estimate: np.ndarray
-    information: np.ndarray
-    gain: float
-    prior: float
-    shared: float
-
-    @property
-    def posterior(self) -> np.ndarray:
-        """Information (k, k) with that of the prior."""
-        return self.information + np.eye(len(self.estimate)) / self.prior**2
-
-    @property
-    def covariance(self) -> np.ndarray:
-        return np.linalg.inv(self.posterior) + self.shared**2 * np.eye(len(self.estimate))
-
-    @property
-    def size(self) -> float:
-        return float(np.linalg.norm(self.estimate))
-
-    @property
-    def error(self) -> float:
-        """Half of the 95 % interval of the size."""
-        along = self.estimate / max(self.size, 1e-12)
-        return 1.96 * float(np.sqrt(along @ self.covariance @ along))
-
-    @property
-    def within(self) -> float:
-        """No error larger than this can have gone unseen (95 %), in whatever direction."""
-        return self.size + 1.96 * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
-
-    @property
-    def deviations(self) -> float:
-        """How many standard deviations of a single number are as unlikely as this estimate without an error."""
-        distance = self.estimate @ np.linalg.solve(self.covariance, self.estimate)
-        from scipy.special import chdtrc, ndtri  # scipy.stats takes a second to import, this a third
-
-        return 0.0 - float(ndtri(max(float(chdtrc(len(self.estimate), distance)), 1e-300) / 2))
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """One episode.
-
-    Attributes:
-        verdict: consistent (as recorded is good), off (`off` names the camera and by how much), explained (`best` names
-            the mistake), unexplained (as recorded is bad, and no reading of it is good), too_little_evidence.
-        best: the reading to believe; "none" unless the verdict is explained.
+        verdict: consistent (good as recorded), off (`off` lists the cameras), explained (`best` is the mistake),
+            unexplained (bad as recorded, and in every reading), too_little_evidence; of a source also mixed (its episodes
+            contradict each other).
+        best: the reading to believe; the recording as written unless the verdict is explained.
         ranked: all readings that were tried, best score first.
-        notes: what a person should know besides: what could not be observed, what the cameras follow.
-        nearest: of an unexplained episode, the readings that come nearest, and what remains wrong under each.
-        residuals: by how much each camera is off under `best`, in each way that the pictures show. off: those that are
-            findings.
+        notes: limits of the evidence, and other facts for a person.
+        nearest: without an explanation, the best readings and what is still wrong under each.
+        camera_errors: the error of each camera under `best`, in each way that the pictures show; `off`: the significant
+            ones.
     """
 
-    episode_id: str
     verdict: VerdictName
-    best: Explanation
-    ranked: tuple[Explanation, ...]
-    measures: tuple[ViewMeasures, ...]
-    notes: tuple[str, ...]
+    best: Explanation = NOTHING_TRIED
+    ranked: tuple[Explanation, ...] = (NOTHING_TRIED,)
+    notes: tuple[str, ...] = ()
     nearest: tuple[str, ...] = ()
-    residuals: tuple[Residual, ...] = ()
-    off: tuple[Residual, ...] = ()
+    camera_errors: tuple[CameraError, ...] = ()
+    off: tuple[CameraError, ...] = ()
 
     @property
-    def none(self) -> Explanation:
+    def as_recorded(self) -> Explanation:
         """The recording as written."""
         return next(explanation for explanation in self.ranked if explanation.mistake == "none")
 
     @property
-    def margin(self) -> float:
-        """How much better the believed reading is than the recording as written."""
-        return self.best.score - self.none.score
+    def consistent_within(self) -> str:
+        """The largest rotation of a camera that could have gone unseen, over the views."""
+        turns = [error.bound for error in self.camera_errors if error.kind == "rotation"]
+        return f"consistent within {max(turns):.1f} deg" if turns else "consistent, but no picture says within what"
 
 
-@dataclass(frozen=True)
-class SetDiagnosis:
-    """All episodes of one source: the same conventions, so that the evidence adds up.
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis(Conclusion):
+    """One episode.
 
     Attributes:
-        verdict: as of an episode; mixed: the episodes contradict each other, no line is right for all of them.
-        ranked: readings with the scores summed over episodes.
+        measures: by view, as recorded: hand_eye_m and hand_eye_deg (root mean square deviation of a moving camera from a
+            fixed place in its tool's frame), in_view (share of frames with a tool in the picture), flow (correlation of
+            measured image motion with the predicted one); those that can be measured.
+    """
+
+    episode_id: str
+    measures: Mapping[str, Mapping[str, float]]
+
+    @property
+    def margin(self) -> float:
+        """Score of the believed reading above that of the recording as written."""
+        return self.best.score - self.as_recorded.score
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceDiagnosis(Conclusion):
+    """All episodes of one source; scores are summed over them.
+
+    Attributes:
         votes: verdicts and mistakes of the single episodes, counted.
-        nearest: of a source without an explanation, the readings that come nearest, and under how many episodes.
         config_lines: what the source's configuration must say, in place of what it says now.
-        residuals, off: as of an episode, estimated from all of them.
     """
 
     source: str
     num_episodes: int
-    verdict: SetVerdictName
-    best: Explanation
-    ranked: tuple[Explanation, ...]
     votes: Mapping[str, int]
-    notes: tuple[str, ...]
     config_lines: tuple[str, ...] = ()
-    nearest: tuple[str, ...] = ()
-    residuals: tuple[Residual, ...] = ()
-    off: tuple[Residual, ...] = ()
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What was found of one episode: a diagnosis, or why there is none.
+def with_camera_errors[C: Conclusion](conclusion: C, errors: tuple[CameraError, ...], limits: ErrorLimits) -> C:
+    """The conclusion with its cameras' errors; a consistent one with a significant error becomes `off`."""
+    off = significant(errors, limits)
+    verdict = "off" if off and conclusion.verdict == "consistent" else conclusion.verdict
+    return replace(conclusion, verdict=verdict, camera_errors=errors, off=off)
+
+
+def term_limits(config: CalibrationDoctorConfig) -> dict[str, float]:
+    """Limits of the terms, by the first word of their names, other than MIN_TERM; noisy signs cannot veto."""
+    return {
+        "flow": correlation_log_likelihood(MIN_FLOW, ARM_FLOW),
+        "turn": turn_log_likelihood(MAX_FLOW_TURN_DEG),
+        "hand-eye": hand_eye_log_likelihood(config.max_hand_eye_m, 0.0),
+        **dict.fromkeys(("change", "wrist", "energy", "fingers", "finger"), -np.inf),
+    }
+
+
+def bad_terms(
+    explanation: Explanation, config: CalibrationDoctorConfig, as_recorded: Explanation | None = None
+) -> dict[str, float]:
+    """The terms that no healthy recording has, by name.
+
+    Args:
+        as_recorded: the recording as written, for a departing explanation, which must leave nothing suspicious but what is
+            tolerated as written and did not get worse.
+    """
+    limits, bad = term_limits(config), {}
+    for name, value in explanation.evidence.items():
+        kind = name.split(" ")[0]
+        if as_recorded is not None:
+            written = as_recorded.evidence.get(name, -np.inf)
+            if value >= written >= limits.get(kind, MIN_TERM):
+                continue
+        if value < limits.get(kind, MIN_TERM if as_recorded is None else SUSPICION):
+            bad[name] = value
+    return bad
+
+
+def nearest_texts(
+    ranked: Iterable[Explanation], as_recorded: Explanation, config: CalibrationDoctorConfig
+) -> tuple[str, ...]:
+    """The best readings without a common mistake, each with what is still wrong under it."""
+    best: list[Explanation] = []
+    for explanation in ranked:
+        if explanation.score > as_recorded.score and not any(
+            set(e.departures) & set(explanation.departures) for e in best
+        ):
+            best.append(explanation)
+    texts = []
+    for explanation in best[:NEAREST_SHOWN]:
+        bad = sorted(bad_terms(explanation, config, as_recorded).items(), key=lambda item: item[1])
+        remains = ", ".join(f"{name} {value:.1f}" for name, value in bad[:TERMS_SHOWN]) or "nothing"
+        more = f" and {len(bad) - TERMS_SHOWN} more" if len(bad) > TERMS_SHOWN else ""
+        texts.append(f"{explanation.text} (score {explanation.score:.1f}): still wrong {remains}{more}")
+    return tuple(texts)
+
+
+def decide(
+    as_recorded: Explanation, ranked: Sequence[Explanation], config: CalibrationDoctorConfig
+) -> tuple[VerdictName, Explanation, list[str]]:
+    """The verdict, the reading to believe, and the mistakes that explain the recording equally well, if several do."""
+    best, bad = ranked[0], bool(bad_terms(as_recorded, config))
+    gain = best.score - as_recorded.score
+    if best is not as_recorded and gain >= config.min_margin and not bad_terms(best, config, as_recorded):
+        # Of mistakes that occur together, the one that explains most alone is compared with the others.
+        alone = next((e for e in ranked if len(e.departures) == 1 and e.departures[0] in best.departures), best)
+        rivals = [
+            other.text
+            for other in ranked
+            if other.score > alone.score - RIVAL_MARGIN
+            and other is not as_recorded
+            and not set(other.departures) & set(best.departures)
+            and (len(best.departures) > 1 or not bad_terms(other, config, as_recorded))
+        ]
+        if not rivals:
+            return "explained", best, []
+        if bad:
+            return "unexplained", as_recorded, [best.text, *rivals]
+    return "unexplained" if bad else "consistent", as_recorded, []
+
+
+def diagnose_source(
+    source: str, diagnoses: Iterable[Diagnosis], config: CalibrationDoctorConfig = DEFAULT_CONFIG
+) -> SourceDiagnosis:
+    """The reading of a source: better than the recordings as written, and healthy in most of them.
+
+    One episode contributes MAX_GAIN at most for or against a reading: a few broken recordings are no habit of their
+    source. A reading that breaks episodes which fit by themselves is not believed: such a source is mixed. Numbers that
+    each episode estimates by itself (a tool offset) are replaced by their median. Mistakes that occur together are tried
+    where they explain some episode alone.
+
+    Args:
+        diagnoses: made with search "always", so that the readings can be compared.
+    """
+    listed = [d for d in diagnoses if d.verdict != "too_little_evidence"]
+    count = len(listed)
+    votes = Counter(d.best.mistake if d.verdict == "explained" else d.verdict for d in listed)
+    if not listed:
+        notes = ("No episode can be judged",)
+        return SourceDiagnosis(verdict="too_little_evidence", notes=notes, source=source, num_episodes=0, votes={})
+    readings = _source_readings(listed, config)
+    as_recorded = _summed([d.as_recorded for d in listed], sum(d.as_recorded.score for d in listed))
+    ranked = sorted([as_recorded, *(r.summed(as_recorded.score) for r in readings)], key=lambda e: -e.score)
+    winning = [r for r in readings if r.gain >= config.min_margin + 0.5 * count and r.healthy > count / 2]
+    sound = [r for r in winning if r.contradicting <= CONTRADICTING_SHARE * count]
+    sound = sorted(sound, key=lambda r: r.regret(sound))
+    rivals = [r for r in sound[1:] if r.fits_like(sound[0], sound)]
+    verdict: VerdictName = "mixed"
+    best = as_recorded
+    if sound and not rivals:
+        verdict, best = "explained", sound[0].summed(as_recorded.score)
+    elif rivals or votes["unexplained"] > count / 2:
+        verdict = "unexplained"
+    elif count - votes["consistent"] - votes["off"] <= CONTRADICTING_SHARE * count:
+        verdict = "consistent"
+    found = SourceDiagnosis(
+        verdict=verdict,
+        best=best,
+        ranked=tuple(ranked),
+        notes=tuple(dict.fromkeys(note for d in listed for note in d.notes)),
+        nearest=_nearest(readings, count) if verdict == "unexplained" else (),
+        source=source,
+        num_episodes=count,
+        votes=dict(votes),
+    )
+    if best.other is not None:
+        return found
+    alike = {d.episode_id: d.camera_errors for d in listed if d.best.conventions == best.conventions}
+    limits = config.off_together if len(alike) >= FEWEST_TOGETHER else config.off_alone
+    return with_camera_errors(found, combine(list(alike.values())), limits)
+
+
+_Key = frozenset[tuple[str, str]]
+_ByKey = dict[_Key, Explanation]
+
+
+class _SourceReading:
+    """One reading over all episodes of a source.
 
     Attributes:
-        reason: a quarantine reason code of an episode that cannot be read, with `detail`; None of one that can.
-        config_lines: what the source's configuration must say, in place of what it says now.
-        picture: path relative to the output folder.
-        notes: of the check itself, beside the diagnosis' own.
+        tried: its explanation in each episode where it was tried.
+        gain: its score above that of the recordings as written; each episode's share is bounded by MAX_GAIN.
+        healthy: episodes that are healthy under it.
+        contradicting: episodes that fit as written, or under another reading, but not under this one.
     """
 
-    episode_id: str
-    source: str
-    diagnosis: Diagnosis | None
-    reason: str | None = None
-    detail: str = ""
-    config_lines: tuple[str, ...] = ()
-    picture: str | None = None
-    notes: tuple[str, ...] = ()
+    def __init__(
+        self, key: _Key, listed: list[Diagnosis], by_key: list[_ByKey], config: CalibrationDoctorConfig
+    ) -> None:
+        self.key = key
+        self.tried = [found[key] for found in by_key if key in found]
+        tolerated = config.min_margin + COMPLEXITY * len(key)
+        self.scores, self.gain, self.healthy, self.contradicting = [], 0.0, 0, 0
+        for diagnosis, found in zip(listed, by_key, strict=True):
+            as_recorded = diagnosis.as_recorded
+            own = found.get(key) or _instead_of(key, found)
+            bad = bool(bad_terms(own, config, as_recorded))
+            self.scores.append(own.score)
+            self.gain += float(np.clip(own.score - as_recorded.score, -MAX_GAIN, MAX_GAIN))
+            self.healthy += not bad
+            fits = diagnosis.verdict in ("consistent", "off")
+            worse = fits and own.score < as_recorded.score - tolerated
+            unseen = fits and {name for name, _ in key} & ESTIMATED and key not in found
+            bad_here = bad and (fits or diagnosis.verdict == "explained")
+            self.contradicting += bool(worse or unseen or bad_here)
 
-    @property
-    def verdict(self) -> str:
-        return "unreadable" if self.diagnosis is None else self.diagnosis.verdict
+    def regret(self, others: list[_SourceReading]) -> float:
+        """Score of the best of several readings above this one, summed over the episodes."""
+        best = np.max([other.scores for other in others], axis=0)
+        return float(np.minimum(best - self.scores, MAX_GAIN).sum())
+
+    def fits_like(self, best: _SourceReading, others: list[_SourceReading]) -> bool:
+        """Whether this is another mistake that explains the episodes as well as the best one."""
+        near = self.regret(others) - best.regret(others) < RIVAL_MARGIN * len(self.scores)
+        return near and not {name for name, _ in self.key} & {name for name, _ in best.key}
+
+    def summed(self, score_as_written: float) -> Explanation:
+        return _summed(self.tried, score_as_written + self.gain)
 
 
-@dataclass(frozen=True)
-class CalibrationCheck:
-    """Everything that was found, and the folder that it was written to."""
+def _instead_of(key: _Key, found: _ByKey) -> Explanation:
+    """Substitute for a reading that was not tried in an episode.
 
-    findings: tuple[Finding, ...]
-    sets: tuple[SetDiagnosis, ...]
-    output: Path
+    The largest part of it that was tried: a mistake beside another leaves no trace there. For a lag, the best other lag if
+    it is worse than none: that lag was not worth trying.
+    """
+    part = max((tried for tried in found if tried <= key), key=lambda tried: (len(tried), found[tried].score))
+    fields = {name for name, _ in key}
+    others = [e for tried, e in found.items() if tried and {name for name, _ in tried} == fields]
+    other = max(others, key=lambda e: e.score, default=found[part])
+    return min(found[part], other, key=lambda e: e.score) if not part else found[part]
 
-    @property
-    def consistent(self) -> bool:
-        """Whether nothing is wrong: some episode is consistent, and none is anything worse than silent."""
-        verdicts = {finding.verdict for finding in self.findings}
-        sound = not verdicts & {"off", "explained", "unexplained", "unreadable"}
-        return sound and "consistent" in verdicts and all(s.verdict not in ("off", "explained") for s in self.sets)
+
+def _nearest(readings: list[_SourceReading], count: int) -> tuple[str, ...]:
+    """The readings that are healthy in most episodes, then those with the best scores; one for each mistake."""
+    best: dict[str, str] = {}
+    for reading in sorted((r for r in readings if r.gain > 0), key=lambda r: (-r.healthy, r.regret(readings))):
+        found = reading.summed(0.0)
+        best.setdefault(found.mistake, f"{found.text}: healthy in {reading.healthy} of {count} episodes")
+    return tuple(list(best.values())[:NEAREST_SHOWN])
+
+
+def _key(explanation: Explanation) -> _Key:
+    """Identity of a reading over episodes, whatever tool offset each of them estimates."""
+    conventions = explanation.conventions
+    items = {(name, str(getattr(conventions, name))) for name in conventions.departures if name != "tool_offset_z_m"}
+    items |= {("tool_offset_z_m", "")} if conventions.tool_offset_z_m else set()
+    return frozenset(items | ({explanation.other} if explanation.other is not None else set()))
+
+
+def _source_readings(listed: list[Diagnosis], config: CalibrationDoctorConfig) -> list[_SourceReading]:
+    """Every single mistake, and those together that explain some episode."""
+    by_key: list[_ByKey] = []
+    keys: dict[_Key, None] = {}
+    for diagnosis in listed:
+        found: _ByKey = {}
+        for explanation in diagnosis.ranked:  # the best of each key comes first
+            found.setdefault(_key(explanation), explanation)
+        by_key.append(found)
+        keys |= {key: None for key, e in found.items() if len(key) == 1 or e is diagnosis.best}
+    return [_SourceReading(key, listed, by_key, config) for key in keys if key]
+
+
+def _summed(members: list[Explanation], score: float) -> Explanation:
+    """The common reading of several episodes."""
+    evidence: dict[str, float] = defaultdict(float)
+    for member in members:
+        for name, value in member.evidence.items():
+            evidence[name] += value
+    conventions = Counter(member.conventions for member in members).most_common(1)[0][0]
+    if conventions.tool_offset_z_m:
+        median = float(np.median([member.conventions.tool_offset_z_m for member in members]))
+        conventions = conventions.model_copy(update={"tool_offset_z_m": round(median, 4)})
+    return Explanation(conventions, score, dict(evidence), members[0].other)

@@ -1,8 +1,8 @@
 """Pictures of a diagnosis: where the recorded calibration puts the tools, beside where a repaired reading puts them.
 
-Unlike action tracks, which let wrist cameras follow the kinematics, these pictures draw with the camera poses *as
-recorded*, frame by frame: what is judged is the recording. The arms' outline is drawn into the head view (in a wrist
-view it would fill the picture): an outline that does not lie on the arm is the plainest sign of a wrong calibration.
+Unlike action tracks, which let wrist cameras follow the kinematics, these pictures use the camera poses *as recorded*,
+frame by frame: the recording is judged. The arms' outline is drawn into the head view (in a wrist view it would fill the
+picture): an outline beside the arm is the plainest sign of a wrong calibration.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from worldline_core.actions.overlay_views import legend_strip, view_name
 from worldline_core.actions.overlays import OverlayStyle, draw_overlay
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.actions.tool_projection import project_tools
-from worldline_core.calibration.residual import consistent_text, corrected_camera, off_text
+from worldline_core.calibration.camera_errors import corrected_camera
 from worldline_core.data.episodes.conventions import along_tool_z, apply_conventions, image_frames
 from worldline_core.errors import DataError
 from worldline_core.pictures import (
@@ -37,8 +37,7 @@ from worldline_core.pictures import (
 )
 
 if TYPE_CHECKING:
-    from worldline_core.calibration.diagnosis import Diagnosis, ViewMeasures
-    from worldline_core.data.episodes.conventions import RecordedConventions
+    from worldline_core.calibration.diagnosis import Diagnosis
     from worldline_core.data.episodes.episode import Episode
     from worldline_core.data.video.frames import Frames
     from worldline_core.geometry.kinematics import ArmKinematics
@@ -91,7 +90,7 @@ def recorded_tracks(
     )  # fmt: skip
 
 
-def telling_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, count: int, wanted: int) -> list[int]:
+def differing_moments(first: EpisodeTracks, second: EpisodeTracks, shift: int, count: int, wanted: int) -> list[int]:
     """Frames of the first reading at which the two differ most in the picture, spread over the clip.
 
     Args:
@@ -138,9 +137,8 @@ def diagnosis_picture(
         repaired = apply_conventions(recorded, conventions)
         lag = image_frames(recorded.num_frames, conventions).start
     elif diagnosis.verdict == "off":
-        cameras = {r.view: corrected_camera(recorded.cameras[r.view], r) for r in diagnosis.off if r.kind != "lag"}
+        cameras = {e.view: corrected_camera(recorded.cameras[e.view], e) for e in diagnosis.off if e.kind != "lag"}
         repaired = replace(recorded, cameras={**recorded.cameras, **cameras})
-    measures = {item.view: item for item in diagnosis.measures}
     left: list[SheetRow] = []
     right: list[SheetRow] = []
     arms: Sequence[str] = ()
@@ -155,13 +153,13 @@ def diagnosis_picture(
             chosen = evenly_spaced(count, 2 * moments)
         else:
             # Image m belongs to state m as recorded, and to state m - lag of the repaired episode.
-            chosen = telling_moments(before, after, lag, count, moments)
+            chosen = differing_moments(before, after, lag, count, moments)
         if not chosen:
             continue
         arms = before.arms
         outlined |= view == HEAD_VIEW
         # A note on one side keeps its line on the other: the two sheets must stay level.
-        note = measures_note(measures.get(view)) or " "
+        note = measures_note(diagnosis.measures.get(view, {})) or " "
         shown = {n: image for n, image in enumerate(islice(frames[view], max(chosen) + 1)) if n in chosen}
         left.append(SheetRow(view_name(view), _drawn(shown, before, view, 0, tile_height), note))
         if repaired is not None:
@@ -173,8 +171,8 @@ def diagnosis_picture(
         )
     sheets = [contact_sheet(left, tile_height=tile_height, title="as recorded", min_width=MIN_WIDTH)]
     if right:
-        changes = departures_text(diagnosis.best.conventions) or [off_text(residual) for residual in diagnosis.off]
-        title = "repaired: " + ", ".join(changes)
+        off = ", ".join(map(str, diagnosis.off))
+        title = "repaired: " + (diagnosis.best.text if diagnosis.best.conventions.departures else off)
         sheets.append(contact_sheet(right, tile_height=tile_height, title=title, min_width=MIN_WIDTH))
     body = np.concatenate(sheets, axis=1)
     width = body.shape[1]
@@ -206,46 +204,31 @@ def _seen_note(tracks: EpisodeTracks) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """The verdict in one line, with the numbers that decide."""
-    as_recorded = diagnosis.none.score
+    as_recorded = diagnosis.as_recorded.score
     match diagnosis.verdict:
         case "explained":
-            return (
-                f"explained by {diagnosis.best.mistake}: score {diagnosis.best.score:.1f}, as recorded {as_recorded:.1f}"
-                "  (0 is healthy)"
-            )
+            score = f"score {diagnosis.best.score:.1f}, as recorded {as_recorded:.1f}  (0 is healthy)"
+            return f"explained by {diagnosis.best.mistake}: {score}"
         case "unexplained":
-            terms = sorted(diagnosis.none.evidence.items(), key=lambda item: item[1])[:2]
+            terms = sorted(diagnosis.as_recorded.evidence.items(), key=lambda item: item[1])[:2]
             worst = ", ".join(f"{name} {value:.1f}" for name, value in terms)
             return f"unexplained: score {as_recorded:.1f} as recorded, and no reading is good; worst are {worst}"
         case "off":
-            return "off: " + ", ".join(off_text(residual) for residual in diagnosis.off)
+            return "off: " + ", ".join(map(str, diagnosis.off))
         case "too_little_evidence":
             return "too little evidence: this recording does not show enough to judge its calibration"
         case _:
-            return f"{consistent_text(diagnosis.residuals)}: score {as_recorded:.1f} as recorded (0 is healthy)"
+            return f"{diagnosis.consistent_within}: score {as_recorded:.1f} as recorded (0 is healthy)"
 
 
-def departures_text(conventions: RecordedConventions) -> list[str]:
-    """`extrinsics: base_to_camera`, one text a departing field."""
-    return [line.removeprefix(".") for line in conventions.config_lines("")]
-
-
-def measures_note(measures: ViewMeasures | None) -> str:
-    """What was measured of a view, in one line."""
-    if measures is None:
-        return ""
+def measures_note(measures: Mapping[str, float]) -> str:
+    """The measures of a view in one line."""
     parts: list[str] = []
-    if measures.hand_eye_m is not None:
-        angle = "" if measures.hand_eye_deg is None else f", {measures.hand_eye_deg:.1f} deg"
-        parts.append(f"camera against hand {1e3 * measures.hand_eye_m:.1f} mm{angle}")
-    if measures.camera_lag_frames is not None:
-        parts.append(f"camera lag {measures.camera_lag_frames:+.1f} frames")
-    if measures.image_lag_frames is not None:
-        parts.append(f"image lag {measures.image_lag_frames:+.1f} frames")
-    if measures.in_view_share is not None:
-        parts.append(f"in view {measures.in_view_share:.0%}")
-    if measures.flow_agreement is not None:
-        parts.append(f"flow agreement {measures.flow_agreement:.2f}")
-    if measures.motion_overlap is not None:
-        parts.append(f"motion on the arm {measures.motion_overlap:.2f}")
+    if "hand_eye_m" in measures:
+        metres, degrees = measures["hand_eye_m"], measures["hand_eye_deg"]
+        parts.append(f"camera against hand {1e3 * metres:.1f} mm, {degrees:.1f} deg")
+    if "in_view" in measures:
+        parts.append(f"in view {measures['in_view']:.0%}")
+    if "flow" in measures:
+        parts.append(f"flow agreement {measures['flow']:.2f}")
     return "  ·  ".join(parts)

@@ -12,9 +12,9 @@ from functools import cache
 
 import numpy as np
 
-from worldline_core.calibration.measures import lagged, parabola_peak
-from worldline_core.calibration.pose_evidence import rms_hand_eye
-from worldline_core.calibration.reading import tool_travel
+from worldline_core.calibration.calibration_doctor import lagged
+from worldline_core.calibration.evidence import rms_hand_eye
+from worldline_core.calibration.observation import tool_travel
 from worldline_core.filters.filter_config import FilterConfig, ProjectionConfig, TimeAlignmentConfig
 from worldline_core.filters.signals import Signals
 from worldline_core.filters.verdict import Finding, Verdict
@@ -38,8 +38,14 @@ def lag_by_correlation(motion: np.ndarray, change: np.ndarray, max_lag: int) -> 
     best = int(scores.argmax())
     refined = float(best - max_lag)
     if 0 < best < len(scores) - 1:
-        refined += parabola_peak(*scores[best - 1 : best + 2])
+        refined += _parabola_peak(*scores[best - 1 : best + 2])
     return refined, float(scores[best]), float(scores[max_lag])
+
+
+def _parabola_peak(left: float, middle: float, right: float) -> float:
+    """Place of the maximum of the parabola through values at -1, 0 and 1; 0 where it has none."""
+    curvature = left - 2 * middle + right
+    return 0.5 * (left - right) / curvature if curvature < -1e-9 else 0.0
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -12,10 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.diagnosis import Diagnosis
-from worldline_core.calibration.pose_evidence import fields_of_view_deg, mount_offset, principal_point_offset
-from worldline_core.calibration.residual import off_text
-from worldline_core.calibration.verdict import bad_terms
+from worldline_core.calibration.diagnosis import Diagnosis, bad_terms
+from worldline_core.calibration.evidence import fields_of_view_deg, mount_offset, principal_point_offset
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.filters.filter_config import CalibrationConfig, FilterConfig, FilterDoctorConfig
 from worldline_core.filters.signals import Signals, known_kinematics
@@ -117,7 +115,7 @@ def detect_mistake(
         lags = all(field.endswith("lag_frames") for field in diagnosis.best.departures)
         reason = "time_alignment" if lags else "calibration"
     elif diagnosis.verdict == "off":
-        reason = "time_alignment" if all(residual.kind == "lag" for residual in diagnosis.off) else "calibration"
+        reason = "time_alignment" if all(error.kind == "lag" for error in diagnosis.off) else "calibration"
     return Verdict(
         reason,
         diagnosis.verdict in ("consistent", "too_little_evidence"),
@@ -139,7 +137,7 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
     numbers: Numbers = {
         "verdict": diagnosis.verdict,
         "mistake": diagnosis.best.mistake,
-        "score_as_recorded": diagnosis.none.score,
+        "score_as_recorded": diagnosis.as_recorded.score,
         "threshold_margin": config.min_margin,
     }
     if diagnosis.verdict == "explained":
@@ -149,13 +147,13 @@ def _numbers(diagnosis: Diagnosis, config: FilterDoctorConfig, step: int) -> Num
         other = diagnosis.best.other
         lines = found.model_copy(update=lags).config_lines() if other is None else (": ".join(other),)
         numbers |= {"score_repaired": diagnosis.best.score, "config": "; ".join(lines)}
-    for r in diagnosis.residuals:
-        kind = f"{r.view} {r.kind}"
-        numbers |= {f"{kind} [{r.unit}]": round(r.size, 3), f"{kind} unseen up to": round(r.within, 3)}
+    for error in diagnosis.camera_errors:
+        kind = f"{error.view} {error.kind}"
+        numbers |= {f"{kind} [{error.unit}]": round(error.size, 3), f"{kind} unseen up to": round(error.bound, 3)}
     if diagnosis.off:
-        numbers |= {"off": "; ".join(map(off_text, diagnosis.off))}
+        numbers |= {"off": "; ".join(map(str, diagnosis.off))}
     if diagnosis.verdict == "unexplained":
-        bad = bad_terms(diagnosis.none, config)
+        bad = bad_terms(diagnosis.as_recorded, config)
         nearest = "; ".join(diagnosis.nearest)
         numbers |= {"bad": ", ".join(sorted(bad, key=lambda name: bad[name])), "nearest": nearest}
     return numbers

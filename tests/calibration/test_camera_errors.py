@@ -13,13 +13,20 @@ import numpy as np
 import pytest
 
 from worldline_core.calibration.calibration_doctor import diagnose
-from worldline_core.calibration.check_report import conclusion_lines, verdict_text
-from worldline_core.calibration.diagnosis import CalibrationCheck, CalibrationDoctorConfig, Diagnosis, Finding, Residual
-from worldline_core.calibration.motion_fit import PARAMETERS, StillView, WristView, moved_camera
+from worldline_core.calibration.camera_errors import (
+    ERROR_KINDS,
+    PARAMETERS,
+    CameraError,
+    StillView,
+    WristView,
+    combine,
+    moved_camera,
+    significant,
+)
+from worldline_core.calibration.check_report import CalibrationCheck, EpisodeCheck, conclusion_lines, verdict_text
+from worldline_core.calibration.diagnosis import CalibrationDoctorConfig, Diagnosis, diagnose_source
 from worldline_core.calibration.observation import Motion
 from worldline_core.calibration.pictures import diagnosis_picture, headline
-from worldline_core.calibration.residual import KINDS, combined, standing_out
-from worldline_core.calibration.source_diagnosis import diagnose_set
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.filters.calibration import detect_mistake
 from worldline_core.filters.filter_config import FilterDoctorConfig
@@ -32,8 +39,8 @@ CONFIG = CalibrationDoctorConfig()
 @pytest.fixture(scope="module")
 def healthy(project_root: Path) -> list:
     """Twenty-two episodes of the test splits, of all robots."""
-    path = project_root / "benchmarks" / "calibration_doctor.py"
-    spec = importlib.util.spec_from_file_location("calibration_doctor_for_residuals", path)
+    path = project_root / "benchmarks" / "calibration.py"
+    spec = importlib.util.spec_from_file_location("calibration_for_camera_errors", path)
     assert spec is not None
     assert spec.loader is not None
     module: ModuleType = importlib.util.module_from_spec(spec)
@@ -45,7 +52,7 @@ def healthy(project_root: Path) -> list:
 def spoiled(episode: Episode, view: str, kind: str, *sizes: float) -> Episode:
     """The episode with one camera's calibration changed, in the unit of the kind."""
     theta = np.zeros(PARAMETERS)
-    theta[KINDS[kind].parameters] = np.asarray(sizes) / KINDS[kind].scale
+    theta[ERROR_KINDS[kind].parameters] = np.asarray(sizes) / ERROR_KINDS[kind].scale
     return replace(episode, cameras={**episode.cameras, view: moved_camera(episode.cameras[view], theta)})
 
 
@@ -53,16 +60,16 @@ def quickly(item: object, episode: Episode) -> Diagnosis:
     return diagnose(episode, item.gray, item.kinematics, QUICK)  # type: ignore[attr-defined]
 
 
-def estimated(diagnosis: Diagnosis, view: str, kind: str) -> Residual:
-    return next(r for r in diagnosis.residuals if (r.view, r.kind) == (view, kind))
+def estimated(diagnosis: Diagnosis, view: str, kind: str) -> CameraError:
+    return next(r for r in diagnosis.camera_errors if (r.view, r.kind) == (view, kind))
 
 
 def solved(view: StillView | WristView, kind: str) -> np.ndarray:
     """In the unit of the kind, after two looks."""
     theta = np.zeros(PARAMETERS)
     for _ in range(3):
-        theta[KINDS[kind].parameters] += KINDS[kind].solved(view.equations(theta, 0.7), theta)[1]
-    return theta[KINDS[kind].parameters] * KINDS[kind].scale
+        theta[ERROR_KINDS[kind].parameters] += ERROR_KINDS[kind].solved(view.equations(theta, 0.7), theta)[1]
+    return theta[ERROR_KINDS[kind].parameters] * ERROR_KINDS[kind].scale
 
 
 @pytest.mark.parametrize(
@@ -84,7 +91,7 @@ def test_what_was_put_into_a_still_view_is_found(kind: str, sizes: tuple[float, 
     radii = np.full(12, 0.04)
     camera = CameraTrack("head", np.array([[100.0, 0, 47.5], [0, 100, 31.5], [0, 0, 1]]), np.eye(4)[None], 96, 64)
     theta = np.zeros(PARAMETERS)
-    theta[KINDS[kind].parameters] = np.asarray(sizes) / KINDS[kind].scale
+    theta[ERROR_KINDS[kind].parameters] = np.asarray(sizes) / ERROR_KINDS[kind].scale
     blank = np.zeros((count - 1, 16, 24))
     view = StillView(camera, points, radii, Motion(np.zeros((*blank.shape, 2)), blank, blank))
     view.measured = view._predicted(theta, np.arange(PARAMETERS))[0]
@@ -103,7 +110,7 @@ def test_what_was_put_into_a_wrist_view_is_found(kind: str, sizes: tuple[float, 
     nothing = (np.zeros((count, 0, 3)), np.zeros(0))
     view = WristView(camera, gray, Motion(np.zeros((*shown.shape, 2)), shown, shown), *nothing)
     theta = np.zeros(PARAMETERS)
-    theta[KINDS[kind].parameters] = np.asarray(sizes) / KINDS[kind].scale
+    theta[ERROR_KINDS[kind].parameters] = np.asarray(sizes) / ERROR_KINDS[kind].scale
     view.flow = view._flow(view._seen(theta), np.full(len(view.step), 3.0))
     assert solved(view, kind) == pytest.approx(sizes, rel=0.1, abs=0.1 * np.abs(sizes).max())
 
@@ -146,48 +153,48 @@ def test_two_degrees_are_found_in_twenty_episodes_and_healthy_ones_are_bounded(h
     clean = [quickly(item, item.joints) for item in healthy]
     assert len(clean) >= 20
     assert np.mean([d.verdict == "consistent" for d in clean]) >= 0.95
-    found = diagnose_set("source", clean, QUICK)
+    found = diagnose_source("source", clean, QUICK)
     assert found.verdict == "consistent"
-    bounds = {residual.kind: residual.within for residual in found.residuals if residual.view == "head"}
+    bounds = {residual.kind: residual.bound for residual in found.camera_errors if residual.view == "head"}
     assert bounds["rotation"] < 3
     assert bounds["focal length"] < 5
-    findings = tuple(Finding(d.episode_id, "source", d) for d in clean)
+    findings = tuple(EpisodeCheck(d.episode_id, "source", d) for d in clean)
     said = "\n".join(conclusion_lines(CalibrationCheck(findings, (found,), tmp_path)))
     assert "together: consistent within " in said
     assert "head within: rotation " in said
     for sizes in ((2.0, 0.0, 0.0), (0.0, -2.0, 0.0)):
-        turned = diagnose_set(
+        turned = diagnose_source(
             "source", [quickly(item, spoiled(item.joints, "head", "rotation", *sizes)) for item in healthy], QUICK
         )
         assert turned.verdict == "off"
         assert {residual.view for residual in turned.off} == {"head"}
-        residual = next(r for r in turned.residuals if (r.view, r.kind) == ("head", "rotation"))
+        residual = next(r for r in turned.camera_errors if (r.view, r.kind) == ("head", "rotation"))
         assert residual.estimate == pytest.approx(-np.asarray(sizes), abs=1.0)
 
 
 def test_many_episodes_say_more_than_one_and_a_broken_one_does_not_speak_for_them() -> None:
     random = np.random.default_rng(0)
 
-    def episode(value: float) -> tuple[Residual, ...]:
+    def episode(value: float) -> tuple[CameraError, ...]:
         return (
-            Residual("head", "focal length", "%", np.array([value]), np.array([[1 / 9]]), value**2 / 18, 30.0, 0.5),
+            CameraError("head", "focal length", "%", np.array([value]), np.array([[1 / 9]]), value**2 / 18, 30.0, 0.5),
         )
 
     values = 3.5 + 3.0 * random.normal(size=24)
-    (together,) = combined([episode(value) for value in values])
+    (together,) = combine([episode(value) for value in values])
     (alone,) = episode(3.5)
-    assert together.error < alone.error / 2
-    assert together.within < alone.within
-    assert standing_out([together], CONFIG.off_together) == (together,)
-    assert standing_out([alone], CONFIG.off_alone) == ()
-    (spoiled_by_one,) = combined([episode(value) for value in (*values, 300.0)])
+    assert together.half_interval < alone.half_interval / 2
+    assert together.bound < alone.bound
+    assert significant([together], CONFIG.off_together) == (together,)
+    assert significant([alone], CONFIG.off_alone) == ()
+    (spoiled_by_one,) = combine([episode(value) for value in (*values, 300.0)])
     assert spoiled_by_one.estimate == pytest.approx(together.estimate, abs=1.0)
 
 
 def test_without_pictures_no_bound_is_claimed(healthy: list) -> None:
     item = healthy[0]
     diagnosis = diagnose(item.poses, {}, item.kinematics, QUICK)
-    assert diagnosis.residuals == ()
+    assert diagnosis.camera_errors == ()
     assert verdict_text(diagnosis) == "consistent, but no picture says within what"
 
 
@@ -198,7 +205,7 @@ def test_exchanged_wrist_videos_are_found(healthy: list) -> None:
         exchanged = {**item.gray, left: item.gray[right], right: item.gray[left]}
         found.append(diagnose(item.joints, exchanged, item.kinematics, QUICK))
     assert sum(d.best.mistake == "wrist_videos" for d in found) >= 3
-    together = diagnose_set("source", found, QUICK)
+    together = diagnose_source("source", found, QUICK)
     assert (together.verdict, together.best.other) == ("explained", ("wrist_videos", "exchanged"))
     named = next(d for d in found if d.best.mistake == "wrist_videos")
     assert any("exchange the two where the source is written" in note for note in named.notes)

@@ -1,21 +1,25 @@
-"""How well a camera's calibration predicts the motion in its pictures, as least squares around a guess of its errors.
+"""Errors of each camera (rotation, place, focal length, principal point, lag), estimated with their uncertainty.
 
-In a view that stands still the arms' projected motion is laid over the measured motion (optical flow and change of the
-picture). In a wrist view the flow of the scene that the camera's own motion predicts, at depths that are left open, is
-compared with the measured one. Both give normal equations of the PARAMETERS.
+In a fixed view the arms' projected motion is laid over the measured motion (optical flow and change of the picture). In a
+wrist view the flow of the scene that the camera's own motion predicts, at free depths, is compared with the measured one.
+Both give normal equations of the PARAMETERS. Each kind of error is estimated as if it were the only one, because several
+look alike in pictures; the kind that explains most is named.
 
 Axis legend: n steps, r c rows and columns of cells, m cells in one row, p points on the robot, k parameters.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from pydantic import Field
 
-from worldline_core.calibration.image_evidence import MIN_CHANGE, MIN_TEXTURE
-from worldline_core.calibration.observation import CELL_PX, Motion, cell_centres, cell_means
+from worldline_core.calibration.evidence import MIN_CHANGE, MIN_TEXTURE, observable_views
+from worldline_core.calibration.observation import CELL_PX, Motion, Observation, Reading, cell_centres, cell_means
+from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import project_points
 from worldline_core.geometry.transforms import lengths, rigid_inverse
@@ -24,21 +28,98 @@ PARAMETERS = 10
 """Rotation and translation of the camera in its own frame [rad, m] (3 + 3), relative focal length (1), principal point in
 shares of the image's sides (2), frames by which the pictures trail (1)."""
 NUISANCE_PRIOR = np.array([0.3, 0.5, 0.5])
-"""Standard deviations of what is fitted besides: thickness of the links, and factors on the predicted flow and change."""
+"""Standard deviations of the nuisance parameters: thickness of the links, factors on the predicted flow and change."""
 EDGE_CELLS = 0.35
 NEAR_M, MIN_STEP_PX, STILL_STEP_PX, LONGEST_STEP_PX = 0.03, 0.3, 0.05, 20.0
 NOISE_CHANGE = 2.0
 MIN_CELLS = 60
 SAMPLE_CELLS_STILL, SAMPLE_CELLS_WRIST = 90.0, 2.5
-"""So many cells count as one independent measurement, because neighbours and successive steps are correlated. Measured on
-healthy recordings."""
+"""Cells per independent measurement, because neighbours and successive steps are correlated; from healthy recordings."""
 DEPTH_START_PER_M, MOST_PER_M, DEPTH_PRIOR = 4.0, 15.0, np.array([4.0, 20.0, 20.0])
 """Inverse depth of the scene before a wrist camera: a plane, its value in the middle and its slopes (priors)."""
 FLOW_ERROR_PX, FLOW_ERROR_SHARE, FAINT_EDGE = 0.5, 0.1, 20.0
 HAND_MARGIN_CELLS = 2.0
 LEAST_INFORMATION = 1e-20
-"""Information on a parameter that a view cannot show because its camera rests: only the prior bounds it."""
+"""Of a parameter that a resting camera cannot show: only the prior bounds it."""
 _STEPS = np.array([0.01] * 3 + [0.0] * 3 + [0.02, 0.02, 0.02, 0.25])
+HAND_REACH_M = 0.2
+COARSE_CELLS, FINE_CELLS = 1.5, 0.7
+"""Blur of the coarse and of the fine maps, in cells."""
+SHAPE_UNKNOWN = 12.0
+"""Factor on the uncertainty of the robot's shape without joints: the arm behind the hand is unknown."""
+SIMILAR_GAIN = 0.5
+"""Kinds of error with at least this share of the best gain are indistinguishable."""
+OUTLIER_DEVIATIONS = 3.0
+"""An episode this many standard deviations from the others has half its weight."""
+
+
+class ErrorLimits(StrictModel):
+    """Smallest size of a camera error, and its standard deviations from zero, to be reported."""
+
+    deviations: float = Field(gt=0)
+    rotation: float = Field(gt=0, description="degrees")
+    translation: float = Field(gt=0, description="millimetres")
+    focal_length: float = Field(gt=0, description="percent")
+    principal_point: float = Field(gt=0, description="percent of the image side")
+    lag: float = Field(gt=0, description="frames")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraError:
+    """One kind of error of one camera, estimated as the only one: the change that makes its pictures fit best.
+
+    Attributes:
+        kind: rotation, translation (of the camera, in its own frame), focal length, principal point, lag (of the pictures).
+        estimate: (k,) in `unit` (% of the focal length, or of the image's sides).
+        information: (k, k) of the estimate.
+        gain: log-likelihood of the pictures with it, less that of the recording as written.
+        prior: standard deviation of each value before any evidence.
+        shared: standard deviation of the error that more episodes do not reduce.
+    """
+
+    view: str
+    kind: str
+    unit: str
+    estimate: np.ndarray
+    information: np.ndarray
+    gain: float
+    prior: float
+    shared: float
+
+    def __str__(self) -> str:
+        return f"{self.view} {self.kind} {self.size:.1f} ± {self.half_interval:.1f} {self.unit}"
+
+    @property
+    def posterior(self) -> np.ndarray:
+        """Information (k, k) with that of the prior."""
+        return self.information + np.eye(len(self.estimate)) / self.prior**2
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return np.linalg.inv(self.posterior) + self.shared**2 * np.eye(len(self.estimate))
+
+    @property
+    def size(self) -> float:
+        return float(np.linalg.norm(self.estimate))
+
+    @property
+    def half_interval(self) -> float:
+        """Half of the 95 % interval of the size."""
+        along = self.estimate / max(self.size, 1e-12)
+        return 1.96 * float(np.sqrt(along @ self.covariance @ along))
+
+    @property
+    def bound(self) -> float:
+        """Upper bound (95 %) of an error in any direction that can have gone unseen."""
+        return self.size + 1.96 * float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+    @property
+    def deviations(self) -> float:
+        """Number of standard deviations of a normal variable that is as unlikely as this estimate without an error."""
+        distance = self.estimate @ np.linalg.solve(self.covariance, self.estimate)
+        from scipy.special import chdtrc, ndtri  # scipy.stats takes a second to import, this a third
+
+        return 0.0 - float(ndtri(max(float(chdtrc(len(self.estimate), distance)), 1e-300) / 2))
 
 
 @dataclass(frozen=True)
@@ -62,7 +143,7 @@ def moved_camera(camera: CameraTrack, theta: np.ndarray) -> CameraTrack:
 
 
 class StillView:
-    """A view that stands still: the measured motion of the arms, which the predicted one is compared with."""
+    """A fixed view: the measured motion of the arms, compared with the predicted one."""
 
     def __init__(self, camera: CameraTrack, points: np.ndarray, radii: np.ndarray, motion: Motion) -> None:
         """points: (n + 1, p, 3), radii: (p,) [m]; motion of the n steps."""
@@ -73,14 +154,13 @@ class StillView:
         self._maps: dict[tuple[bytes, int, int], tuple[np.ndarray, ...]] = {}
 
     def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """The predicted maps move where the parameters move their points, and change where these change speed.
+        """Normal equations of the `wanted` parameters, zero for the others.
 
-        Args:
-            wanted: parameters whose equations are computed; those of the others are zero.
+        The predicted maps move where the parameters move their points, and change where these change speed.
         """
         parameters, size = np.arange(PARAMETERS)[wanted], PARAMETERS + 1
         key = theta.tobytes(), wanted.start, wanted.stop
-        if key not in self._maps:  # the start is looked at with more than one blur
+        if key not in self._maps:  # the start is evaluated with more than one blur
             self._maps[key] = self._predicted(theta, parameters)
         value, shift, growth, cover = self._maps[key]
         if blur not in self._by_blur:
@@ -178,7 +258,7 @@ class StillView:
 
 
 def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (n, p, 2), depth and whether ahead (n, p), and the pixels' slope by the camera's parameters (n, p, 2, k - 1)."""
+    """Pixels (n, p, 2), depth and visibility (n, p), and the pixels' derivatives by the camera's parameters (n, p, 2, k - 1)."""
     pose, K = camera.T_base_camera[0], camera.K
     seen = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = seen[..., 2] > NEAR_M
@@ -192,7 +272,7 @@ def _projected(points: np.ndarray, camera: CameraTrack) -> tuple[np.ndarray, np.
 
 
 def _delayed(values: np.ndarray, frames: float) -> np.ndarray:
-    """A series (n, ...) as it was so many frames before, at rest before it starts and after it ends."""
+    """A series (n, ...) delayed by this many frames, constant before its start and after its end."""
     if frames == 0.0:
         return values
     when = np.clip(np.arange(len(values)) - frames, 0, len(values) - 1)
@@ -207,7 +287,7 @@ def _blurred(maps: np.ndarray, cells: float) -> np.ndarray:
 
 
 def _without_nuisance(equations: Equations) -> Equations:
-    """Equations of the PARAMETERS alone, with the nuisance parameters fitted (Schur complement)."""
+    """Equations of the PARAMETERS alone: the nuisance parameters are eliminated (Schur complement)."""
     a, b = slice(0, PARAMETERS), slice(PARAMETERS, None)
     information, gradient = equations.information, equations.gradient
     known = information[b, b] + np.diag(NUISANCE_PRIOR**-2)
@@ -220,10 +300,10 @@ def _without_nuisance(equations: Equations) -> Equations:
 
 
 class WristView:
-    """A view from a hand: the flow of the scene as measured, in the cells that show an edge and change.
+    """A wrist view: the measured flow of the scene, in cells with an edge and a change.
 
-    Cells near the hand itself are left out: it hides the scene, and its fingers move by themselves. Across an edge flow is
-    known, along it it is a guess: errors are weighted by the picture's gradients.
+    Cells near the hand are left out: it hides the scene, and its fingers move by themselves. Flow is known across an edge
+    and a guess along it, so errors are weighted by the picture's gradients.
     """
 
     def __init__(
@@ -249,12 +329,10 @@ class WristView:
         self.certainty = sharp.astype(np.float64) / error_px[:, None, None] ** 2
 
     def equations(self, theta: np.ndarray, blur: float, wanted: slice = slice(PARAMETERS)) -> Equations:
-        """With one plane of inverse depth for each step, fitted as well.
+        """Normal equations of the `wanted` parameters, zero for the others; each step's plane of inverse depth is fitted.
 
-        Args:
-            wanted: parameters whose equations are computed; those of the others are zero.
+        Flow is not blurred: `blur` has no effect.
         """
-        del blur
         key = theta.tobytes(), wanted.start, wanted.stop
         if key not in self._found:
             self._found[key] = self._equations(theta, np.arange(PARAMETERS)[wanted])
@@ -299,20 +377,18 @@ class WristView:
         return error, slope, self.certainty / (1 + distance)[:, None, None], distance
 
     def _per_step(self, by_depth: np.ndarray, weight: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each step that has cells: projections (s, 3, l) of values (m, 2, l) on the plane of inverse depths, and that
-        plane fitted."""
+        """Projections (s, 3, l) of values (m, 2, l) on each step's plane of inverse depths, and the fitted planes."""
         weighted = (weight @ by_depth[..., None])[..., 0]
         square = self._sums((weighted * by_depth).sum(-1)[:, None, None] * self.plane[:, :, None] * self.plane[:, None])
         cross = self._sums(self.plane[:, :, None] * (weighted[..., None] * values).sum(1)[:, None])
         return cross, np.linalg.solve(square + np.diag(DEPTH_PRIOR**-2), cross)
 
     def _sums(self, values: np.ndarray) -> np.ndarray:
-        """(s, ...) of values (m, ...), whose cells lie step by step."""
+        """Sums (s, ...) over each step of values (m, ...)."""
         return np.add.reduceat(values, self._first, axis=0)
 
     def _seen(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the cells' rays end after the step, as homogeneous pixels (m, 3), and by how much a unit of inverse depth
-        moves these (m, 3)."""
+        """Homogeneous pixels (m, 3) of the cells' rays after the step, and their motion by a unit of inverse depth (m, 3)."""
         camera = moved_camera(self.camera, theta)
         moves = theta[[0, 1, 2, 3, 4, 5, 9]].tobytes()  # the others change K alone
         if moves not in self._steps:
@@ -329,8 +405,7 @@ class WristView:
 
 
 def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (n, 3, 3) and translations (n, 3) [m] of a camera from each of its poses (n + 1, 4, 4) to the next, delayed
-    by so many frames."""
+    """Rotations (n, 3, 3) and translations (n, 3) [m] between successive poses (n + 1, 4, 4), delayed by a number of frames."""
     relative = rigid_inverse(poses[1:]) @ poses[:-1]
     if frames == 0.0:
         return relative[:, :3, :3], relative[:, :3, 3]
@@ -340,7 +415,7 @@ def _steps_between(poses: np.ndarray, frames: float) -> tuple[np.ndarray, np.nda
 
 
 def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Bool (n, r, c): cells that these points (n + 1, p, 3) hide at either end of a step, with a margin."""
+    """Bool (n, r, c): cells hidden by these points (n + 1, p, 3) at either end of a step, with a margin."""
     rows, columns = (np.arange(count) * CELL_PX + (CELL_PX - 1) / 2 for count in shape[1:])
     hidden = np.zeros((shape[0] + 1, *shape[1:]), dtype=bool)
     for i, pose in enumerate(camera.T_base_camera):
@@ -350,3 +425,143 @@ def _covered(camera: CameraTrack, points: np.ndarray, radii: np.ndarray, shape: 
         down, across = (rows[:, None] - uv[ahead, 1]) ** 2, (columns[:, None] - uv[ahead, 0]) ** 2
         hidden[i] = (down[:, None] + across < reach**2).any(-1)
     return hidden[1:] | hidden[:-1]
+
+
+@dataclass(frozen=True)
+class ErrorKind:
+    """One kind of error.
+
+    Attributes:
+        parameters: its place among the PARAMETERS.
+        unit, scale: unit of a report and of all that follows, and its factor from radians, metres or shares.
+        prior: standard deviation of each parameter before any evidence.
+        usual: typical error of a camera that was bumped or badly calibrated.
+        linear: an estimate from the fine maps is final up to this size; beyond it the equations are solved again there.
+        near: beyond this size the coarse maps are solved first.
+        shared_still, shared_wrist: standard deviation of the error common to all episodes of a source, because the robot's
+            shape is simplified and flow is measured too short.
+    """
+
+    parameters: slice
+    unit: str
+    scale: float
+    prior: float
+    usual: float
+    linear: float
+    near: float
+    shared_still: float
+    shared_wrist: float
+
+    def solved(self, equations: Equations, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Information (k, k) on these parameters, and the step (k,) to their best values."""
+        prior = (self.scale / self.prior) ** 2
+        information = equations.information[self.parameters, self.parameters]
+        gradient = equations.gradient[self.parameters] - prior * theta[self.parameters]
+        return information, np.linalg.solve(information + prior * np.eye(len(gradient)), gradient)
+
+
+ERROR_KINDS = {
+    "rotation": ErrorKind(slice(0, 3), "deg", 180 / np.pi, 15.0, 3.0, 1.2, 1.5, 0.35, 1.5),
+    "translation": ErrorKind(slice(3, 6), "mm", 1e3, 300.0, 30.0, 25.0, 30.0, 10.0, 50.0),
+    "focal length": ErrorKind(slice(6, 7), "%", 1e2, 30.0, 5.0, 0.7, 4.0, 0.5, 4.0),
+    "principal point": ErrorKind(slice(7, 9), "%", 1e2, 20.0, 2.0, 2.0, 2.5, 0.7, 3.0),
+    "lag": ErrorKind(slice(9, 10), "frames", 1.0, 3.0, 1.0, 0.3, 0.3, 0.08, 0.2),
+}
+
+
+def estimate_camera_errors(observation: Observation, reading: Reading) -> tuple[CameraError, ...]:
+    """The estimated error of each kind for every view whose pictures show it, under one reading of the conventions."""
+    states, images = reading.steps(observation.num_images)
+    frames, pictures = slice(states.start, states.stop + 1), slice(images.start, images.stop + 1)
+    found: list[CameraError] = []
+    for view in observable_views(observation):
+        camera, motion = reading.cameras[view], observation.motion(view)
+        motion = Motion(motion.flow[images], motion.change[images], motion.texture[images])
+        points = reading.points[frames]
+        if view not in observation.wrists:
+            shape = 1.0 if reading.whole_arms else SHAPE_UNKNOWN
+            found += _estimate(view, StillView(camera, points, reading.radii, motion), shape)
+        elif camera.moving:
+            tool = reading.tools[frames, None, observation.wrists[view], :3, 3]
+            near = np.median(np.linalg.norm(points - tool, axis=-1), axis=0) < HAND_REACH_M
+            camera = replace(camera, T_base_camera=camera.T_base_camera[frames])
+            hand, radii = points[:, near], reading.radii[near]
+            found += _estimate(view, WristView(camera, observation.gray[view][pictures], motion, hand, radii))
+    return tuple(found)
+
+
+def _estimate(view: str, evidence: StillView | WristView, shape: float = 1.0) -> list[CameraError]:
+    """The errors of one view. Where one is large, the equations are solved again at the corrected camera.
+
+    Args:
+        shape: factor on the uncertainty of the robot's shape in a fixed view.
+    """
+    start = np.zeros(PARAMETERS)
+    fine, coarse, found = evidence.equations(start, FINE_CELLS), None, []
+    for name, kind in ERROR_KINDS.items():
+        information, change = kind.solved(fine, start)
+        if not information.any():
+            continue
+        theta, last = start.copy(), fine
+        blurs = (FINE_CELLS, FINE_CELLS)
+        if np.linalg.norm(change) * kind.scale > kind.near:
+            coarse = coarse or evidence.equations(start, COARSE_CELLS)
+            _, change = kind.solved(coarse, start)
+            blurs = (COARSE_CELLS, *blurs)
+        for blur in blurs:
+            size = max(float(np.linalg.norm(change)) * kind.scale, 1e-9)
+            if size < kind.linear:
+                break
+            theta[kind.parameters] += change * min(1.0, 2 * kind.prior / size)
+            last = evidence.equations(theta, blur, kind.parameters)
+            information, change = kind.solved(last, theta)
+        estimate = (theta[kind.parameters] + change) * kind.scale
+        shared = kind.shared_wrist if isinstance(evidence, WristView) else kind.shared_still * shape
+        gain = last.likelihood - fine.likelihood + float(change @ information @ change) / 2
+        information = information / kind.scale**2
+        found.append(CameraError(view, name, kind.unit, estimate, information, gain, kind.prior, shared))
+    return found
+
+
+def combine(episodes: Sequence[Sequence[CameraError]]) -> tuple[CameraError, ...]:
+    """Errors of a source's cameras from those of its episodes; outliers count less, and scatter widens the interval."""
+    groups: dict[tuple[str, str], list[CameraError]] = {}
+    for error in (error for errors in episodes for error in errors):
+        groups.setdefault((error.view, error.kind), []).append(error)
+    found = []
+    for members in groups.values():
+        estimates, weights = np.stack([m.estimate for m in members]), np.stack([m.posterior for m in members])
+        total, mean = weights.sum(axis=0), np.median(estimates, axis=0)
+        apart, trust = np.zeros(len(members)), np.ones(len(members))
+        for _ in range(3):
+            apart = np.einsum("ei,eij,ej->e", estimates - mean, weights, estimates - mean) / len(mean)
+            trust = 1 / (1 + apart / OUTLIER_DEVIATIONS**2)
+            total = np.einsum("e,eij->ij", trust, weights)
+            mean = np.linalg.solve(total, np.einsum("e,eij,ej->i", trust, weights, estimates))
+        scatter = max(1.0, float((trust * apart).sum() / max(trust.sum() - 1, 1.0)))
+        together = replace(members[0], estimate=mean, information=total / scatter)
+        found.append(replace(together, gain=together.deviations**2 / 2))
+    return tuple(found)
+
+
+def significant(errors: Sequence[CameraError], limits: ErrorLimits) -> tuple[CameraError, ...]:
+    """At most one certain and large error for each view: among the kinds that explain its pictures about equally well, the
+    smallest against its usual size."""
+    found: dict[str, list[CameraError]] = {}
+    for error in errors:
+        large = error.size > getattr(limits, error.kind.replace(" ", "_")) and error.gain > 0
+        if large and error.deviations > limits.deviations:
+            found.setdefault(error.view, []).append(error)
+    off = []
+    for kinds in found.values():
+        best = max(error.gain for error in kinds)
+        alike = [error for error in kinds if error.gain >= SIMILAR_GAIN * best]
+        off.append(min(alike, key=lambda error: error.size / ERROR_KINDS[error.kind].usual))
+    return tuple(off)
+
+
+def corrected_camera(camera: CameraTrack, error: CameraError) -> CameraTrack:
+    """The camera without the estimated error."""
+    kind, theta = ERROR_KINDS[error.kind], np.zeros(PARAMETERS)
+    theta[kind.parameters] = error.estimate / kind.scale
+    return moved_camera(camera, theta)

@@ -1,0 +1,478 @@
+"""Evidence for a reading of an episode: terms of a log-likelihood, from its poses and from its pictures.
+
+0 is as in a healthy recording, lower is worse. Poses: rigid mounts, stated mounts, plausible places, kinematics against
+records. Pictures, in a fixed view: the projected motion of the robot's points against optical flow and image change; in a
+wrist view: the flow of the scene that the camera's own motion predicts (rotation exactly, translation up to one depth for
+each step); in any view: the speed of what moves it against the amount of change. Grippers: does 1 mean open?
+
+The typical values are medians over the healthy training episodes of the shipped recordings (the benchmark of the
+calibration doctor prints them). They hold for other recordings as far as these resemble them, so decisions rest on
+differences between readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from worldline_core.calibration.observation import (
+    CELL_PX,
+    Arm,
+    Motion,
+    Observation,
+    Reading,
+    cell_centres,
+    predict_motion,
+)
+from worldline_core.data.episodes.episode import CameraTrack
+from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
+from worldline_core.geometry.rotations import rotation_angle_deg
+from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse
+
+
+class Typical(NamedTuple):
+    """A correlation that healthy recordings reach, and the number of independent samples behind it."""
+
+    value: float
+    samples: float
+
+
+class Spread(NamedTuple):
+    """A correlation that healthy recordings reach, and its standard deviation."""
+
+    value: float
+    spread: float
+
+
+# Poses; standard deviations of healthy recordings, unless they are limits.
+WORST_TERM, WORST_HAND_EYE_TERM, WORST_FACING_TERM = -40.0, -60.0, -15.0
+HAND_EYE_M, HAND_EYE_DEG = 0.002, 0.7
+HAND_EYE_SAMPLES = 20.0
+"""Independent frames behind a hand-eye residual."""
+MOUNT_M, MOUNT_DEG = 0.01, 3.0
+KINEMATICS_M, KINEMATICS_DEG = 0.005, 2.0
+PRINCIPAL_POINT = 0.03
+"""Of its distance from the image centre, in shares of the side."""
+MAX_REACH_M, MAX_CAMERA_M, MAX_WRIST_CAMERA_M = 2.5, 5.0, 0.5
+"""Tool from base, camera from base, wrist camera from its tool."""
+FOLLOWS_COMMANDS_COST = 2.0
+"""Of camera poses that follow the commands rather than the states."""
+FACING_DEG, FACING_SPREAD_DEG = 45.0, 10.0
+"""Between a wrist camera's axis and the direction to its tool."""
+
+# Pictures.
+MIN_IMAGE_PAIRS = 8
+"""Fewer pictures are no evidence."""
+ARM_FLOW, ARM_CHANGE = Typical(0.92, 20), Typical(0.74, 20)
+TOOL_FLOW, TOOL_CHANGE = Typical(0.96, 14), Typical(0.5, 14)
+"""The same where only tool poses are recorded."""
+WRIST_FLOW, WRIST_ENERGY = Typical(0.55, 12), Typical(0.8, 8)
+FINGERS, FINGER_LINKS = Spread(0.75, 0.4), Spread(0.5, 0.3)
+FLOW_TURN_DEG, WORST_TURN_TERM = 8.0, -12.0
+MIN_STEP_PX = 0.7
+"""Smallest predicted motion of a cell that flow is compared with."""
+FOLLOWS_CORRELATION = 0.5
+"""Above it an angle between measured and predicted flow means something."""
+INVERSE_DEPTHS_PER_M = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+"""Of the scene before a wrist camera, tried one by one."""
+MIN_TEXTURE, MIN_CHANGE = 4.0, 5.0
+"""Grey levels: where flow can be measured, and where there is any."""
+LARGEST_FLOW_ERROR_PX = 8.0
+# Grippers.
+MIN_OPENING_RANGE = 0.12
+"""Over the episode: a smaller one moves no finger visibly, and noise stays below."""
+MIN_OPENING_STEP = 0.02
+"""Per frame, of a gripper that moves."""
+FULL_OPENING_STEPS = 16
+"""Steps with a moving gripper for its signs to have their full weight: a few may coincide with something else."""
+FINGER_REACH_M, FINGER_LENGTH_M = 0.06, 0.12
+FULL_CHANGE = 20.0
+"""Grey levels from which a cell has its full weight."""
+MIN_FINGER_STEP_PX = 0.15
+STOPPED_GAP, STOPPED_STEP = 0.1, 0.01
+"""A stopped gripper: opening away from its command by more, and changing by less per frame."""
+STOPPED_TERM, LARGEST_DEVIATIONS = -10.0, 4.0
+
+
+def pose_terms(observation: Observation, reading: Reading) -> dict[str, float]:
+    """Log-likelihood terms of the poses by name; a term of a view ends with the view's name."""
+    terms = {"workspace": _workspace(reading)}
+    if observation.episode.state_kind == "joints":
+        terms["joint range"] = _joint_range(observation, reading)
+    if reading.kinematic_tools is not None:
+        terms["kinematics"] = _kinematics(reading.kinematic_tools, reading.tools)
+    for view, camera in reading.cameras.items():
+        terms[f"intrinsics {view}"] = _intrinsics(camera)
+        terms[f"camera place {view}"] = _place(camera.T_base_camera)
+        if view in observation.wrists:
+            i = observation.wrists[view]
+            terms |= _wrist(reading, camera, i, observation.arms[i])
+        else:
+            terms[f"in view {view}"] = -30.0 * max(0.0, 0.6 - in_view_share(reading, camera))
+            terms[f"upright {view}"] = _upright(camera)
+    return terms
+
+
+def rms_hand_eye(T_base_tool: np.ndarray, T_base_camera: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Mean mount (4, 4), and root mean square deviation from it, [m] and [deg]."""
+    mount, metres, degrees = hand_eye_residual(T_base_tool, T_base_camera)
+    return mount, float(np.sqrt((metres**2).mean())), float(np.sqrt((degrees**2).mean()))
+
+
+def hand_eye_log_likelihood(metres: float, degrees: float) -> float:
+    """Log-likelihood of a hand-eye residual, heavy-tailed because frames of one recording are not independent."""
+    value = (metres / HAND_EYE_M) ** 2 + (degrees / HAND_EYE_DEG) ** 2
+    return max(WORST_HAND_EYE_TERM, -HAND_EYE_SAMPLES / 2 * float(np.log1p(value)))
+
+
+def _quadratic(*ratios: float) -> float:
+    return max(WORST_TERM, -0.5 * float(sum(ratio**2 for ratio in ratios)))
+
+
+def _wrist(reading: Reading, camera: CameraTrack, i: int, arm: Arm) -> dict[str, float]:
+    view = camera.view
+    poses = camera.poses(np.arange(len(reading.tools)))
+    mount, metres, degrees = rms_hand_eye(reading.tools[:, i], poses)
+    residual_term = hand_eye_log_likelihood(metres, degrees)
+    if reading.action_tools is not None:
+        _, by_action_m, by_action_deg = rms_hand_eye(reading.action_tools[:, i], poses)
+        followed = hand_eye_log_likelihood(by_action_m, by_action_deg) - FOLLOWS_COMMANDS_COST
+        residual_term = max(residual_term, followed)
+    terms = {f"hand-eye {view}": residual_term}
+    if arm.T_tool_mount is not None:
+        offset, turned = mount_offset(mount, arm.T_tool_mount)
+        terms[f"mount {view}"] = _quadratic(offset / MOUNT_M, turned / MOUNT_DEG)
+    # Wherever it is mounted, a wrist camera is near its tool and looks at it.
+    tool = rigid_inverse(mount)[:3, 3]
+    distance = float(np.linalg.norm(tool))
+    off_axis = float(np.degrees(np.arctan2(np.hypot(tool[0], tool[1]), tool[2])))
+    far = max(0.0, np.log(max(distance, 1e-6) / MAX_WRIST_CAMERA_M)) / 0.2
+    aside = max(0.0, off_axis - FACING_DEG) / FACING_SPREAD_DEG
+    terms[f"faces its tool {view}"] = max(WORST_FACING_TERM, _quadratic(far, aside))
+    return terms
+
+
+def mount_offset(mount: np.ndarray, stated: np.ndarray) -> tuple[float, float]:
+    """Distance and angle between two mounts (4, 4), [m] and [deg]."""
+    return (
+        float(np.linalg.norm(mount[:3, 3] - stated[:3, 3])),
+        float(rotation_angle_deg(mount[:3, :3].T @ stated[:3, :3])),
+    )
+
+
+def _intrinsics(camera: CameraTrack) -> float:
+    u, v = principal_point_offset(camera.K, camera.width, camera.height)
+    fields = fields_of_view_deg(camera.K, camera.width, camera.height)
+    odd = max(0.0, (20.0 - min(fields)) / 3, (max(fields) - 140.0) / 5)
+    return _quadratic(u / PRINCIPAL_POINT, v / PRINCIPAL_POINT, odd)
+
+
+def principal_point_offset(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
+    """Offset from the image centre along u and v, in shares of the image side."""
+    return float((K[0, 2] - (width - 1) / 2) / width), float((K[1, 2] - (height - 1) / 2) / height)
+
+
+def fields_of_view_deg(K: np.ndarray, width: int, height: int) -> tuple[float, float]:
+    """Horizontal and vertical field of view."""
+    return (
+        float(np.degrees(2 * np.arctan2(width, 2 * K[0, 0]))),
+        float(np.degrees(2 * np.arctan2(height, 2 * K[1, 1]))),
+    )
+
+
+def _place(T_base_camera: np.ndarray) -> float:
+    distance = float(np.median(np.linalg.norm(T_base_camera[:, :3, 3], axis=1)))
+    return _quadratic(max(0.0, np.log(max(distance, 1e-6) / MAX_CAMERA_M)) / 0.2)
+
+
+def in_view_share(reading: Reading, camera: CameraTrack) -> float:
+    """Share of frames with some arm's tool in the picture, in front of the camera."""
+    poses = camera.poses(np.arange(len(reading.tools)))
+    inside = np.zeros(len(reading.tools), dtype=bool)
+    for i in range(reading.tools.shape[1]):
+        uv, depth = project_points(reading.tools[:, i, :3, 3], camera.K, poses)
+        inside |= (depth > MIN_DEPTH_M) & inside_image(uv, (camera.height, camera.width))
+    return float(inside.mean())
+
+
+def _upright(camera: CameraTrack) -> float:
+    """Low where the image's down is the base's up: pictures are taken the right way up."""
+    up = float(np.median(camera.T_base_camera[:, 2, 1]))
+    return -6.0 * float(np.clip((up - 0.2) / 0.3, 0.0, 1.0))
+
+
+def _workspace(reading: Reading) -> float:
+    distance = np.linalg.norm(reading.tools[..., :3, 3], axis=-1)
+    return WORST_TERM * float((distance > MAX_REACH_M).mean())
+
+
+def _joint_range(observation: Observation, reading: Reading) -> float:
+    """Joint positions beyond the robot's limits, or beyond two turns where no limits are known."""
+    state = reading.episode.state.astype(np.float64)
+    if observation.kinematics is not None:
+        outside = observation.kinematics.embodiment.outside_limits(state, tolerance_rad=0.1)
+    else:
+        outside = np.abs(state) > 4 * np.pi
+    return WORST_TERM * float(np.clip(outside.any(axis=1).mean(), 0.0, 1.0))
+
+
+def _kinematics(by_joints: np.ndarray, recorded: np.ndarray) -> float:
+    """Median distance over frames of recorded tool poses from those of the joints, for the worst arm."""
+    apart = rigid_inverse(by_joints) @ recorded
+    metres = np.median(np.linalg.norm(apart[..., :3, 3], axis=-1), axis=0).max()
+    degrees = np.median(rotation_angle_deg(apart[..., :3, :3]), axis=0).max()
+    return _quadratic(float(metres) / KINEMATICS_M, float(degrees) / KINEMATICS_DEG)
+
+
+def image_terms(observation: Observation, reading: Reading, *, wrist_flow: bool = True) -> dict[str, float]:
+    """Log-likelihood terms of the pictures by name; a term of a view ends with the view's name.
+
+    The set of terms does not depend on the reading, so that readings can be compared.
+
+    Args:
+        wrist_flow: whether to compute the most expensive term, the flow in wrist views.
+    """
+    terms = {}
+    for view in observable_views(observation):
+        if view in observation.wrists and wrist_flow:
+            flow = wrist_flow_agreement(observation, reading, view)
+            terms[f"wrist flow {view}"] = correlation_log_likelihood(flow, WRIST_FLOW)
+        elif view not in observation.wrists:
+            flow, change, turn_deg = still_view_agreement(observation, reading, view)
+            terms[f"turn {view}"] = turn_log_likelihood(turn_deg)
+            terms[f"flow {view}"] = correlation_log_likelihood(flow, ARM_FLOW if reading.whole_arms else TOOL_FLOW)
+            terms[f"change {view}"] = correlation_log_likelihood(
+                change, ARM_CHANGE if reading.whole_arms else TOOL_CHANGE
+            )
+        terms[f"energy {view}"] = correlation_log_likelihood(
+            energy_correlation(observation, reading, view), WRIST_ENERGY
+        )
+    return terms
+
+
+def observable_views(observation: Observation) -> list[str]:
+    """Calibrated views with enough pictures and motion; those of no hand must stand still."""
+    return [
+        view
+        for view in observation.episode.cameras
+        if len(observation.gray.get(view, ())) > MIN_IMAGE_PAIRS
+        and (view in observation.wrists or observation.stands_still(view))
+        and observation.motion(view).moves
+    ]
+
+
+def correlation_log_likelihood(correlation: float, typical: Typical) -> float:
+    """Log-likelihood of a Gaussian residual with this correlation, relative to a typical recording; flat below 0."""
+    r = float(np.clip(correlation, 0.0, 0.995))
+    return typical.samples / 2 * float(np.log(1 - typical.value**2) - np.log(1 - r**2))
+
+
+def turn_log_likelihood(turn_deg: float) -> float:
+    """Log-likelihood of an angle between measured and predicted flow."""
+    return max(WORST_TURN_TERM, -0.5 * (turn_deg / FLOW_TURN_DEG) ** 2)
+
+
+def still_view_agreement(observation: Observation, reading: Reading, view: str) -> tuple[float, float, float]:
+    """Agreement of a fixed view with the robot's predicted motion.
+
+    Returns:
+        Correlation of predicted with measured flow where motion is predicted; correlation of predicted with measured
+        change; angle [deg] by which the flow is turned as a whole, 0 where it does not follow at all. All 0 without
+        predicted motion in the picture.
+    """
+    states, images = reading.steps(observation.num_images)
+    motion, predicted = observation.motion(view), reading.predicted(view)
+    step, vector = predicted.step[states], predicted.vector[states]
+    flow, change = motion.flow[images], motion.change[images]
+    moving = step > MIN_STEP_PX
+    if moving.sum() < 20:
+        return 0.0, 0.0, 0.0
+    measured, expected = flow[moving], vector[moving]
+    # One outlier of a hundred pixels must not outweigh a thousand cells.
+    expected = expected * np.minimum(1.0, 20.0 / np.maximum(lengths(expected)[:, None], 1e-9))
+    agreement = cosine(measured, expected)
+    across = cosine(measured, np.stack([-expected[:, 1], expected[:, 0]], axis=-1))
+    follows = np.hypot(agreement, across) > FOLLOWS_CORRELATION
+    turn_deg = float(np.degrees(np.arctan2(across, agreement))) if follows else 0.0
+    x, y = np.log1p(np.minimum(step, 20.0)).ravel(), np.log1p(change).ravel()
+    if x.std() < 1e-9 or y.std() < 1e-9:
+        return agreement, 0.0, turn_deg
+    return agreement, float(np.corrcoef(x, y)[0, 1]), turn_deg
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Cosine of the angle between two arrays taken as vectors; 0 where one vanishes."""
+    norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    return float((a * b).sum()) / norm if norm > 1e-9 else 0.0
+
+
+def wrist_flow_agreement(observation: Observation, reading: Reading, view: str) -> float:
+    """Correlation of measured flow with the one that the camera's motion predicts, on cells that show a change."""
+    camera, motion = reading.cameras[view], observation.motion(view)
+    states, images = reading.steps(observation.num_images)
+    if not camera.moving:
+        return 0.0
+    key = b"".join((camera.T_base_camera.tobytes(), camera.K.tobytes(), repr((states, images)).encode()))
+    if key not in motion.agreements:
+        motion.agreements[key] = _wrist_flow_agreement(camera, motion, states, images)
+    return motion.agreements[key]
+
+
+def _wrist_flow_agreement(camera: CameraTrack, motion: Motion, states: slice, images: slice) -> float:
+    poses = camera.T_base_camera
+    T_next_this = (rigid_inverse(poses[1:]) @ poses[:-1])[states]
+    keep = (motion.texture[images] > MIN_TEXTURE) & (motion.change[images] > MIN_CHANGE)
+    centres, inverse_depths = cell_centres(camera.height, camera.width), np.array(INVERSE_DEPTHS_PER_M)
+    rays = np.concatenate([centres, np.ones((*centres.shape[:2], 1))], axis=-1) @ np.linalg.inv(camera.K).T
+    measured, expected = [], []
+    for T, flow, cells in zip(T_next_this, motion.flow[images], keep, strict=True):
+        if cells.sum() < 3:
+            continue
+        turned = rays[cells] @ T[:3, :3].T
+        moved = (turned[None] + inverse_depths[:, None, None] * T[:3, 3]) @ camera.K.T
+        ahead = moved[..., 2:] > 0.1
+        step = np.where(ahead, moved[..., :2] / np.where(ahead, moved[..., 2:], 1.0) - centres[cells], 0.0)
+        error = np.minimum(lengths(step - flow[cells]), LARGEST_FLOW_ERROR_PX).sum(axis=1)
+        best = step[error.argmin()]
+        expected.append(best * np.minimum(1.0, 20.0 / np.maximum(lengths(best)[:, None], 1e-9)))
+        measured.append(flow[cells])
+    if sum(len(cells) for cells in measured) < 50:
+        return 0.0
+    return cosine(np.concatenate(measured), np.concatenate(expected))
+
+
+def energy_correlation(observation: Observation, reading: Reading, view: str) -> float:
+    """Correlation over time of the speed of what moves a view (its own arm, or the fastest) with its mean change."""
+    states, images = reading.steps(observation.num_images)
+    own = observation.wrists.get(view)
+    speed = (reading.tool_speed.max(axis=1) if own is None else reading.tool_speed[:, own])[states]
+    return correlation(speed, observation.motion(view).mean_change[images])
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's, 0 where one does not vary."""
+    if len(a) < 8 or a.std() < 1e-9 or b.std() < 1e-9:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def gripper_terms(observation: Observation, reading: Reading) -> dict[str, float]:
+    """Log-likelihood terms of the grippers by name; none where none moves."""
+    terms = {}
+    for i, arm in enumerate(observation.arms):
+        for name, found, typical in _signs(observation, reading, i):
+            terms[f"{name} {arm.wrist_view}"] = _weight(reading, i) * _log_likelihood(found, typical)
+        stopped = stopped_share(reading, i)
+        if stopped is not None:
+            terms[f"stopped gripper {arm.name}"] = STOPPED_TERM * (1 - stopped)
+    return terms
+
+
+def inversion_gain(observation: Observation, reading: Reading) -> float:
+    """Approximate gain of the terms if 1 meant closed: every correlation changes its sign."""
+    gain = 0.0
+    for i in range(len(observation.arms)):
+        for _, found, typical in _signs(observation, reading, i):
+            gain += _weight(reading, i) * (_log_likelihood(-found, typical) - _log_likelihood(found, typical))
+        stopped = stopped_share(reading, i)
+        gain += 0.0 if stopped is None else STOPPED_TERM * (2 * stopped - 1)
+    return gain
+
+
+def _signs(observation: Observation, reading: Reading, arm: int) -> list[tuple[str, float, Spread]]:
+    """(name, correlation, typical value) of what the pictures show of the fingers."""
+    away, along = finger_flow(observation, reading, arm), finger_agreement(observation, reading, arm)
+    return [
+        (name, found, typical)
+        for name, found, typical in (("fingers", away, FINGERS), ("finger links", along, FINGER_LINKS))
+        if found is not None
+    ]
+
+
+def _weight(reading: Reading, arm: int) -> float:
+    """Weight (0..1) of a gripper's signs, by its number of moving steps; the same for all readings."""
+    if reading.gripper is None:
+        return 0.0
+    moving = np.abs(np.diff(reading.gripper[:, arm])) > MIN_OPENING_STEP
+    return min(1.0, float(moving.sum()) / FULL_OPENING_STEPS)
+
+
+def _log_likelihood(correlation: float, typical: Spread) -> float:
+    return -0.5 * min(((correlation - typical.value) / typical.spread) ** 2, LARGEST_DEVIATIONS**2)
+
+
+def finger_agreement(observation: Observation, reading: Reading, arm: int) -> float | None:
+    """Correlation (-1..1) of measured flow with that of the finger links by kinematics, in the wrist view.
+
+    None without a moving gripper, or without known finger joints.
+    """
+    view = observation.arms[arm].wrist_view
+    kinematics = observation.kinematics
+    if kinematics is None or not kinematics.embodiment.arms[arm].gripper.finger_joints or not reading.whole_arms:
+        return None
+    if not _moves(observation, reading, arm):
+        return None
+    camera, tool = reading.cameras[view], reading.tools[:, arm, :3, 3]
+    near = np.median(lengths(reading.points - tool[:, None]), axis=0) < FINGER_LENGTH_M
+    T_camera_base = rigid_inverse(camera.poses(np.arange(len(tool))))
+    points = reading.points[:, near] @ np.swapaxes(T_camera_base[:, :3, :3], 1, 2) + T_camera_base[:, None, :3, 3]
+    fixed = replace(camera, T_base_camera=np.eye(4)[None])
+    predicted = predict_motion(points, reading.radii[near], fixed)
+    states, images = reading.steps(observation.num_images)
+    moving = predicted.step[states] > MIN_FINGER_STEP_PX
+    if moving.sum() < 10:
+        return 0.0  # whether there is a term must not depend on the reading
+    return cosine(observation.motion(view).flow[images][moving], predicted.vector[states][moving])
+
+
+def _moves(observation: Observation, reading: Reading, arm: int) -> bool:
+    """Whether a gripper moves in front of its own camera."""
+    view = observation.arms[arm].wrist_view
+    if reading.gripper is None or view not in observation.gray or view not in reading.cameras:
+        return False
+    return bool(np.ptp(reading.gripper[:, arm]) >= MIN_OPENING_RANGE) and len(observation.gray[view]) > MIN_IMAGE_PAIRS
+
+
+def finger_flow(observation: Observation, reading: Reading, arm: int) -> float | None:
+    """Correlation (-1..1) of the flow away from the projected tool point, near it, with the growth of the opening."""
+    view = observation.arms[arm].wrist_view
+    if reading.gripper is None or not _moves(observation, reading, arm):
+        return None
+    opening = np.diff(reading.gripper[:, arm])
+    states, images = reading.steps(observation.num_images)
+    motion, camera = observation.motion(view), reading.cameras[view]
+    poses = camera.poses(np.arange(len(reading.tools)))
+    uv, depth = project_points(reading.tools[:, arm, :3, 3], camera.K, poses)
+    point, near = np.median(uv, axis=0), float(np.median(depth))
+    if near < 0.01 or not np.isfinite(point).all():
+        return 0.0
+    away = cell_centres(camera.height, camera.width) - point
+    distance = lengths(away)
+    close = (distance < camera.K[0, 0] * FINGER_REACH_M / near) & (distance > CELL_PX / 4)
+    if close.sum() < 4:
+        return 0.0
+    outward = (motion.flow[images] * (away / np.maximum(distance, 1.0)[..., None])).sum(-1)
+    weight = close * np.minimum(motion.change[images], FULL_CHANGE) / FULL_CHANGE
+    spread, growth = (outward * weight).sum(axis=(1, 2)), opening[states]
+    moves = np.abs(growth) > MIN_OPENING_STEP
+    # Over all steps, flow that comes without a moving finger counts against; over the others it does not.
+    return (cosine(spread, growth) + cosine(spread[moves], growth[moves])) / 2
+
+
+def stopped_share(reading: Reading, arm: int) -> float | None:
+    """Share of frames with a gripper more open than its command, among those in which it rests away from it.
+
+    An object stops a closing gripper, never an opening one.
+    """
+    if reading.gripper is None or reading.gripper_command is None:
+        return None
+    opening, command = reading.gripper[:, arm], reading.gripper_command[:, arm]
+    gap = opening - command
+    rests = (
+        (np.abs(np.gradient(opening)) < STOPPED_STEP)
+        & (np.abs(gap) > STOPPED_GAP)
+        & (np.abs(np.gradient(command)) < STOPPED_STEP)
+    )
+    return float((gap[rests] > 0).mean()) if rests.sum() >= 4 else None
