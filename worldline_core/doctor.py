@@ -1,4 +1,4 @@
-"""What this machine can do: cores, memory, accelerators, codecs, GL, weights, Prefect."""
+"""Checks of `worldline doctor`: cores, memory, accelerators, codecs, GL, weights, Prefect."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import platform
 import shutil
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,14 +17,25 @@ from typing import Literal
 from worldline_core.errors import installing
 from worldline_core.shipped import SHIPPED, project_path
 
+EXTRAS = {
+    "mujoco": "sim (worldline record)",
+    "h5py": "hdf5 (HDF5 sources)",
+    "s3fs": "s3 (S3 object stores)",
+    "gymnasium": "gym (Gymnasium environments)",
+    "msgpack": "serve (worldline serve, play)",
+}
+SHIPPED_MODELS = ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter")
+PUBLISHED_MODELS = (
+    "nvidia/Cosmos3-Nano",
+    "facebook/vjepa2-vitg-fpc64-384",
+    "facebook/sam3",
+    "Qwen/Qwen3-VL-8B-Instruct",
+)
+
 
 @dataclass(frozen=True)
 class MachineCheck:
-    """One property of the machine, checked.
-
-    Attributes:
-        next_step: what the user can do about it; empty where nothing need be done.
-    """
+    """One property of the machine, checked; ``next_step`` is empty where nothing need be done."""
 
     name: str
     status: Literal["ok", "missing", "optional"]
@@ -31,25 +43,18 @@ class MachineCheck:
     next_step: str = ""
 
 
+def _check(name: str, good: bool, found: str, next_step: str = "", *, optional: bool = False) -> MachineCheck:
+    status = "ok" if good else "optional" if optional else "missing"
+    return MachineCheck(name, status, found, "" if good else next_step)
+
+
 def examine_machine(project: Path) -> list[MachineCheck]:
-    """What the project needs, in the order of a report."""
-    return [
-        _system(),
-        _memory(),
-        _disk(project),
-        _accelerator(),
-        _bfloat16(),
-        _codec(),
-        _decoder(),
-        *_packages(),
-        _software_gl(),
-        *_weights(project),
-        _prefect_api(),
-    ]
+    """The project's requirements, in the order of a report."""
+    return [*_hardware(project), *_libraries(), *_weights(project), _prefect_api()]
 
 
 def format_findings(findings: list[MachineCheck]) -> str:
-    """A table for people."""
+    """The checks as a table, and below it what can be done."""
     marks = {"ok": "ok      ", "missing": "MISSING ", "optional": "optional"}
     width = max(len(finding.name) for finding in findings)
     lines = [f"{marks[finding.status]} {finding.name:<{width}}  {finding.found}" for finding in findings]
@@ -57,147 +62,73 @@ def format_findings(findings: list[MachineCheck]) -> str:
     return "\n".join(lines + (["", "What you can do:", *advice] if advice else []))
 
 
-def _system() -> MachineCheck:
+def _hardware(project: Path) -> Iterator[MachineCheck]:
+    import torch
+
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return MachineCheck(
-        "system", "ok", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores"
-    )
-
-
-def _memory() -> MachineCheck:
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    advice = "" if total >= 6 else "the tiny preset needs about 6 GiB; lower batch sizes with --set"
-    return MachineCheck("memory", "ok" if total >= 6 else "missing", f"{total:.1f} GiB", advice)
-
-
-def _disk(project: Path) -> MachineCheck:
+    system = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores"
+    yield MachineCheck("system", "ok", system)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    advice = "the tiny preset needs about 6 GiB; lower batch sizes with --set"
+    yield _check("memory", memory >= 6, f"{memory:.1f} GiB", advice)
     free = shutil.disk_usage(project).free / 2**30
-    return MachineCheck(
-        "disk", "ok" if free >= 10 else "missing", f"{free:.0f} GiB free", "" if free >= 10 else "free some space"
-    )
+    yield _check("disk", free >= 10, f"{free:.0f} GiB free", "free some space")
+    found, present = f"none; torch {torch.__version__} on the CPU", torch.cuda.is_available()
+    if present:
+        card = torch.cuda.get_device_properties(0)
+        found = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, torch {torch.__version__}"
+    advice = "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more"
+    yield _check("accelerator", present, found, advice, optional=True)
+    wide = bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
+    fast = wide and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    yield _check("CPU bfloat16", fast, "native" if fast else "emulated: training is slower", optional=True)
 
 
-def _accelerator() -> MachineCheck:
-    import torch
-
-    if torch.cuda.is_available():
-        properties = torch.cuda.get_device_properties(0)
-        return MachineCheck(
-            "accelerator",
-            "ok",
-            f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}",
-        )
-    return MachineCheck(
-        "accelerator", "optional", f"none; torch {torch.__version__} on the CPU",
-        "the tiny preset needs none; cosmos3-nano wants a CUDA GPU with 80 GiB or more",
-    )  # fmt: skip
-
-
-def _bfloat16() -> MachineCheck:
-    import torch
-
-    fast = (
-        bool(torch.backends.cpu.get_cpu_capability().startswith("AVX512"))
-        and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    )
-    return MachineCheck(
-        "CPU bfloat16", "ok" if fast else "optional", "native" if fast else "emulated: training is slower"
-    )
-
-
-def _codec() -> MachineCheck:
+def _libraries() -> Iterator[MachineCheck]:
     import av
 
-    missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
-    if missing:
-        return MachineCheck(
-            "video codecs", "missing", f"PyAV {av.__version__} without {', '.join(missing)}", "reinstall av from PyPI"
-        )
-    return MachineCheck("video codecs", "ok", f"PyAV {av.__version__}: H.264, AV1 decode")
-
-
-def _decoder() -> MachineCheck:
     from worldline_core.data.video.frame_decoder import describe_decoders
 
-    found = describe_decoders()
-    status = "optional" if found["next_step"] else "ok"
-    reason = f" (torchcodec: {found['torchcodec']})" if found["next_step"] else ""
-    return MachineCheck("clip decoder", status, f"auto takes {found['auto']}{reason}", found["next_step"])
-
-
-def _packages() -> list[MachineCheck]:
-    extras = {
-        "mujoco": "sim (worldline record)",
-        "h5py": "hdf5 (HDF5 sources)",
-        "s3fs": "s3 (S3 object stores)",
-        "gymnasium": "gym (Gymnasium environments)",
-        "msgpack": "serve (worldline serve, play)",
-    }
-    findings = []
-    for package, purpose in extras.items():
+    missing = [name for name in ("libx264", "libdav1d") if name not in av.codecs_available]
+    found = f"PyAV {av.__version__}" + (f" without {', '.join(missing)}" if missing else ": H.264, AV1 decode")
+    yield _check("video codecs", not missing, found, "reinstall av from PyPI")
+    decoders = describe_decoders()
+    advice = decoders["next_step"]
+    found = f"auto takes {decoders['auto']}" + (f" (torchcodec: {decoders['torchcodec']})" if advice else "")
+    yield _check("clip decoder", not advice, found, advice, optional=True)
+    for package, purpose in EXTRAS.items():
         present = importlib.util.find_spec(package) is not None
-        advice = "" if present else installing(purpose.split()[0])
-        findings.append(
-            MachineCheck(
-                f"extra {purpose}", "ok" if present else "optional", "installed" if present else "absent", advice
-            )
-        )
-    return findings
-
-
-def _software_gl() -> MachineCheck:
+        advice = installing(purpose.split()[0])
+        yield _check(f"extra {purpose}", present, "installed" if present else "absent", advice, optional=True)
     libraries = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
-    if libraries:
-        return MachineCheck("headless GL", "ok", ", ".join(libraries))
-    return MachineCheck(
-        "headless GL",
-        "optional",
-        "none",
-        "only `worldline record` needs it: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri",
-    )
+    advice = "only `worldline record` needs it: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+    yield _check("headless GL", bool(libraries), ", ".join(libraries) or "none", advice, optional=True)
 
 
-def _weights(project: Path) -> list[MachineCheck]:
-    findings = []
-    for name in ("tokenizer", "teacher", "base", "stage2", "causal", "segmenter"):
+def _weights(project: Path) -> Iterator[MachineCheck]:
+    for name in SHIPPED_MODELS:
         folder = project_path(project, SHIPPED / "models" / name)
         present = any(folder.glob("*.safetensors"))
-        findings.append(
-            MachineCheck(
-                f"weights {name}",
-                "ok" if present else "missing",
-                str(folder.relative_to(project) if folder.is_relative_to(project) else folder) if present else "absent",
-                "" if present else "they come with a checkout, and with pip install 'worldline[assets]'",
-            )
-        )
+        place = folder.relative_to(project) if folder.is_relative_to(project) else folder
+        advice = "they come with a checkout, and with pip install 'worldline[assets]'"
+        yield _check(f"weights {name}", present, str(place) if present else "absent", advice)
     hub = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")) / "hub"
-    for repository in (
-        "nvidia/Cosmos3-Nano",
-        "facebook/vjepa2-vitg-fpc64-384",
-        "facebook/sam3",
-        "Qwen/Qwen3-VL-8B-Instruct",
-    ):
+    for repository in PUBLISHED_MODELS:
         present = (hub / f"models--{repository.replace('/', '--')}").is_dir()
-        findings.append(
-            MachineCheck(f"weights {repository}", "ok" if present else "optional", "in the local hub cache" if present else "absent",
-                     "" if present else "only the full-size preset needs it; download it where a hub is reachable")
-        )  # fmt: skip
-    return findings
+        found = "in the local hub cache" if present else "absent"
+        advice = "only the full-size preset needs it; download it where a hub is reachable"
+        yield _check(f"weights {repository}", present, found, advice, optional=True)
 
 
 def _prefect_api() -> MachineCheck:
-    url = os.environ.get("PREFECT_API_URL")
+    name, url = "Prefect API", os.environ.get("PREFECT_API_URL")
     if not url:
-        return MachineCheck("Prefect API", "ok", "none set: flows start a temporary server")
+        return MachineCheck(name, "ok", "none set: flows start a temporary server")
     if not url.startswith(("http://", "https://")):
-        return MachineCheck("Prefect API", "missing", url, "PREFECT_API_URL must start with http:// or https://")
+        return MachineCheck(name, "missing", url, "PREFECT_API_URL must start with http:// or https://")
     try:
         with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=3) as answer:  # noqa: S310 - scheme checked above
-            return MachineCheck("Prefect API", "ok", f"{url} answers {answer.status}")
+            return MachineCheck(name, "ok", f"{url} answers {answer.status}")
     except (urllib.error.URLError, TimeoutError) as error:
-        return MachineCheck(
-            "Prefect API",
-            "missing",
-            f"{url}: {error}",
-            "start it with `prefect server start`, or unset PREFECT_API_URL",
-        )
+        advice = "start it with `prefect server start`, or unset PREFECT_API_URL"
+        return MachineCheck(name, "missing", f"{url}: {error}", advice)

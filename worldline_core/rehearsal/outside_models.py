@@ -1,20 +1,17 @@
-"""The models of others that the full-size preset needs, written small with random weights.
+"""Small random-weight versions of the outside models that the full-size preset needs.
 
-Each folder has what its publisher's has: the same classes of diffusers and transformers wrote it, in the same files (sharded
-weights with their index, configuration, processors, tokenizer). Sizes alone differ; LPIPS keeps its size, which is small
-and not a matter of configuration. Whoever reads them cannot tell them from the published ones, and predicts nothing.
+The same classes of diffusers and transformers write them, in the same files as the published ones (sharded weights with their
+index, configuration, processors, tokenizer). Sizes alone differ; LPIPS keeps its own, which is small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from worldline_core.errors import UnavailableError
 from worldline_core.model.cosmos3 import SINGLE
 from worldline_core.model.lpips import BACKBONE_FILE, HEADS_FILE, LAYERS
 from worldline_core.model.text import SYSTEM_PROMPT, VISION_START
@@ -24,17 +21,9 @@ SHARD = "100KB"
 """Largest file of weights: small enough that every model of several files has an index."""
 
 TRANSFORMER: dict[str, Any] = {
-    "head_dim": 16,
-    "hidden_size": 32,
-    "intermediate_size": 48,
-    "num_attention_heads": 2,
-    "num_hidden_layers": 4,
-    "num_key_value_heads": 1,
-    "rope_axes_dim": (4, 2, 2),
-    "vocab_size": 1024,
-    "action_dim": 8,
-    "num_embodiment_domains": 2,
-}
+    "head_dim": 16, "hidden_size": 32, "intermediate_size": 48, "num_attention_heads": 2, "num_hidden_layers": 4,
+    "num_key_value_heads": 1, "rope_axes_dim": (4, 2, 2), "vocab_size": 1024, "action_dim": 8, "num_embodiment_domains": 2,
+}  # fmt: skip
 _WORDS = (
     f"{SYSTEM_PROMPT} system user assistant The video is 4.3 seconds long and is of 30 FPS. This video is of 480x640 "
     "resolution. lift place push press the red green blue yellow orange purple block can tray drawer button on pad closed "
@@ -50,43 +39,12 @@ _CHAT = (
 )
 
 
-@dataclass(frozen=True)
-class OutsideModel:
-    """One published folder.
-
-    Attributes:
-        name: what it is.
-        published: where its publisher has it.
-        folder: its name under a preset's ``weights/``.
-        write: makes the small one in a folder.
-    """
-
-    name: str
-    published: str
-    folder: str
-    write: Callable[[Path], None]
-
-
-def write_outside_models(weights: Path, models: Sequence[OutsideModel] | None = None) -> None:
-    """Write small random-weight versions below ``weights``, the same bytes every time.
-
-    Raises:
-        UnavailableError: one of them cannot be made with the libraries that are installed; the message names it.
-    """
-    for model in OUTSIDE_MODELS if models is None else models:
+def write_outside_models(weights: Path) -> None:
+    """Write small random-weight versions below ``weights``, the same bytes every time."""
+    for name, write in OUTSIDE_MODELS.items():
         torch.manual_seed(0)
-        folder = weights / model.folder
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            model.write(folder)
-        except (ImportError, TypeError, ValueError, RuntimeError, AttributeError, KeyError, OSError) as error:
-            raise UnavailableError(
-                f"{model.name} cannot be made small, so it cannot be rehearsed",
-                where=folder,
-                expected=f"the classes that read {model.published}",
-                got=f"{type(error).__name__}: {error}",
-                next_step="compare the installed diffusers and transformers with those of uv.lock",
-            ) from error
+        (weights / name).mkdir(parents=True, exist_ok=True)
+        write(weights / name)
 
 
 def write_qwen2_tokenizer(folder: Path) -> Any:
@@ -252,10 +210,11 @@ def write_lpips(folder: Path) -> None:
     torch.save(heads, folder / HEADS_FILE)
 
 
-OUTSIDE_MODELS = (
-    OutsideModel("Cosmos3", "nvidia/Cosmos3-Nano", "Cosmos3-Nano", write_cosmos3),
-    OutsideModel("V-JEPA 2", "facebook/vjepa2-vitg-fpc64-384", "vjepa2-vitg-fpc64-384", write_vjepa2),
-    OutsideModel("SAM 3", "facebook/sam3", "sam3", write_sam3),
-    OutsideModel("Qwen3-VL", "Qwen/Qwen3-VL-8B-Instruct", "Qwen3-VL-8B-Instruct", write_qwen3_vl),
-    OutsideModel("LPIPS", "torchvision and richzhang/PerceptualSimilarity", "lpips", write_lpips),
-)
+OUTSIDE_MODELS: dict[str, Callable[[Path], None]] = {
+    "Cosmos3-Nano": write_cosmos3,
+    "vjepa2-vitg-fpc64-384": write_vjepa2,
+    "sam3": write_sam3,
+    "Qwen3-VL-8B-Instruct": write_qwen3_vl,
+    "lpips": write_lpips,
+}
+"""Writers by the names of the published folders, as presets name them."""

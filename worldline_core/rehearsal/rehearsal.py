@@ -1,5 +1,5 @@
-"""A preset at small size: the same file with sizes changed, each change listed, over small models, and over shipped
-recordings at the rate and length of real ones, with three views and with two."""
+"""A preset at small size: the same file with listed changes of size, small models, and shipped recordings at the rate and
+length of real ones, with three views and with two."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,13 @@ from worldline_core.pipeline.ablations import choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models
 from worldline_core.shipped import shipped_folder
-from worldline_core.store.atomic import atomic_path
+from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipInput, FrameInput, LatentInput
 
 CHANGES_FILE = "changes.md"
 RECORDINGS, TWO_VIEW_RECORDINGS = "recordings", "recordings_two_views"
 
 WEIGHTS = "weights"
-_LPIPS, _SAM3 = f"{WEIGHTS}/lpips", f"{WEIGHTS}/sam3"
 _SMALL = "its small version"
 SIZES: tuple[tuple[str, Any, str], ...] = (
     (
@@ -41,8 +41,8 @@ SIZES: tuple[tuple[str, Any, str], ...] = (
     ("models.base", f"{WEIGHTS}/base", _SMALL),
     ("models.teacher", f"{WEIGHTS}/vjepa2-vitg-fpc64-384", _SMALL),
     ("*.text.path", f"{WEIGHTS}/Cosmos3-Nano/text_tokenizer", _SMALL),
-    ("*.lpips_weights", _LPIPS, _SMALL),
-    ("*.sam3_weights", _SAM3, _SMALL),
+    ("*.lpips_weights", f"{WEIGHTS}/lpips", _SMALL),
+    ("*.sam3_weights", f"{WEIGHTS}/sam3", _SMALL),
     ("evaluate_policy.vlm.weights", f"{WEIGHTS}/Qwen3-VL-8B-Instruct", _SMALL),
     ("*image_size", [64, 96], "pictures of the recordings"),
     ("*device", "cpu", "no accelerator"),
@@ -66,10 +66,6 @@ ABLATION_SIZES: tuple[tuple[str, Any, str], ...] = (
     ("rollouts.*.seeds", [42], "six models are evaluated"),
     ("rollouts.*.num_frames", 33, "six models are evaluated"),
 )
-"""What the ablations change besides."""
-
-OTHER_INPUT_SIZES: tuple[tuple[str, Any, str], ...] = (("distill.clips.lengths", [33], "two blocks"),)
-"""What the second distillation changes besides: see :func:`other_input`."""
 
 ALWAYS = ("curate.sources", "encode_latents.start_step", "runner.steps_at_once")
 """Changed whatever they are; of the others nothing is made larger, and what is off stays off."""
@@ -86,7 +82,7 @@ class Change:
 
     @property
     def override(self) -> str:
-        """As it is given to ``--set``."""
+        """The change as a value of ``--set``."""
         return f"{self.key}={json.dumps(self.rehearsed)}"
 
 
@@ -98,23 +94,23 @@ def changes_of(
     Raises:
         ConfigError: the configuration is not valid, or not with its changes.
     """
-    config = load_config(PipelineConfig, preset=preset, path=path, overrides=overrides)
-    before = dict(_leaves(config.model_dump(mode="json")))
+
+    def values(more: Sequence[str] = ()) -> dict[str, Any]:
+        config = load_config(PipelineConfig, preset=preset, path=path, overrides=[*overrides, *more])
+        return dict(_leaves(config.model_dump(mode="json")))
+
     small: list[Change] = []
-    for key, value in before.items():
-        fitting = next((size for size in sizes if fnmatchcase(key, size[0])), None)
-        if fitting is not None and (key in ALWAYS or _larger(value, fitting[1])):
-            small.append(Change(key, value, *fitting[1:]))
-    changed = [*overrides, *(change.override for change in small)]
-    after = dict(
-        _leaves(load_config(PipelineConfig, preset=preset, path=path, overrides=changed).model_dump(mode="json"))
-    )
+    for key, value in values().items():
+        size = next((size for size in sizes if fnmatchcase(key, size[0])), None)
+        if size is not None and (key in ALWAYS or _larger(value, size[1])):
+            small.append(Change(key, value, *size[1:]))
+    after = values([change.override for change in small])
     return [change for change in small if after[change.key] != change.published]
 
 
 def other_input(preset: str | None, path: Path | None, overrides: Sequence[str]) -> list[Change]:
-    """What a second distillation changes: it reads its clips the other way, cached latents or frames that are encoded when
-    they are needed, because a laboratory chooses by what its disks hold. Its clips are shorter.
+    """Changes of a second, shorter distillation that reads its clips the other way, cached latents or frames: laboratories
+    choose by the size of their disks.
 
     Args:
         overrides: those of the rehearsal.
@@ -125,17 +121,15 @@ def other_input(preset: str | None, path: Path | None, overrides: Sequence[str])
     if not isinstance(mine, FrameInput):
         other = stage2 if isinstance(stage2, FrameInput) else FrameInput(image_size=config.encode_latents.image_size)
     read = Change("distill.input", mine.model_dump(), other.model_dump(), "the other way to read clips")
-    return [read, *changes_of(preset, path, overrides, OTHER_INPUT_SIZES)]
+    return [read, *changes_of(preset, path, overrides, (("distill.clips.lengths", [33], "two blocks"),))]
 
 
 def _larger(value: Any, small: Any) -> bool:
-    """Whether a rehearsal makes it smaller."""
     if isinstance(value, int) and isinstance(small, int):
         return value > small
     if isinstance(value, list) and isinstance(small, list):
-        return len(value) > len(small) or (
-            len(value) == len(small) and any(v > s for v, s in zip(value, small, strict=True))
-        )
+        equally_long = len(value) == len(small)
+        return len(value) > len(small) or (equally_long and any(v > s for v, s in zip(value, small, strict=True)))
     return value is not None and value != small
 
 
@@ -149,17 +143,13 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 def table(changes: Sequence[Change]) -> str:
     """The changes as a table in Markdown."""
-    rows = [("key", "preset", "rehearsal", "why"), ("---",) * 4]
-    rows += [(c.key, _shown(c.published), _shown(c.rehearsed), c.why) for c in changes]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
-    ]
-    return "\n".join(lines)
+    rows = [(c.key, _shown(c.published), _shown(c.rehearsed), c.why) for c in changes]
+    lines = [("key", "preset", "rehearsal", "why"), ("---",) * 4, *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _shown(value: Any) -> str:
-    """A value as JSON; of recordings their folders alone."""
+    """A value as JSON; recordings by their folders alone."""
     sources = isinstance(value, list) and all(isinstance(item, Mapping) and "path" in item for item in value)
     return json.dumps([item["path"] for item in value] if sources else value)
 
@@ -169,30 +159,24 @@ def prepare(
 ) -> tuple[list[Change], list[Change], list[Change]]:
     """Write outside models, recordings and the list of changes into ``folder``; what is there already is kept.
 
-    Returns the changes, those that the second distillation makes besides, and those that the ablations make.
+    Returns the changes, those of the second distillation besides, and those of the ablations.
 
     Raises:
         ConfigError: the configuration is not valid, or not with its changes, or has nothing to ablate.
-        UnavailableError: an outside model cannot be made small; the message names it.
     """
     changes = changes_of(preset, path, overrides)
     changed = [*overrides, *(change.override for change in changes)]
     again = other_input(preset, path, changed)
-    besides = changes_of(preset, path, changed, ABLATION_SIZES) if ablations else []
-    if ablations:  # what is wrong with them is said now, not at the end
-
-        def load(more: Sequence[str]) -> PipelineConfig:
-            return load_config(PipelineConfig, preset=preset, path=path, overrides=[*changed, *more])
-
+    lists = {"What the rehearsal changes; all else is as the file says": changes, "In the second distillation": again}
+    ablated: list[Change] = []
+    if ablations:  # mistakes in their configuration are reported now, not at the end
+        ablated = lists["In the ablations"] = changes_of(preset, path, changed, ABLATION_SIZES)
+        load = partial(load_config, PipelineConfig, preset=preset, path=path)
         for variant in choose_variants().values():
-            variant_config(load, variant)
+            variant_config(lambda more: load(overrides=[*changed, *more]), variant)
     folder.mkdir(parents=True, exist_ok=True)
-    with atomic_path(folder / CHANGES_FILE) as temporary:
-        temporary.write_text(
-            f"# {preset or path}\n\nWhat the rehearsal changes; all else is as the file says.\n\n{table(changes)}\n"
-            f"\nBesides, in the second distillation:\n\n{table(again)}\n"
-            + (f"\nBesides, in the ablations:\n\n{table(besides)}\n" if ablations else "")
-        )
+    text = "\n\n".join(f"{title}:\n\n{table(rows)}" for title, rows in lists.items())
+    write_bytes_atomic(folder / CHANGES_FILE, f"# {preset or path}\n\n{text}\n".encode())
     if not (folder / WEIGHTS).is_dir():
         shutil.rmtree(folder / f"{WEIGHTS}.partial", ignore_errors=True)
         write_outside_models(folder / f"{WEIGHTS}.partial")
@@ -200,7 +184,7 @@ def prepare(
     for name, episodes, split in ((RECORDINGS, THREE_VIEWS, None), (TWO_VIEW_RECORDINGS, TWO_VIEWS, "test")):
         if not (folder / name / "index.parquet").is_file():
             write_recordings(folder / name, episodes, split=split)
-    return changes, again, besides
+    return changes, again, ablated
 
 
 FPS, FRAMES = 30.0, 129
@@ -254,14 +238,13 @@ def _moved(camera: CameraTrack, moments: np.ndarray) -> CameraTrack:
 
 
 def _poses(poses: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    """Poses (..., 4, 4) between recorded ones: positions linearly, rotations as the nearest to the mixed matrices."""
+    """Poses ``(..., 4, 4)`` between recorded ones: positions linearly, rotations nearest to the mixed matrices."""
     mixed = _between(poses, moments)
     mixed[..., :3, :3] = nearest_rotation(mixed[..., :3, :3])
     return mixed
 
 
 def _between(values: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    """Rows of ``values`` at frame numbers with fractions, linearly."""
     before = np.floor(moments).astype(int)
     after = np.minimum(before + 1, len(values) - 1)
     share = (moments - before).reshape(-1, *[1] * (values.ndim - 1))
