@@ -12,10 +12,10 @@ from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError
 from worldline_core.evaluation.policy.trust import (
-    Calibration,
     JudgedBy,
     KnownRecordings,
     PredictedBy,
+    TrustCalibration,
     TrustModel,
     content_digest,
     control_vectors,
@@ -50,7 +50,7 @@ def test_info_says_how_far_the_judge_is_to_be_trusted(project_root: Path, tmp_pa
             segmenter_weights=content_digest(shipped / "models" / "segmenter"),
         ),
         embodiments=(ROBOT,), least_trust=0.6, novelty_level=0.05, training_recordings=8,
-        methods={"causal": Calibration(
+        methods={"causal": TrustCalibration(
             predicted_by=PredictedBy(
                 checkpoint=content_digest(shipped / "models" / "causal"), sampler="block_causal", steps=None
             ),

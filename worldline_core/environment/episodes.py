@@ -16,9 +16,9 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.evaluation.policy.judge import confidence_of, judge_trajectory
 from worldline_core.evaluation.policy.measured_judge import MeasuredEvidenceJudge
 from worldline_core.evaluation.policy.trust import (
-    Calibration,
     JudgedBy,
     PredictedBy,
+    TrustCalibration,
     TrustModel,
     content_digest,
     control_vectors,
@@ -69,7 +69,7 @@ class TrustedJudge:
         )
         either = [asked, asked.model_copy(update={"steps": None})] if world.steps == usual else [asked]
         found = [self._saved.calibration_of(made) for made in either]
-        fitting = [calibration for calibration in found if isinstance(calibration, Calibration)]
+        fitting = [calibration for calibration in found if isinstance(calibration, TrustCalibration)]
         if not fitting or "disagreement" in fitting[0].signals:
             raise ConfigError(
                 "A saved calibration of trust is not of these simulations", where=saved,

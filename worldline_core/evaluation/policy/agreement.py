@@ -1,9 +1,8 @@
-"""Does a simulator rank policies as the world does? Success rates of every policy, recorded and predicted.
+"""Agreement of a simulator with the world on policies: success rates of every policy, recorded and predicted.
 
-Pearson's r and Spearman's rho of the two rates over policies; the mean maximum rank violation (MMRV, SIMPLER, Li et al.
-2024): over policies, the mean of the largest gap in recorded success to a policy that the simulator ranks the other way
-round; and the mean absolute error of the rates. A policy is a source of the episodes. Policies that tried the same starts
-(one bank each) are compared on these; intervals are bootstraps over starts, and over starts and policies together.
+Pearson's r and Spearman's rho of the two rates over policies; the mean maximum rank violation (MMRV, SIMPLER, Li et al. 2024): over
+policies, the mean of the largest gap in recorded success to a policy that the simulator ranks the other way round; and the mean absolute
+error of the rates. A policy is a source of the episodes. Policies that tried the same starts (one bank each) are compared on these.
 
 Axis legend: p policies, n starts, r resamples.
 """
@@ -38,14 +37,13 @@ def spearman(a: Float[np.ndarray, "*r p"], b: Float[np.ndarray, "*r p"]) -> Floa
 
 
 def mmrv(recorded: Float[np.ndarray, "*r p"], predicted: Float[np.ndarray, "*r p"]) -> Float[np.ndarray, "*r"]:
-    """``mean_i max_j |R_i - R_j| [(S_i > S_j) != (R_i > R_j)]``, R recorded and S predicted rates; NaN where one is unknown."""
+    """``mean_i max_j |R_i - R_j| [(S_i > S_j) != (R_i > R_j)]``, R recorded and S predicted rates."""
 
     def over(rates: np.ndarray) -> np.ndarray:
         return rates[..., :, None] > rates[..., None, :]
 
     gap = np.abs(recorded[..., :, None] - recorded[..., None, :])
-    unknown = np.isnan(recorded + predicted).any(-1)
-    return np.where(unknown, np.nan, (gap * (over(predicted) != over(recorded))).max(-1).mean(-1))
+    return (gap * (over(predicted) != over(recorded))).max(-1).mean(-1)
 
 
 def _statistics(recorded: np.ndarray, predicted: np.ndarray) -> dict[str, np.ndarray]:
@@ -58,7 +56,7 @@ def _statistics(recorded: np.ndarray, predicted: np.ndarray) -> dict[str, np.nda
 
 
 def require_policies(policies: set[str]) -> None:
-    """Raises: DataError for fewer than three policies, which have no ranking worth the name."""
+    """Raises: DataError for fewer than three policies."""
     if len(policies) < 3:
         raise DataError(
             "Policies cannot be ranked", expected="episodes of at least three sources, a policy each", got=sorted(policies),
@@ -70,13 +68,12 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
     """Recorded and predicted success rates of every policy and how they agree, by method and task.
 
     Args:
-        rows: verdicts with method, policy, start, task, episode_id, outcome and predicted; several of one episode (seeds of
-            a prediction) are averaged. Where predicted is None a verdict is left out: the recorded rate counts the
-            attempt, the predicted rate does not, and a policy of which all are left out is not ranked.
+        rows: verdicts with method, policy, start, task, episode_id, outcome and predicted; several of one episode (seeds of a prediction)
+            are averaged.
 
     Returns:
-        {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value", "over_starts":
-        [low, high], "over_starts_and_policies": [low, high], "undefined": share of resamples}}}}; tasks are "all" and each.
+        {method: {task: {"policies": {name: {"recorded", "predicted", "attempts"}}, statistic: {"value", "over_starts": [low, high],
+        "over_starts_and_policies": [low, high], "undefined": share of resamples}}}}; tasks are "all" and each.
 
     Raises:
         DataError: fewer than three policies.
@@ -87,30 +84,36 @@ def policy_agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed:
         of_method = [row for row in rows if row["method"] == method]
         for task in (ALL, *sorted({row["task"] for row in of_method})):
             chosen = [row for row in of_method if task in (ALL, row["task"])]
-            ranked = {row["policy"] for row in chosen if row["predicted"] is not None}
-            chosen = [row for row in chosen if row["policy"] in ranked]
-            if len(ranked) > 2:
+            if len({row["policy"] for row in chosen}) > 2:
                 found[method][task] = _agreement(chosen, resamples=resamples, seed=seed)
     return dict(found)
 
 
 def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) -> dict[str, Any]:
-    policies, recorded, predicted = _tables(rows)
-    attempts = np.isfinite(recorded).sum(-1)
-    rates = _mean(recorded), _mean(predicted)
+    cells: dict[tuple[str, str], list[tuple[bool, bool]]] = defaultdict(list)
+    for row in rows:
+        cells[row["policy"], row["start"]].append((row["outcome"] == "success", row["predicted"] == "success"))
+    policies, starts = (sorted({key[side] for key in cells}) for side in (0, 1))
+    success = np.full(
+        (2, len(policies), len(starts)), np.nan
+    )  # recorded and predicted; NaN where a policy did not try a start
+    for (policy, start), ends in cells.items():
+        success[:, policies.index(policy), starts.index(start)] = np.mean(ends, axis=0)
+    tried = np.isfinite(success[0])
+    rates = np.nan_to_num(success).sum(-1) / tried.sum(-1)
     values = _statistics(*rates)
     random = np.random.default_rng(seed)
-    over_starts = _resampled_rates(recorded, predicted, resamples, random)
-    picked = random.integers(0, len(policies), (resamples, len(policies)))
-    over_both = tuple(np.take_along_axis(side, picked, axis=1) for side in over_starts)
+    over_starts = _resampled_rates(success, tried, resamples, random)
+    drawn = random.integers(0, len(policies), (resamples, len(policies)))
+    over_both = np.stack([np.take_along_axis(side, drawn, axis=1) for side in over_starts])
     intervals = _statistics(*over_starts), _statistics(*over_both)
     facts = {
         name: {"recorded": float(r), "predicted": float(s), "attempts": int(n)}
-        for name, r, s, n in zip(policies, *rates, attempts, strict=True)
+        for name, r, s, n in zip(policies, *rates, tried.sum(-1), strict=True)
     }
     return {"policies": facts} | {
         name: {
-            "value": _number(values[name]),
+            "value": float(values[name]) if np.isfinite(values[name]) else None,
             "over_starts": _bounds(intervals[0][name]),
             "over_starts_and_policies": _bounds(intervals[1][name]),
             "undefined": float(np.isnan(intervals[1][name]).mean()),
@@ -119,51 +122,22 @@ def _agreement(rows: Sequence[Mapping[str, Any]], *, resamples: int, seed: int) 
     }
 
 
-def _tables(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Policies, and recorded and predicted success ``(p, n)`` of each at each start; NaN where it did not try it."""
-    cells: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
-    for row in rows:
-        predicted = np.nan if row["predicted"] is None else float(row["predicted"] == "success")
-        cells[row["policy"], row["start"]].append((float(row["outcome"] == "success"), predicted))
-    policies, starts = (sorted({key[side] for key in cells}) for side in (0, 1))
-    table = np.full((2, len(policies), len(starts)), np.nan)
-    for (policy, start), ends in cells.items():
-        table[:, policies.index(policy), starts.index(start)] = _mean(np.array(ends).T)
-    return policies, table[0], table[1]
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean along the last axis of what is known there; NaN where nothing is."""
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.where(known, values, 0.0).sum(-1) / known.sum(-1)
-
-
 def _resampled_rates(
-    recorded: np.ndarray, predicted: np.ndarray, resamples: int, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rates ``(r, p)`` over starts drawn with replacement: the same for all policies where all tried them, else each its own."""
-    tried = np.isfinite(recorded)
+    success: Float[np.ndarray, "2 p n"], tried: np.ndarray, resamples: int, random: np.random.Generator
+) -> Float[np.ndarray, "2 r p"]:
+    """Rates over starts drawn with replacement: the same starts for all policies where all tried them, else each its own."""
     if tried.all():
-        index = random.integers(0, recorded.shape[1], (resamples, recorded.shape[1]))
-        counts = np.stack([np.bincount(row, minlength=recorded.shape[1]) for row in index]) / recorded.shape[1]
-        known = np.isfinite(predicted)
-        with np.errstate(invalid="ignore"):
-            judged = np.where(known.all(-1), 1.0, counts @ known.T.astype(np.float64))
-            return counts @ recorded.T, counts @ np.nan_to_num(predicted).T / judged
-    rates = np.empty((2, resamples, len(recorded)))
+        index = random.integers(0, tried.shape[1], (resamples, tried.shape[1]))
+        counts = np.stack([np.bincount(row, minlength=tried.shape[1]) for row in index]) / tried.shape[1]
+        return np.stack([counts @ side.T for side in success])
+    rates = np.empty((2, resamples, len(tried)))
     for policy, own in enumerate(tried):
         index = random.integers(0, own.sum(), (resamples, own.sum()))
-        rates[0, :, policy] = recorded[policy, own][index].mean(-1)
-        rates[1, :, policy] = _mean(predicted[policy, own][index])
-    return rates[0], rates[1]
+        rates[:, :, policy] = success[:, policy, own][:, index].mean(-1)
+    return rates
 
 
 def _bounds(values: np.ndarray) -> list[float] | None:
     """95 % percentile interval of the resamples in which the statistic is defined; None without any."""
     known = values[np.isfinite(values)]
     return [float(bound) for bound in np.quantile(known, [0.025, 0.975])] if len(known) else None
-
-
-def _number(value: np.ndarray) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -160,7 +160,7 @@ class PredictedBy(StrictModel):
     stride: int = 1
 
 
-class Calibration(StrictModel):
+class TrustCalibration(StrictModel):
     """Logistic model of a right verdict on one model's videos: weights of the intercept and of each signal."""
 
     predicted_by: PredictedBy
@@ -188,7 +188,7 @@ class TrustModel(StrictModel):
     least_trust: float
     novelty_level: float
     training_recordings: int
-    methods: dict[str, Calibration] = Field(default={})
+    methods: dict[str, TrustCalibration] = Field(default={})
     controls: KnownRecordings = Field(exclude=True)
     setups: KnownRecordings = Field(exclude=True)
 
@@ -260,7 +260,7 @@ class TrustModel(StrictModel):
                 next_step="calibrate with this judge where outcomes of these robots are known",
             )  # fmt: skip
 
-    def calibration_of(self, predicted_by: PredictedBy | None) -> Calibration | str:
+    def calibration_of(self, predicted_by: PredictedBy | None) -> TrustCalibration | str:
         """The calibration for such videos, or the reason why there is none."""
         fitting = (made for made in self.methods.values() if predicted_by and made.predicted_by == predicted_by)
         known = "; ".join(f"{name}: {made.predicted_by}" for name, made in self.methods.items()) or "none"
@@ -334,7 +334,7 @@ def trust_verdicts(
     rows: Sequence[Mapping[str, Any]],
     config: TrustConfig,
     *,
-    saved: Mapping[str, Calibration | str] | None = None,
+    saved: Mapping[str, TrustCalibration | str] | None = None,
     resamples: int,
     seed: int,
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -375,11 +375,11 @@ def trust_verdicts(
     return [row for own in by_method.values() for row in own], methods
 
 
-def calibrated(rows: Sequence[Mapping[str, Any]], predicted_by: PredictedBy) -> Calibration:
+def calibrated(rows: Sequence[Mapping[str, Any]], predicted_by: PredictedBy) -> TrustCalibration:
     """The calibration by all verdicts of a method with known outcomes."""
     signals, known = _signals(rows)
     weights = fit_right(signals, _right(rows))
-    return Calibration(predicted_by=predicted_by, signals=tuple(known), weights=tuple(weights))
+    return TrustCalibration(predicted_by=predicted_by, signals=tuple(known), weights=tuple(weights))
 
 
 def reasons(row: Mapping[str, Any], least_trust: float) -> list[str]:
