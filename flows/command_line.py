@@ -225,8 +225,12 @@ def _inspect(arguments: argparse.Namespace) -> None:
 
 
 def _verify(arguments: argparse.Namespace) -> None:
-    from worldline_core.store.artifact_files import check_artifacts, finished_artifacts, how_to_rebuild
+    from worldline_core.errors import ArtifactError
+    from worldline_core.store.artifact_files import MANIFEST_NAME, check_artifacts, finished_artifacts, how_to_rebuild
 
+    for folder in arguments.artifact:
+        if not (folder / MANIFEST_NAME).is_file():
+            raise ArtifactError("Not a finished artifact", where=folder, expected=MANIFEST_NAME, got="no such file")
     checked = check_artifacts(arguments.artifact or finished_artifacts(arguments.artifacts))
     damaged = sum(map(bool, checked.values()))
     if arguments.json:

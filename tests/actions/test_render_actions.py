@@ -181,7 +181,7 @@ def test_data_that_is_gone_is_no_verdict_on_an_episode(linked, tmp_path, mode):
     filtered, curated = linked
     store = ArtifactStore(tmp_path / "store", mode)
     curated.rename(tmp_path / "elsewhere")
-    with pytest.raises(ArtifactError, match="shares recordings that are not there"):
+    with pytest.raises(ArtifactError, match="missing, with recordings"):
         render_actions_task.run(store, CONFIG, {"episodes": filtered})
     (tmp_path / "elsewhere").rename(curated)
     tracks = render_actions_task.run(store, CONFIG, {"episodes": filtered})

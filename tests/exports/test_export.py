@@ -145,7 +145,7 @@ def test_a_rerun_export_holds_the_tools_as_inspect_shows_them(tmp_path: Path, ca
         for folder in ("out", "seen")
     )
     assert set(exported) == set(seen)
-    for path in ("/world/tools/arm0", "/world/tool_paths/arm0", "/world/cameras/head/points"):
+    for path in ("/world/tools/arm0", "/world/tool_paths/arm0", "/world/cameras/head/actions"):
         values = [[column.to_pylist() for column in batch.columns[1:]] for batch in (exported[path], seen[path])]
         assert values[0] == values[1]
     # Nobody describes this robot, so nothing tells where its tools are.

@@ -19,7 +19,7 @@ from worldline_core.errors import DataError
 from worldline_core.exports.export import export_rollout, write_prediction_mcap
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 
-COUNT, HEIGHT = 5, 32
+COUNT = 5
 """As `conftest` makes the episode."""
 
 
@@ -70,24 +70,6 @@ def test_rerun_signals_are_named_and_timed(chunks: dict[str, list], content: Rec
     assert np.allclose(values, content.episode.action[:, 3])
     times = column(chunks["/signals/state/left_a"], "time")
     assert [time.total_seconds() for time in times] == pytest.approx([0, 0.125, 0.25, 0.375, 0.5])
-
-
-def test_rerun_overlay_layers_hold_the_valid_tools_only(chunks: dict[str, list], content: RecordingContent) -> None:
-    tracks = content.tracks
-    assert tracks is not None
-    for view in VIEWS:
-        points = column(chunks[f"/world/cameras/{view}/points"], "Points2D:positions")
-        points = [row for row in points if row is not None]
-        assert [len(row) for row in points] == [2, 2, 2, 1, 1]
-        # Rerun counts pixels from the picture's corner.
-        assert np.allclose(points[0], tracks.uv[0, VIEWS.index(view)] + 0.5)
-        strips = [
-            row for row in column(chunks[f"/world/cameras/{view}/axes"], "LineStrips2D:strips") if row is not None
-        ]
-        assert [len(row) for row in strips] == [6, 6, 6, 3, 3]
-        assert np.allclose(strips[4][0][0], points[4][0])
-    radii = [row for row in column(chunks["/world/cameras/head/points"], "Points2D:radii") if row is not None]
-    assert radii[0][0] == pytest.approx(HEIGHT * 0.03)
 
 
 def test_rerun_robot_lies_along_its_capsules(chunks: dict[str, list], content: RecordingContent) -> None:

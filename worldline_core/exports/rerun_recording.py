@@ -5,8 +5,6 @@ Entities of an episode (all poses in the robot's base frame, metres, z up; camer
     world/cameras/<view>            camera pose and pinhole (K), shown as a frustum
     world/cameras/<view>/true       recorded frames
     world/cameras/<view>/actions    heat of the action maps, a transparent image over the frames
-    world/cameras/<view>/points     projected tools, the wider the further the gripper is open; only valid ones
-    world/cameras/<view>/axes       projected tool axes; only of valid tools
     world/tools/<arm>               tool frame per time step; `world/tool_paths/<arm>`: the whole path
     world/robot                     the arms as the kinematics place them: one line per link
     predicted/<method>/<view>       predicted frames
@@ -39,7 +37,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
-from worldline_core.actions.overlays import AXIS_COLOURS, arm_colour, axis_tips, heat_layer, picture_pixel
+from worldline_core.actions.overlays import arm_colour, heat_layer
 from worldline_core.pictures import KEPT_COLOUR, jpeg_bytes, png_bytes, reason_colour
 from worldline_core.store.atomic import atomic_path
 
@@ -92,9 +90,12 @@ def write_rerun_recording(path: Path, content: RecordingContent) -> None:
         if tracks is not None:
             _log_tools(stream, tracks, episode.fps)
             _log_robot(stream, tracks, episode.fps)
-            for view in tracks.views:
-                if view in content.true_frames:
-                    _log_overlay(stream, tracks, view, content.true_frames[view], episode.fps, content.sigma_px_ref)
+            for view in [view for view in tracks.views if view in content.true_frames]:
+                frames = content.true_frames[view]
+                size, count = (frames.shape[1], frames.shape[2]), min(len(frames), tracks.num_frames)
+                heat = (png_bytes(heat_layer(tracks, n, view, size, content.sigma_px_ref)) for n in range(count))
+                _log_images(stream, f"world/cameras/{view}/actions", heat, "image/png", episode.fps)
+                stream.log(f"world/cameras/{view}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
         _log_signals(stream, episode)
         _log_description(stream, episode)
         stream.disconnect()
@@ -176,48 +177,6 @@ def _log_robot(stream: rr.RecordingStream, tracks: EpisodeTracks, fps: float) ->
     stream.send_columns("world/robot", _timeline(count, fps), columns.partition([links] * count))
 
 
-def _log_overlay(
-    stream: rr.RecordingStream, tracks: EpisodeTracks, view: str, frames: Frames, fps: float, sigma_px_ref: float
-) -> None:
-    """What `draw_overlay` draws over a view, as layers that can be shown and hidden one by one."""
-    v, entity = tracks.views.index(view), f"world/cameras/{view}"
-    count, size = min(len(frames), tracks.num_frames), (frames.shape[1], frames.shape[2])
-    times = _timeline(count, fps)
-    heat = (png_bytes(heat_layer(tracks, n, view, size, sigma_px_ref)) for n in range(count))
-    _log_images(stream, f"{entity}/actions", heat, "image/png", fps)
-    stream.log(f"{entity}/actions", rr.EncodedImage.from_fields(draw_order=10.0), static=True)
-    shown = [(n, a) for n in range(count) for a in range(len(tracks.arms)) if tracks.valid[n, v, a]]
-    if not shown:
-        return
-
-    def pixel(uv: NDArray[np.floating]) -> list[float]:
-        """Counted from the picture's corner, as Rerun does."""
-        return (picture_pixel(uv, tracks.image_size, size) + 0.5).tolist()
-
-    points = [pixel(tracks.uv[n, v, a]) for n, a in shown]
-    lengths = [int(tracks.valid[n, v].sum()) for n in range(count)]
-    marks = rr.Points2D.columns(
-        positions=points,
-        radii=[size[0] * (0.008 + 0.022 * float(tracks.gripper[n, v, a])) for n, a in shown],
-        colors=[arm_colour(tracks.arms, a) for _, a in shown],
-        labels=[tracks.arms[a] for _, a in shown],
-    )
-    stream.send_columns(f"{entity}/points", times, marks.partition(lengths))
-    stream.log(f"{entity}/points", rr.Points2D.from_fields(draw_order=30.0, show_labels=False), static=True)
-    axes = [
-        [origin, origin if tip is None else pixel(tip)]
-        for (n, a), origin in zip(shown, points, strict=True)
-        for tip in axis_tips(tracks, n, v, a)
-    ]
-    strips = rr.LineStrips2D.columns(
-        strips=np.asarray(axes, dtype=np.float32),
-        radii=[size[0] / 200] * len(axes),
-        colors=[*AXIS_COLOURS] * len(shown),
-    )
-    stream.send_columns(f"{entity}/axes", times, strips.partition([3 * n for n in lengths]))
-    stream.log(f"{entity}/axes", rr.LineStrips2D.from_fields(draw_order=20.0), static=True)
-
-
 def _log_signals(stream: rr.RecordingStream, episode: Episode) -> None:
     """Joint and gripper values, recorded and commanded."""
     names = episode.state_names or [f"joint_{joint}" for joint in range(episode.state.shape[1])]
@@ -234,14 +193,14 @@ def _log_description(stream: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _blueprint(content: RecordingContent) -> rrb.Blueprint:
-    """How the recording opens: the views in a row per method, the scene under (or beside) them, time series below."""
+    """The initial layout: the views in a row per method, the scene under or beside them, time series below."""
     views = list(content.true_frames)
     rows = [[(f"world/cameras/{view}", f"true, {view.replace('_', ' ')}") for view in views]]
     for method, predicted in content.predicted_frames.items():
         rows.append([(f"predicted/{method}/{view}", f"{method}, {view.replace('_', ' ')}") for view in predicted])
     pictures = [rrb.Horizontal(*[rrb.Spatial2DView(origin=at, name=name) for at, name in row]) for row in rows]
-    # What is drawn over the frames would float in the scene twice; Rerun's patterns know no wildcard but a last `/**`.
-    flat = [f"- $origin/cameras/{view}/{layer}" for view in views for layer in ("actions", "points", "axes")]
+    # The heat over the frames would float in the scene twice.
+    flat = [f"- $origin/cameras/{view}/actions" for view in views]
     scene = rrb.Spatial3DView(
         origin="world",
         name="scene",

@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
@@ -326,20 +326,28 @@ def _digest_or_error(path: Path) -> str:
         return f"({error.strerror})"
 
 
-def _shared_datasets(folder: Path) -> list[Path]:
-    """The datasets of other artifacts that an EpisodeSet shares: a filtered set has no videos of its own."""
-    index = read_table(folder / "index.parquet")
-    if index is None or "dataset" not in index.column_names:
-        return []
-    shared = [name for name in index.column("dataset").unique().to_pylist() if ".." in PurePosixPath(name).parts]
-    return [Path(os.path.normpath(folder / name)) for name in shared]
+def check_artifacts(folders: Iterable[Path], mode: VerifyMode = "full") -> dict[Path, list[str]]:
+    """The damage of artifacts, and of those whose datasets they share, by folder.
 
-
-def linked_artifacts(folder: Path) -> list[Path]:
-    """The artifacts whose datasets an EpisodeSet shares."""
-    places = _shared_datasets(folder)
-    owners = [next((above for above in place.parents if (above / MANIFEST_NAME).is_file()), None) for place in places]
-    return list(dict.fromkeys(owner for owner in owners if owner is not None))
+    A filtered EpisodeSet has no videos of its own: a shared dataset that is missing is damage too.
+    """
+    waiting, checked = list(folders), dict[Path, list[str]]()
+    while waiting:
+        folder = waiting.pop(0)
+        if folder in checked:
+            continue
+        checked[folder] = find_damage(folder, mode)
+        index = None if checked[folder] else read_table(folder / "index.parquet")
+        for name in (
+            [] if index is None or "dataset" not in index.column_names else index["dataset"].unique().to_pylist()
+        ):
+            if ".." in PurePosixPath(name).parts:
+                shared = Path(os.path.normpath(folder / name))
+                if shared.is_dir():
+                    waiting += [above for above in shared.parents if (above / MANIFEST_NAME).is_file()][:1]
+                else:
+                    checked[shared.parents[1]] = [f"datasets/{shared.name}: missing, with recordings of {folder}"]
+    return checked
 
 
 def verify_artifact(folder: Path, mode: VerifyMode = "full", what: str = "Artifact") -> None:
@@ -348,49 +356,16 @@ def verify_artifact(folder: Path, mode: VerifyMode = "full", what: str = "Artifa
     Raises:
         ArtifactError: files differ from what was written, or shared datasets are missing.
     """
-    _verify_alone(folder, mode, what)
-    if missing := [place for place in _shared_datasets(folder) if not place.is_dir()]:
-        raise ArtifactError(
-            f"{what} shares recordings that are missing",
-            where=folder,
-            expected=", ".join(map(str, missing[:3])),
-            got="no such folder",
-            next_step=how_to_rebuild(missing[0].parents[1]),
-        )
-    for artifact in linked_artifacts(folder):
-        _verify_alone(artifact, mode, what)
-
-
-def _verify_alone(folder: Path, mode: VerifyMode, what: str) -> None:
-    if damage := find_damage(folder, mode):
-        more = f"; and {len(damage) - 5} more" if len(damage) > 5 else ""
-        raise ArtifactError(
-            f"{what} is damaged: files differ from what was written",
-            where=folder,
-            expected=f"the files of its {MANIFEST_NAME}",
-            got="; ".join(damage[:5]) + more,
-            next_step=how_to_rebuild(folder),
-        )
-
-
-def check_artifacts(folders: Sequence[Path]) -> dict[Path, list[str]]:
-    """The damage of finished artifacts, and of those whose datasets they share, by folder.
-
-    Raises:
-        ArtifactError: a folder has no manifest.
-    """
-    for folder in folders:
-        if not (folder / MANIFEST_NAME).is_file():
-            raise ArtifactError("Not a finished artifact", where=folder, expected=MANIFEST_NAME, got="no such file")
-    waiting, checked = list(folders), dict[Path, list[str]]()
-    while waiting:
-        folder = waiting.pop(0)
-        if folder in checked:
-            continue
-        checked[folder] = find_damage(folder)
-        if not checked[folder]:
-            waiting += linked_artifacts(folder)
-    return checked
+    for artifact, damage in check_artifacts([folder], mode).items():
+        if damage:
+            more = f"; and {len(damage) - 5} more" if len(damage) > 5 else ""
+            raise ArtifactError(
+                f"{what} is damaged: files differ from what was written",
+                where=artifact,
+                expected=f"the files of its {MANIFEST_NAME}",
+                got="; ".join(damage[:5]) + more,
+                next_step=how_to_rebuild(artifact),
+            )
 
 
 def finished_artifacts(root: Path) -> list[Path]:
