@@ -19,7 +19,7 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import read_index, read_quarantine, write_index
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import fill_template, inside
-from worldline_core.data.sources.ids import check_id, storable, unique_identity
+from worldline_core.data.sources.episode_files import check_id, storable, unique_identity
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.errors import DataError
 

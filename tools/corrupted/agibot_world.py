@@ -161,7 +161,7 @@ KIND_COUNT = len(KINDS)
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
-    """One folder of one task; see `labels.Layout`."""
+    """One folder of one task: labels, and the `curate.sources[]` entry that reads it."""
     labels: list[Label] = []
 
     def add(kind: str, reasons: tuple[str, ...] = ()) -> _Episode:

@@ -89,7 +89,7 @@ KIND_COUNT = len(KINDS) + len(_TEXTS)
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
-    """One folder of annotations; see `labels.Layout`."""
+    """One folder of annotations: labels, and the `curate.sources[]` entry that reads it."""
     labels: list[Label] = []
     (root / "annotation/val").mkdir(parents=True)
 

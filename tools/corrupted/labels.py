@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 SECOND = "#source.?"
 """End of the id of an episode that its source lists again; `corpus` puts the source's number in."""
@@ -40,14 +37,3 @@ class Kind:
     spoil: Callable[..., Any]
     reasons: tuple[str, ...]
     stage: Stage = "curate"
-
-
-@dataclass(frozen=True)
-class Layout:
-    """A part of a corpus: writes `healthy` clean recordings and `spoilt` ones of each kind below a folder.
-
-    Returns of `write`: the labels, and the `curate.sources[]` entry that reads them.
-    """
-
-    name: str
-    write: Callable[[Path, int, int, np.random.Generator], tuple[list[Label], dict[str, Any]]]

@@ -211,7 +211,7 @@ class _Dataset:
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
-    """One dataset; see `labels.Layout`."""
+    """One dataset: labels, and the `curate.sources[]` entry that reads it."""
     dataset = _Dataset(root)
     for _ in range(healthy):
         _write_episode(dataset.add("clean", "kept"), random, NUM_FRAMES)

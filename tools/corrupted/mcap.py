@@ -109,7 +109,7 @@ KIND_COUNT = len(VALUE_KINDS) + len(MESSAGE_KINDS) + len(FILE_KINDS) + 2
 
 
 def write(root: Path, healthy: int, each: int, random: np.random.Generator) -> tuple[list[Label], dict[str, Any]]:
-    """A folder of files; see `labels.Layout`."""
+    """A folder of files: labels, and the `curate.sources[]` entry that reads it."""
     labels: list[Label] = []
 
     def place(sample: Sample, kind: str, reasons: tuple[str, ...] = ()) -> Path:

@@ -6,7 +6,7 @@ Every recording is used once: the same motion with other pictures would be a nea
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,42 +18,6 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.errors import DataError
 from worldline_core.recorder.defects import DEFECTS_FILE, lagged_state
 from worldline_core.recorder.simulate import Recording
-
-_BLANK = ("corrupted", "too_dark")
-
-
-def _still(recording: Recording, random: np.random.Generator) -> Recording:
-    episode = recording.episode
-    first = np.zeros(episode.num_frames, dtype=np.int64)
-    cameras = {
-        view: replace(camera, T_base_camera=camera.T_base_camera[first]) if camera.moving else camera
-        for view, camera in episode.cameras.items()
-    }
-    changed = replace(episode, state=episode.state[first], action=episode.action[first], cameras=cameras)
-    return Recording(changed, {view: images[first] for view, images in recording.frames.items()}, {})
-
-
-def _head(change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Callable[..., Recording]:
-    def spoil(recording: Recording, random: np.random.Generator) -> Recording:
-        return replace(recording, frames={**recording.frames, "head": change(recording.frames["head"].copy(), random)})
-
-    return spoil
-
-
-def _frozen(images: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    images[2:] = images[2]
-    return images
-
-
-def _black(images: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    images[int(random.integers(0, len(images) // 4)) :] = random.integers(0, 8)
-    return images
-
-
-def _noise(images: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    start = int(random.integers(0, len(images) // 4))
-    images[start:] = random.integers(0, 256, images[start:].shape, dtype=np.uint8)
-    return images
 
 
 def _not_finite(recording: Recording, random: np.random.Generator) -> Recording:
@@ -82,10 +46,6 @@ def _one_eyed(recording: Recording, random: np.random.Generator) -> Recording:
 
 
 KINDS = (
-    Kind("still", _still, ("static",), "filter"),
-    Kind("camera_frozen", _head(_frozen), ("corrupted", "frozen"), "filter"),
-    Kind("camera_black", _head(_black), _BLANK, "filter"),
-    Kind("camera_noise", _head(_noise), ("corrupted", "noise"), "filter"),
     Kind("states_late", lagged_state, ("time_alignment",), "stage2"),
     Kind("view_missing", _one_eyed, ("missing_view",), "stage2"),
     Kind("view_uncalibrated", _uncalibrated, ("missing_calibration",), "stage2"),
@@ -97,7 +57,7 @@ KINDS = (
 def write(
     root: Path, healthy: int, each: int, random: np.random.Generator, recordings: Path
 ) -> tuple[list[Label], dict[str, Any]]:
-    """An EpisodeSet of at most as many episodes as `recordings` has healthy ones; see `labels.Layout`.
+    """An EpisodeSet of at most as many episodes as `recordings` has healthy ones: labels, and its `curate.sources[]` entry.
 
     Kinds take turns, so that all have nearly the same number.
     """

@@ -24,7 +24,7 @@ from worldline_core.data.guards.plain_files import read_json
 from worldline_core.data.guards.reader_process import read_limited
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import parse_location, portable_text, unchanged_files, watch_run
-from worldline_core.data.sources.ids import check_id, unique_identity
+from worldline_core.data.sources.episode_files import check_id, unique_identity
 from worldline_core.data.sources.open import nothing_found, open_source
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.scale.account import InputRow, check_account, crash_evidence, portable_message, write_account

@@ -88,7 +88,7 @@ class _Reader:
 
     def __init__(self) -> None:
         self.used = False
-        self.environment = dict(os.environ)
+        self.environment = _environment()
         self._connection, there = Pipe()
         with there:
             # Not multiprocessing: that imports the program's main module again, and allows no children of daemons.
@@ -159,11 +159,15 @@ _idle: list[_Reader] = []
 os.register_at_fork(after_in_child=_idle.clear)
 
 
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+
+
 def _idle_reader() -> _Reader | None:
     """A reader with the present environment, which holds credentials and endpoints of object stores."""
     while _idle:
         reader = _idle.pop()
-        if reader.environment == os.environ:
+        if reader.environment == _environment():
             return reader
         reader.end()
     return None

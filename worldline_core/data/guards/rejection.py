@@ -54,7 +54,7 @@ Reason = Literal[
 REASONS: tuple[str, ...] = get_args(Reason)
 
 RATE_TOLERANCE = 1e-2
-"""Of a video's rate, as a share of the stated one: containers round times."""
+"""Largest deviation of a video's rate, as a share of the stated one: containers round times."""
 MAX_SIDE_PX = 16_384
 MAX_PIXELS = 40_000_000
 """One image; 8K video has 33 million pixels."""

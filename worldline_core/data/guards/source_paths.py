@@ -29,7 +29,7 @@ from worldline_core.store.remote import AnyPath, list_files, parse_location, pro
 
 type FileState = tuple[int, int, int, int]
 _REMEMBERED = 100_000
-"""Of files shared by many episodes (joined videos, tables) the state before the first episode counts."""
+"""How many files are remembered. Many episodes may share one (joined videos, tables): its state before the first counts."""
 
 _LONGEST_STEM = 200
 
@@ -51,12 +51,10 @@ def note_file(path: object) -> None:
 
     Only files of this machine: an object store replaces a file as a whole.
     """
-    if not isinstance(path, Path):
-        return
     opened = _opened.get()
+    if not isinstance(path, Path) or path in (opened or ()):
+        return
     if opened is not None:
-        if path in opened:
-            return
         opened.add(path)
     state = _state(path)
     if state is not None and path not in _first_seen:
@@ -71,35 +69,28 @@ def unchanged_files(episode_id: str) -> Iterator[None]:
 
     Raises: RejectedInputError (changed_while_reading) naming the files.
     """
-    token = _opened.set(set())
+    opened: set[Path] = set()
+    token = _opened.set(opened)
+    finding: Exception | None = None
     try:
         yield
-    except Exception as error:
-        _check(episode_id, error)
-        raise
-    else:
-        _check(episode_id, None)
+    except Exception as error:  # noqa: BLE001 - raised below
+        finding = error
     finally:
         _opened.reset(token)
-
-
-def _check(episode_id: str, error: Exception | None) -> None:
-    changed = []
-    for path in sorted(_opened.get() or ()):
-        before = _first_seen.get(path)
-        if before is not None and _state(path) != before:
-            changed.append(path)
-            _first_seen.move_to_end(path)
+    changed = [path for path in sorted(opened) if _state(path) != _first_seen.get(path, _state(path))]
     if changed:
         raise RejectedInputError(
             "changed_while_reading",
             "Files changed while the recording was read",
             where=f"episode {episode_id}",
-            expected="files that nobody writes",
+            expected="files that do not change",
             got=", ".join(str(path) for path in changed[:5]) + (" ..." if len(changed) > 5 else ""),
             next_step="wait until the recording is complete, then curate again",
-            evidence={"files": len(changed), "other_finding": getattr(error, "reason", None)},
-        ) from error
+            evidence={"files": len(changed), "other_finding": getattr(finding, "reason", None)},
+        ) from finding
+    if finding is not None:
+        raise finding
 
 
 def _state(path: Path) -> FileState | None:
@@ -128,12 +119,9 @@ SourceFolder = Annotated[
 """Field type of a configuration: a folder, or a URL such as `s3://bucket/folder`."""
 
 _FILE_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
+    stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
-}
+}  # fmt: skip
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
@@ -193,8 +181,7 @@ def local_file(path: AnyPath) -> Path:
 
 
 def regular_file(path: AnyPath, what: str = "File", *, max_bytes: int | None = None) -> Path:
-    """The file to open for `path` (see `local_file`), when it can be read to an end: a pipe would block for ever, a device
-    never ends.
+    """The file to open for `path` (see `local_file`), if it is regular: a pipe may block, a device does not end.
 
     Raises: RejectedInputError: missing_file, special_file, too_large, and what `local_file` raises.
     """
@@ -275,7 +262,7 @@ def find_folders[P: AnyPath](root: P, depth: int) -> list[P]:
 
 
 def content_of(folder: AnyPath) -> str:
-    """In a line what lies in a folder: the first names, and how many files of each kind there are below it."""
+    """Content of a folder in a line: the first names, and how many files of each kind there are below it."""
     if is_file(folder):
         return "a file"
     names = [relative_name(path, folder) for path in find_files(folder, "*")]

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import REPEATS_STATE, VIEWS, Episode
+from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EmbodimentName,
@@ -30,7 +30,8 @@ from worldline_core.data.episodes.source import (
 )
 from worldline_core.data.guards.plain_files import read_image, read_npy, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_finite, check_shape
-from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, find_files, inside_folder, is_file
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, pose_from_quaternion_xyzw
 
 AGIBOT_CAMERAS = {"head": "head", "left_wrist": "hand_left", "right_wrist": "hand_right"}
@@ -62,29 +63,23 @@ class AgibotGesimSourceConfig(ForeignSourceConfig):
     distortions: dict[str, LensConfig] = Field(default={}, description="view -> lens, where images are distorted")
 
 
-class AgibotGesimSource:
+class AgibotGesimSource(EpisodeFiles[AgibotGesimSourceConfig]):
     """Reads `sample_*` and `demo_*` folders anywhere below the root."""
 
     looked_for = "folders with actions.npy (sample_*) or state_joints_0.npy (demo_*)"
 
     def __init__(self, config: AgibotGesimSourceConfig, root: AnyPath) -> None:
-        self._config = config
-        self._root = root
         found = sorted(p.parent for name in ("actions.npy", "state_joints_0.npy") for p in find_files(root, name))
-        self._folders = {"-".join(relative_name(folder, root).parts) or root.name: folder for folder in found}
-
-    def episode_ids(self) -> list[str]:
-        return sorted(f"{self._config.label}-{key}" for key in self._folders)
+        super().__init__(config, root, found, lambda folder: folder.parts or (root.name,))
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        found = self._folders[episode_id.removeprefix(f"{self._config.label}-")]
-        folder = inside_folder(self._root, str(relative_name(found, self._root)))
+        folder = inside_folder(self.root, str(self.files[episode_id]))
         read = self._read_v2 if is_file(folder / "state_joints_0.npy") else self._read_v1
         return read(episode_id, folder)
 
     def _read_v1(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
         raw = numbers(folder / "actions.npy", (None, 16))
-        state, ends, overshoot = pose_state(raw, self._config.gripper_v1, folder / "actions.npy")
+        state, ends, overshoot = pose_state(raw, self.config.gripper_v1, folder / "actions.npy")
         images = {view: _numbered_images(folder / f"{name}_color") for view, name in AGIBOT_CAMERAS.items()}
         counts = {view: len(files) for view, files in images.items()}
         if len(set(counts.values())) != 1:
@@ -95,11 +90,19 @@ class AgibotGesimSource:
         poses = {
             view: numbers(folder / f"extrinsic_{name}.npy", (len(raw), 4, 4)) for view, name in AGIBOT_CAMERAS.items()
         }
-        notes = {"layout": "agibot_gesim v1", "action": f"{REPEATS_STATE}: no commands are published"}
-        episode = self._episode(
-            episode_id, folder, state, state, ends, state[:, [7, 15]], overshoot, self._config.tool_offset_v1_m, notes
+        offset = self.config.tool_offset_v1_m
+        episode = self.episode(
+            episode_id,
+            f"{self.config.label}-{folder.name}",
+            layout="agibot_gesim v1",
+            state=state,
+            overshoot=overshoot,
+            T_base_ee=along_tool_z(ends, offset),
+            gripper=state[:, [7, 15]],
+            state_names=AGIBOT_POSE_NAMES,
+            state_kind="ee_pose",
+            conventions={"tool_offset_m": offset},
         )
-        episode = replace(episode, state_names=AGIBOT_POSE_NAMES, state_kind="ee_pose")
         return self._loaded(episode, folder, images, K, poses)
 
     def _read_v2(self, episode_id: str, folder: AnyPath) -> LoadedEpisode:
@@ -110,58 +113,32 @@ class AgibotGesimSource:
         ends = np.stack(
             [pose_from_euler_fixed_xyz(recorded[:, a : a + 3], recorded[:, a + 3 : a + 6]) for a in (0, 7)], axis=1
         )
-        opening, overshoot = self._config.gripper_v2.opening(joints[:, 14:16])
+        opening, overshoot = self.config.gripper_v2.opening(joints[:, 14:16])
         action[:, [7, 15]], more = GRIPPER_COMMAND_RAW.opening(action[:, [7, 15]])
         state = np.hstack([joints[:, :7], opening[:, :1], joints[:, 7:14], opening[:, 1:]])
-        notes = {
-            "layout": "agibot_gesim v2",
-            "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
-            **{name: float(joints[0, 16 + i]) for i, name in enumerate(_POSTURE_V2)},
-        }
-        episode = self._episode(
-            episode_id, folder, state, action, ends, opening, overshoot + more, self._config.tool_offset_v2_m, notes
+        task, offset = folder / "task.txt", self.config.tool_offset_v2_m
+        episode = self.episode(
+            episode_id,
+            f"{self.config.label}-{folder.name}",
+            layout="agibot_gesim v2",
+            state=state,
+            action=action,
+            overshoot=overshoot + more,
+            instruction=read_text(task).strip() if is_file(task) else "",
+            T_base_ee=along_tool_z(ends, offset),
+            gripper=opening,
+            state_names=AGIBOT_STATE_NAMES,
+            conventions={
+                "tool_offset_m": offset,
+                "wrist_extrinsics": "follow the action's kinematics, up to 6 mm from the state's",
+                **{name: float(joints[0, 16 + i]) for i, name in enumerate(_POSTURE_V2)},
+            },
         )
-        task = folder / "task.txt"
-        instruction = read_text(task).strip() if is_file(task) else ""
-        episode = replace(episode, state_names=AGIBOT_STATE_NAMES, instruction=instruction)
         images = {view: [folder / name] for view, name in _IMAGE_V2.items()}
         K = numbers(folder / "intrinsic.npy", (3, 3, 3))
         poses = numbers(folder / "extrinsic_alignstate_0.npy", (3, num_frames, 4, 4))
         return self._loaded(
             episode, folder, images, dict(zip(VIEWS, K, strict=True)), dict(zip(VIEWS, poses, strict=True))
-        )
-
-    def _episode(
-        self,
-        episode_id: str,
-        folder: AnyPath,
-        state: np.ndarray,
-        action: np.ndarray,
-        ends: np.ndarray,
-        opening: np.ndarray,
-        overshoot: int,
-        tool_offset_m: float,
-        notes: Mapping[str, str | float],
-    ) -> Episode:
-        """Without cameras.
-
-        Args:
-            ends: (N, 2, 4, 4) of the end link of the left and of the right arm.
-        """
-        config = self._config
-        return Episode(
-            **config.declared(f"{config.label}-{folder.name}"),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
-            instruction="",
-            outcome=config.outcome,
-            fps=config.fps,
-            state=state.astype(np.float32),
-            action=action.astype(np.float32),
-            timestamps=np.arange(len(state)) / config.fps,
-            T_base_ee=along_tool_z(ends, tool_offset_m),
-            gripper=opening,
-            conventions={"tool_offset_m": tool_offset_m, "gripper_overshoot": overshoot, **notes},
         )
 
     def _loaded(
@@ -192,7 +169,7 @@ class AgibotGesimSource:
             video_frames=None if num_images == episode.num_frames else num_images,
             conventions={**episode.conventions, **cameras.notes()},
         )
-        lenses = {view: lens.distortion for view, lens in self._config.distortions.items()}
+        lenses = {view: lens.distortion for view, lens in self.config.distortions.items()}
         return LoadedEpisode(episode, VIEWS, lambda view: map(read_image, images[view]), distortions=lenses)
 
 

@@ -21,7 +21,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EmbodimentName,
@@ -41,6 +40,7 @@ from worldline_core.data.sources.agibot_gesim import (
     GRIPPER_STATE_RAW,
     TOOL_OFFSET_RAW_M,
 )
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5, require_h5py
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
@@ -92,7 +92,7 @@ class AgibotWorldSourceConfig(ForeignSourceConfig):
     )
 
 
-class AgibotWorldSource:
+class AgibotWorldSource(EpisodeFiles[AgibotWorldSourceConfig]):
     """Reads every `<task>/<episode>` that `proprio_stats` or `observations` has a folder of; ids are label-task-episode.
 
     Arrays are read one episode at a time, videos when their frames are asked for.
@@ -102,32 +102,24 @@ class AgibotWorldSource:
 
     def __init__(self, config: AgibotWorldSourceConfig, root: AnyPath) -> None:
         require_h5py()
-        self._config = config
-        self._root = root
-        found = {
-            (folder.parent.name, folder.name)
-            for part in ("proprio_stats", "observations")
-            for folder in find_folders(root / part, 2)
-        }
-        self._episodes = {f"{config.label}-{task}-{episode}": (task, episode) for task, episode in found}
+        folders = [folder for part in ("proprio_stats", "observations") for folder in find_folders(root / part, 2)]
+        named = {(folder.parent.name, folder.name) for folder in folders}
+        super().__init__(config, root, [root / task / episode for task, episode in named], lambda folder: folder.parts)
         self._episodes_of = lru_cache(maxsize=1)(self._read_task)  # episodes are read in order of tasks
 
-    def episode_ids(self) -> list[str]:
-        return sorted(self._episodes)
-
     def load(self, episode_id: str) -> LoadedEpisode:
-        config = self._config
-        task, number = self._episodes[episode_id]
+        config = self.config
+        task, number = self.files[episode_id].parts
         info = self._info(task, number)
         videos = {
-            view: inside(self._root, f"observations/{task}/{number}/videos/{AGIBOT_CAMERAS[view]}_color.mp4")
+            view: inside(self.root, f"observations/{task}/{number}/videos/{AGIBOT_CAMERAS[view]}_color.mp4")
             for view in config.views
         }
         faults: list[RejectedInputError] = []
         sizes, absent = sorted_views(videos, lambda view: timed_video_size(videos[view], config.fps), faults)
         if faults:
             raise all_of([*faults, *absent.values()], f"episode {episode_id}")
-        path = inside(self._root, f"proprio_stats/{task}/{number}/proprio_stats.h5")
+        path = inside(self.root, f"proprio_stats/{task}/{number}/proprio_stats.h5")
         with open_hdf5(path) as file:
             positions = file.array("state/end/position", (None, 2, 3))
             length = len(positions)
@@ -141,17 +133,16 @@ class AgibotWorldSource:
         cameras = RecordedCameras()
         folder = f"parameters/{task}/{number}/parameters/camera"
         distortion = max(
-            (add_camera(cameras, view, self._root, folder, sizes[view], length) for view in sizes), default=0.0
+            (add_camera(cameras, view, self.root, folder, sizes[view], length) for view in sizes), default=0.0
         )
-        episode = Episode(
-            **config.declared(f"{config.label}-{task}"),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
+        episode = self.episode(
+            episode_id,
+            f"{config.label}-{task}",
+            layout="agibot_world",
+            state=state,
+            action=action,
+            overshoot=overshoot + command_overshoot,
             instruction=str(info.get("task_name") or "").strip(),
-            outcome=config.outcome,
-            fps=config.fps,
-            state=state.astype(np.float32),
-            action=action.astype(np.float32),
             timestamps=times,
             cameras=cameras.tracks,
             T_base_ee=along_tool_z(ends, config.tool_offset_m),
@@ -159,9 +150,7 @@ class AgibotWorldSource:
             primary_view=config.views[0],
             state_names=AGIBOT_STATE_NAMES,
             conventions={
-                "layout": "agibot_world",
                 "tool_offset_m": config.tool_offset_m,
-                "gripper_overshoot": overshoot + command_overshoot,
                 "distortion_not_applied": distortion if not config.distortions else 0.0,
                 "steps": _steps(info),
                 **posture,
@@ -178,7 +167,7 @@ class AgibotWorldSource:
 
     def _read_task(self, task: str) -> dict[str, Any]:
         """What `task_info` says about the episodes of a task, by episode."""
-        listed = read_json(inside(self._root, f"task_info/task_{task}.json"))
+        listed = read_json(inside(self.root, f"task_info/task_{task}.json"))
         rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
         return {str(row.get("episode_id")): row for row in rows}
 
@@ -190,7 +179,7 @@ class AgibotWorldSource:
             raise RejectedInputError(
                 "missing_column",
                 "Task information does not name the episode",
-                where=f"{self._root}, task_info/task_{task}.json",
+                where=f"{self.root}, task_info/task_{task}.json",
                 expected=f"an entry with episode_id {number}",
                 got=f"{len(known)} entries",
             )

@@ -1,4 +1,4 @@
-"""Calibration that lies beside a dataset whose format has no place for it, in JSON or YAML.
+"""Calibration beside a dataset whose format has no place for it, in JSON or YAML.
 
     views:
       head:
@@ -127,7 +127,7 @@ def add_calibrated_view(
             where=f"{where}, view {view}",
             expected=f"the aspect of {width}x{height}",
             got=f"{entry.width}x{entry.height}",
-            next_step="give K for the recorded image: what was cropped cannot be told from the sizes",
+            next_step="give K for the recorded image: the sizes do not show what was cropped",
         )
     if entry.T_feature is not None:
         matrices = _feature_poses(entry.T_feature, read_feature, num_frames, f"{where}, view {view}")

@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import REPEATS_STATE, Episode
 from worldline_core.data.episodes.instructions import one_annotation
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
@@ -26,7 +25,7 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import expect_layout, read_json
 from worldline_core.data.guards.rejection import RejectedInputError, all_of, check_length, check_rate, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
-from worldline_core.data.sources.ids import by_number, file_ids
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
@@ -45,30 +44,23 @@ class DroidAnnotationSourceConfig(EvaluationSourceConfig):
     )
 
 
-class DroidAnnotationSource:
+class DroidAnnotationSource(EpisodeFiles[DroidAnnotationSourceConfig]):
     """Reads every `annotation/<split>/<id>.json` below the root."""
 
     looked_for = "annotation/<split>/<id>.json"
 
     def __init__(self, config: DroidAnnotationSourceConfig, root: AnyPath) -> None:
-        self._config = config
-        self._root = root
         found = find_files(root, "annotation/*/*.json")
-        self._files = file_ids(
-            config.label, root, found, lambda file: (*file.parts[:-3], *file.parts[-2:-1], file.stem)
-        )
-
-    def episode_ids(self) -> list[str]:
-        return sorted(self._files, key=by_number)
+        super().__init__(config, root, found, lambda file: (*file.parts[:-3], *file.parts[-2:-1], file.stem))
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        file = inside(self._root, str(self._files[episode_id]))
+        file = self.path(episode_id)
         record = read_json(file)
         with expect_layout(file, "an annotation: a mapping with states, joints, videos and texts"):
             return self._read(episode_id, file.parents[2], file, record)
 
     def _read(self, episode_id: str, subset: AnyPath, file: AnyPath, record: dict[str, Any]) -> LoadedEpisode:
-        config = self._config
+        config = self.config
         states = _rows(record, "states", 7, file)
         listed = record.get("videos") or []
         videos = {
@@ -92,25 +84,20 @@ class DroidAnnotationSource:
         pose = pose_from_euler_fixed_xyz(states[:, :3], states[:, 3:6])[:, None]
         success = record.get("success")
         texts = [str(text) for text in record.get("texts", []) if text]
-        episode = Episode(
-            **config.declared(f"{config.label}-{subset.name}-{file.stem}"),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
+        episode = self.episode(
+            episode_id,
+            f"{config.label}-{subset.name}-{file.stem}",
+            layout=EVALUATION_LAYOUTS[0],
+            state=state,
+            action=command,
+            overshoot=overshoot,
             instruction=one_annotation(texts),
             outcome=config.outcome if success is None else "success" if success else "failure",
             fps=fps,
-            state=state.astype(np.float32),
-            action=(state if command is None else command).astype(np.float32),
-            timestamps=np.arange(len(states)) / fps,
             T_base_ee=along_tool_z(pose, config.tool_offset_m),
             gripper=opening,
             state_names=joint_names({"right": 7}),
-            conventions={
-                "layout": EVALUATION_LAYOUTS[0],
-                "action": f"{REPEATS_STATE}: no commands are published" if command is None else "commanded joints",
-                "tool_offset_m": config.tool_offset_m,
-                "gripper_overshoot": overshoot,
-            },
+            conventions={"tool_offset_m": config.tool_offset_m},
         )
         counts = {view: len(frame_times(videos[view])) for view in rates}
         clips = {view: VideoClip.whole_file(videos[view], count, fps) for view, count in counts.items()}

@@ -23,7 +23,6 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.data.episodes.conventions import along_tool_z
-from worldline_core.data.episodes.episode import REPEATS_STATE, Episode
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose
 from worldline_core.data.episodes.source import (
     EmbodimentName,
@@ -53,8 +52,8 @@ from worldline_core.data.sources.agibot_world import (
     timed_video_size,
     two_grippers,
 )
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import open_hdf5
-from worldline_core.data.sources.ids import file_ids
 from worldline_core.data.video.clip import VideoClip
 
 _PARTS = ("proprio_stats.h5", "action.npy", "frame.png", *(f"{camera}_color.mp4" for camera in AGIBOT_CAMERAS.values()))
@@ -82,11 +81,11 @@ class EnerverseAcSourceConfig(ForeignSourceConfig):
 
 @dataclass(frozen=True)
 class _Controls:
-    """State and action (N, 16), poses of the end links (N, 2, 4, 4), openings (N, 2), times (N,) [s], `first_posture`."""
+    """State (N, 16), action (N, 16) where joints and commands are recorded, poses of the end links (N, 2, 4, 4), openings
+    (N, 2), times (N,) [s], `first_posture`."""
 
     state: np.ndarray
-    action: np.ndarray
-    joints: bool
+    action: np.ndarray | None
     ends: np.ndarray
     opening: np.ndarray
     times: np.ndarray
@@ -94,23 +93,18 @@ class _Controls:
     posture: dict[str, float] = field(default_factory=dict)
 
 
-class EnerverseAcSource:
+class EnerverseAcSource(EpisodeFiles[EnerverseAcSourceConfig]):
     """Reads every folder below the root that holds a file of a clip; videos are decoded when their frames are asked for."""
 
     looked_for = "folders with one of " + ", ".join(_PARTS)
 
     def __init__(self, config: EnerverseAcSourceConfig, root: AnyPath) -> None:
-        self._config = config
-        self._root = root
         found = sorted({path.parent for name in _PARTS for path in find_files(root, name)})
-        self._folders = file_ids(config.label, root, found, lambda folder: folder.parts or (root.name,))
-
-    def episode_ids(self) -> list[str]:
-        return sorted(self._folders)
+        super().__init__(config, root, found, lambda folder: folder.parts or (root.name,))
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        config, relative = self._config, self._folders[episode_id]
-        folder = inside_folder(self._root, str(relative))
+        config, relative = self.config, self.files[episode_id]
+        folder = inside_folder(self.root, str(relative))
         recorded = is_file(folder / "proprio_stats.h5") or not is_file(folder / "action.npy")
         found = self._recorded(folder / "proprio_stats.h5") if recorded else self._poses(folder / "action.npy")
         length = len(found.state)
@@ -134,43 +128,34 @@ class EnerverseAcSource:
         cameras = RecordedCameras()
         for view, size in sizes.items():
             if recorded:
-                add_camera(cameras, view, self._root, str(relative), size, length)
+                add_camera(cameras, view, self.root, str(relative), size, length)
             else:
                 pose = camera_pose(view, _extrinsics(folder / "extrinsics.npy", view, length), where=folder)
                 cameras.add(view, numbers(folder / "intrinsics.npy", (3, 3)), pose, size)
         clip = _STEP_OF_EPISODE.fullmatch(folder.name)
         task = clip[1] if clip is not None else "-".join(relative.parts[:-1])
-        episode = Episode(
-            **config.declared("-".join(filter(None, [config.label, task]))),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
-            instruction="",
-            outcome=config.outcome,
-            fps=config.fps,
-            state=found.state.astype(np.float32),
-            action=found.action.astype(np.float32),
+        episode = self.episode(
+            episode_id,
+            "-".join(filter(None, [config.label, task])),
+            layout="enerverse_ac",
+            state=found.state,
+            action=found.action,
+            overshoot=found.overshoot,
             timestamps=found.times,
             cameras=cameras.tracks,
             T_base_ee=along_tool_z(found.ends, config.tool_offset_m),
             gripper=found.opening,
             video_frames=None if clips or length == 1 else 1,
             primary_view=config.views[0],
-            state_names=AGIBOT_STATE_NAMES if found.joints else AGIBOT_POSE_NAMES,
-            state_kind="joints" if found.joints else "ee_pose",
-            conventions={
-                "layout": "enerverse_ac",
-                "tool_offset_m": config.tool_offset_m,
-                "gripper_overshoot": found.overshoot,
-                **({} if found.joints else {"action": f"{REPEATS_STATE}: no commands are published"}),
-                **found.posture,
-                **cameras.notes(),
-            },
+            state_names=AGIBOT_STATE_NAMES if found.action is not None else AGIBOT_POSE_NAMES,
+            state_kind="joints" if found.action is not None else "ee_pose",
+            conventions={"tool_offset_m": config.tool_offset_m, **found.posture, **cameras.notes()},
         )
         lenses = {view: lens.distortion for view, lens in config.distortions.items()}
         return LoadedEpisode(episode, config.views, lambda view: [read_image(picture)], distortions=lenses, clips=clips)
 
     def _recorded(self, path: AnyPath) -> _Controls:
-        config = self._config
+        config = self.config
         with open_hdf5(path) as file:
             positions = file.array("state/end/position", (None, 2, 3))
             length = len(positions)
@@ -184,20 +169,18 @@ class EnerverseAcSource:
             )
             times = file.times_ns("timestamp", length) if file.has("timestamp") else np.arange(length) / config.fps
             state, ends, overshoot = pose_state(rows.reshape(length, 16), config.gripper_state, path)
-            opening, joints = state[:, [7, 15]], False
-            action = state
+            opening, action = state[:, [7, 15]], None
             if all(file.has(f"{track}/joint/position") for track in ("state", "action")):
-                joints = True
                 state, opening, overshoot = arm_vector(file, "state", length, config.gripper_state, path)
                 action, _, more = arm_vector(file, "action", length, config.gripper_command, path)
                 overshoot += more
             posture = first_posture(file, length)
-        return _Controls(state, action, joints, ends, opening, times, overshoot, posture)
+        return _Controls(state, action, ends, opening, times, overshoot, posture)
 
     def _poses(self, path: AnyPath) -> _Controls:
-        state, ends, overshoot = pose_state(numbers(path, (None, 16)), self._config.gripper_state, path)
-        times = np.arange(len(state)) / self._config.fps
-        return _Controls(state, state, False, ends, state[:, [7, 15]], times, overshoot)
+        state, ends, overshoot = pose_state(numbers(path, (None, 16)), self.config.gripper_state, path)
+        times = np.arange(len(state)) / self.config.fps
+        return _Controls(state, None, ends, state[:, [7, 15]], times, overshoot)
 
 
 def _extrinsics(path: AnyPath, view: str, length: int) -> np.ndarray:

@@ -219,7 +219,7 @@ class Hdf5File:
                 raise self._rejected("missing_column", "File lacks a dataset", key, key, f"top level: {got}")
             if node.external or node.is_virtual:
                 raise self._rejected(
-                    "path_traversal", "Dataset lies in other files", key, "data in this file", "external storage"
+                    "path_traversal", "Dataset is stored in other files", key, "data in this file", "external storage"
                 )
             wanted, found = 1, int(node.id.get_storage_size() > 0)
             if node.chunks:

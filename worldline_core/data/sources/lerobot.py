@@ -133,7 +133,7 @@ class LeRobotSource:
         return "success" if bool(succeeded[-1]) else "failure"
 
     def _cameras(self, index: int, key_of: dict[str, str], length: int) -> RecordedCameras:
-        """Of the views that are there the calibrated ones; one whose pose was never measured is left out."""
+        """Calibrated cameras of the views that are there, without those whose pose was never measured."""
         cameras = RecordedCameras()
         if self._config.calibration is None:
             return cameras
@@ -164,8 +164,8 @@ class LeRobotSource:
 
 def _is_droid(config: LeRobotSourceConfig, root: AnyPath, info: DatasetInfo) -> bool:
     """Whether a dataset is DROID by its name, its robot's name or its cameras' names (its port calls the robot Franka)."""
-    said = (config.label, config.embodiment, root.name, str(info.robot_type), str(info.repo_id))
-    return says_droid(*said) or set(info.features) >= _DROID_VIDEOS
+    names = (config.label, config.embodiment, root.name, str(info.robot_type), str(info.repo_id))
+    return says_droid(*names) or set(info.features) >= _DROID_VIDEOS
 
 
 _OPEN_DATASETS = 8

@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.source import (
     EmbodimentName,
     ForeignSourceConfig,
@@ -35,8 +35,8 @@ from worldline_core.data.episodes.source import (
 )
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside
+from worldline_core.data.sources.episode_files import EpisodeFiles, printable
 from worldline_core.data.sources.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
-from worldline_core.data.sources.ids import file_ids, printable
 from worldline_core.data.sources.video_folder import caption_table
 
 LayoutName = Literal[
@@ -203,55 +203,44 @@ class RobomindSourceConfig(ForeignSourceConfig):
         return self.action or ROBOMIND_LAYOUTS[self.layout].command
 
 
-class RobomindSource:
+class RobomindSource(EpisodeFiles[RobomindSourceConfig]):
     """Reads every `trajectory.hdf5` below the root; images are decoded one by one when they are asked for."""
 
     looked_for = _FILE
 
     def __init__(self, config: RobomindSourceConfig, root: AnyPath) -> None:
         require_h5py()
-        self._config = config
+        super().__init__(config, root, find_files(root, _FILE), _episode_parts)
         self._layout = ROBOMIND_LAYOUTS[config.layout]
-        self._root = root
-        self._files = file_ids(config.label, root, find_files(root, _FILE), _episode_parts)
         table = config.instructions
         self._instructions = None if table is None else caption_table(inside(root, table), "task", "instruction")
 
-    def episode_ids(self) -> list[str]:
-        return sorted(self._files)
-
     def load(self, episode_id: str) -> LoadedEpisode:
-        config, layout = self._config, self._layout
-        relative = self._files[episode_id]
-        path = inside(self._root, str(relative))
+        config, layout = self.config, self._layout
+        relative, path = self.files[episode_id], self.path(episode_id)
         views = dict(config.views or layout.views)
         with open_hdf5(path) as file:
             state, overshoot = self._vector(file, path, "puppet")
-            action, more = (state, 0) if config.command == "puppet" else self._vector(file, path, "master")
+            action, more = (None, 0) if config.command == "puppet" else self._vector(file, path, "master")
             self._check_compression(file, path)
             file.require_cameras(layout.images, views)
             # Who collected it: some stations recorded the arms exchanged.
             collector = file.attribute("metadata", "collector") if layout.version == 2 else None
             text = self._text(file, relative, path)
         grippers = any(arm.gripper is not None for arm in layout.arms)
-        episode = Episode(
-            **config.declared("-".join([config.label, *_task_parts(relative)])),
-            episode_id=episode_id,
+        episode = self.episode(
+            episode_id,
+            "-".join([config.label, *_task_parts(relative)]),
+            layout=f"robomind {layout.version}",
+            state=state,
+            action=action,
+            overshoot=overshoot + more,
             embodiment=config.embodiment or layout.embodiment,
             instruction=text,
             outcome=_outcome(relative, config.outcome),
-            fps=config.fps,
-            state=state,
-            action=action,
-            timestamps=np.arange(len(state)) / config.fps,
             primary_view=next(iter(views)),
             state_names=joint_names({arm.name: arm.num_joints for arm in layout.arms}, gripper=grippers),
-            conventions={
-                "layout": f"robomind {layout.version}",
-                "gripper_overshoot": overshoot + more,
-                **({"action": REPEATS_STATE} if config.command == "puppet" else {}),
-                **({} if collector is None else {"collector": collector}),
-            },
+            conventions={} if collector is None else {"collector": collector},
         )
         channels: Channels = config.channels or layout.channels or "standard"
         return LoadedEpisode(
@@ -261,8 +250,8 @@ class RobomindSource:
         )
 
     def _vector(self, file: Hdf5File, path: AnyPath, track: Track) -> tuple[np.ndarray, int]:
-        """(N, J) float32 in the contract's layout, and how many gripper readings were clipped."""
-        span = self._config.gripper_state if track == "puppet" else self._config.gripper_command
+        """(N, J) in the contract's layout, and how many gripper readings were clipped."""
+        span = self.config.gripper_state if track == "puppet" else self.config.gripper_command
         blocks: list[np.ndarray] = []
         overshoot, length = 0, None
         for arm in self._layout.arms:
@@ -294,8 +283,7 @@ class RobomindSource:
             opening, outside = span.opening(values[:, column : column + 1])
             overshoot += outside
             blocks.append(opening)
-        with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
-            return np.concatenate(blocks, axis=1).astype(np.float32), overshoot
+        return np.concatenate(blocks, axis=1), overshoot
 
     def _check_compression(self, file: Hdf5File, path: AnyPath) -> None:
         compressed = file.attribute("/", "compress") if self._layout.version == 1 else None

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.episodes.episode import NO_EMBODIMENT, REPEATS_STATE, Episode
+from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose, rejected_as
 from worldline_core.data.episodes.source import (
     EVALUATION_LAYOUTS,
@@ -29,8 +29,8 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import image_size, read_json
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import Channels, Hdf5File, hdf5_images, open_hdf5, require_h5py
-from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.geometry.transforms import pose_from_quaternion_wxyz
 
 _ARMS = ("left", "right")
@@ -57,24 +57,17 @@ class RobotwinSourceConfig(EvaluationSourceConfig):
     )
 
 
-class RobotwinSource:
+class RobotwinSource(EpisodeFiles[RobotwinSourceConfig]):
     """Reads every `episode*.hdf5` below the root; images are decoded when their frames are asked for."""
 
     looked_for = "episode*.hdf5"
 
     def __init__(self, config: RobotwinSourceConfig, root: AnyPath) -> None:
         require_h5py()
-        self._config = config
-        self._root = root
-        found = find_files(root, "episode*.hdf5")
-        self._files = file_ids(config.label, root, found, lambda file: file.with_suffix("").parts)
-
-    def episode_ids(self) -> list[str]:
-        return sorted(self._files, key=by_number)
+        super().__init__(config, root, find_files(root, "episode*.hdf5"))
 
     def load(self, episode_id: str) -> LoadedEpisode:
-        config = self._config
-        path = inside(self._root, str(self._files[episode_id]))
+        config, path = self.config, self.path(episode_id)
         cameras = RecordedCameras()
         with open_hdf5(path) as file:
             ends, grippers, blocks = [], [], []
@@ -96,32 +89,25 @@ class RobotwinSource:
         # From between the fingertips, with +z out of the gripper, to the recorded end pose.
         T_end_tool = _END_FROM_TOOL.copy()
         T_end_tool[0, 3] = config.tool_offset_m
-        setting = "-".join(relative_name(path, self._root).parts[:-2])
-        episode = Episode(
-            **config.declared(f"{config.label}-{setting}-{path.stem}"),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
+        setting = "-".join(relative_name(path, self.root).parts[:-2])
+        episode = self.episode(
+            episode_id,
+            f"{config.label}-{setting}-{path.stem}",
+            layout=EVALUATION_LAYOUTS[1],
+            state=state,
+            overshoot=overshoot + sum(count for *_, count in clipped),
             instruction=self._instruction(path),
-            outcome=config.outcome,
-            fps=config.fps,
-            state=state.astype(np.float32),
-            action=state.astype(np.float32),
-            timestamps=np.arange(length) / config.fps,
             cameras=cameras.tracks,
             T_base_ee=np.stack(ends, axis=1) @ T_end_tool,
             gripper=opening,
             primary_view=next(iter(config.views)),
             state_names=names,
             conventions={
-                "layout": EVALUATION_LAYOUTS[1],
-                "action": f"{REPEATS_STATE}: one joint track is recorded",
                 "base_frame": "world of the simulation",
                 "tool_offset_m": config.tool_offset_m,
-                "gripper_overshoot": overshoot + sum(count for *_, count in clipped),
                 **cameras.notes(),
             },
         )
-
         return LoadedEpisode(
             episode,
             tuple(config.views),
@@ -130,8 +116,8 @@ class RobotwinSource:
 
     def _instruction(self, path: AnyPath) -> str:
         """The first of the seen instructions; they are generated apart from the recording and may not be there."""
-        relative = relative_name(path, self._root).parent.parent / "instructions" / f"{path.stem}.json"
-        file = inside(self._root, str(relative))
+        relative = relative_name(path, self.root).parent.parent / "instructions" / f"{path.stem}.json"
+        file = inside(self.root, str(relative))
         if not is_file(file):
             return ""
         record = read_json(file)

@@ -25,7 +25,6 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import (
     EmbodimentName,
     ForeignSourceConfig,
@@ -36,8 +35,8 @@ from worldline_core.data.episodes.source import (
 from worldline_core.data.guards.plain_files import expect_layout, read_text
 from worldline_core.data.guards.rejection import RejectedInputError, check_rate, unreadable
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file, relative_name
+from worldline_core.data.sources.episode_files import EpisodeFiles
 from worldline_core.data.sources.hdf5 import Hdf5File, open_hdf5, raw_images, require_h5py
-from worldline_core.data.sources.ids import by_number, file_ids
 from worldline_core.data.video.clip import VideoClip, video_size
 
 Robot = Literal["z1_single", "z1_dual", "g1_dex1"]
@@ -79,25 +78,19 @@ class UnitreeH5SourceConfig(ForeignSourceConfig):
     gripper_command: GripperRange = Field(description="commanded readings")
 
 
-class UnitreeH5Source:
+class UnitreeH5Source(EpisodeFiles[UnitreeH5SourceConfig]):
     """Reads every recording of either layout below the root; frames are decoded when they are asked for."""
 
     looked_for = f"{_TRANSITIONS}/*/*.h5 or episode_*.hdf5"
 
     def __init__(self, config: UnitreeH5SourceConfig, root: AnyPath) -> None:
         require_h5py()
-        self._config = config
-        self._root = root
         found = [path for path in find_files(root, "*.h5") if relative_name(path, root).parts[:-2] == (_TRANSITIONS,)]
-        self._files = file_ids(config.label, root, [*found, *find_files(root, "episode_*.hdf5")], _episode_parts)
+        super().__init__(config, root, [*found, *find_files(root, "episode_*.hdf5")], _episode_parts)
         self._instructions = lru_cache(maxsize=1)(self._read_instructions)  # episodes are read in order of datasets
 
-    def episode_ids(self) -> list[str]:
-        return sorted(self._files, key=by_number)
-
     def load(self, episode_id: str) -> LoadedEpisode:
-        config, relative = self._config, self._files[episode_id]
-        path = inside(self._root, str(relative))
+        config, relative, path = self.config, self.files[episode_id], self.path(episode_id)
         trained = relative.suffix == ".h5"
         with open_hdf5(path) as file:
             state, overshoot = self._vector(file, path, "observation.state" if trained else "observations/qpos", None)
@@ -114,26 +107,20 @@ class UnitreeH5Source:
         if trained:
             folder = f"videos/{relative.parent.name}"
             for view, camera in config.views.items():
-                video = inside(self._root, f"{folder}/{camera}/{relative.stem}.mp4")
+                video = inside(self.root, f"{folder}/{camera}/{relative.stem}.mp4")
                 check_rate(video_size(video)[2], config.fps, video, tolerance=0.02)
                 clips[view] = VideoClip.whole_file(video, len(state), config.fps)
-        episode = Episode(
-            **config.declared("-".join([config.label, *_episode_parts(relative)[:-1]])),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
-            instruction=text,
-            outcome=config.outcome,
-            fps=config.fps,
+        episode = self.episode(
+            episode_id,
+            "-".join([config.label, *_episode_parts(relative)[:-1]]),
+            layout="unitree unifolm" if trained else "unitree hdf5",
             state=state,
             action=action,
-            timestamps=np.arange(len(state)) / config.fps,
+            overshoot=overshoot + more,
+            instruction=text,
             primary_view=next(iter(config.views)),
             state_names=joint_names({arm.name: arm.num_joints for arm in ROBOTS[config.robot]}),
-            conventions={
-                "layout": "unitree unifolm" if trained else "unitree hdf5",
-                "gripper_overshoot": overshoot + more,
-                **({} if robot is None else {"robot_type": robot}),
-            },
+            conventions={} if robot is None else {"robot_type": robot},
         )
         return LoadedEpisode(
             episode,
@@ -143,8 +130,8 @@ class UnitreeH5Source:
         )
 
     def _vector(self, file: Hdf5File, path: AnyPath, key: str, length: int | None) -> tuple[np.ndarray, int]:
-        """(N, J) float32 in the contract's layout, and how many gripper readings were clipped."""
-        arms = ROBOTS[self._config.robot]
+        """(N, J) in the contract's layout, and how many gripper readings were clipped."""
+        arms = ROBOTS[self.config.robot]
         values = file.array(key, (length, None))
         wanted = sum(arm.num_joints + 1 for arm in arms)
         if values.shape[1] != wanted:
@@ -152,19 +139,18 @@ class UnitreeH5Source:
                 "length_mismatch",
                 "Vector has another number of columns than this robot's",
                 where=f"{path}, {key}",
-                expected=f"{wanted} ({self._config.robot})",
+                expected=f"{wanted} ({self.config.robot})",
                 got=values.shape[1],
                 next_step="check curate.sources[].robot; robots with dexterous hands are not read",
             )
-        span = self._config.gripper_command if key == "action" else self._config.gripper_state
+        span = self.config.gripper_command if key == "action" else self.config.gripper_state
         blocks: list[np.ndarray] = []
         overshoot = 0
         for arm in arms:
             opening, outside = span.opening(values[:, [arm.gripper]])
             overshoot += outside
             blocks += [values[:, arm.start : arm.start + arm.num_joints], opening]
-        with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
-            return np.concatenate(blocks, axis=1).astype(np.float32), overshoot
+        return np.concatenate(blocks, axis=1), overshoot
 
     def _instruction(self, relative: PurePosixPath, path: AnyPath) -> str:
         table = self._instructions(relative.parent.name)
@@ -182,7 +168,7 @@ class UnitreeH5Source:
 
     def _read_instructions(self, dataset: str) -> dict[str, str] | None:
         """Recording -> instruction of a dataset; None where it has no table."""
-        path = inside(self._root, f"{dataset}.csv")
+        path = inside(self.root, f"{dataset}.csv")
         if not is_file(path):
             return None
         text = io.StringIO(read_text(path, encoding="utf-8-sig"), newline="")

@@ -19,12 +19,11 @@ import numpy as np
 from pydantic import Field
 
 from worldline_core.config import StrictModel
-from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.source import ForeignSourceConfig, LoadedEpisode
 from worldline_core.data.guards.plain_files import read_json, read_json_lines, read_text
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.guards.source_paths import AnyPath, find_files, inside, is_file
-from worldline_core.data.sources.ids import file_ids, printable
+from worldline_core.data.sources.episode_files import EpisodeFiles, printable
 from worldline_core.data.video.clip import VideoClip, frame_times, video_size
 from worldline_core.errors import ConfigError, DataError
 
@@ -53,8 +52,8 @@ def caption_table(path: AnyPath, video_key: str, caption_key: str) -> dict[str, 
     table: dict[str, str] = {}
     for number, row in enumerate(_rows(path, suffix, video_key, caption_key), start=1):
         video, caption = (_field(row, key, number, path) for key in (video_key, caption_key))
-        name, said = video.removeprefix("./"), " ".join(caption.split())
-        if table.setdefault(name, said) != said:
+        name, text = video.removeprefix("./"), " ".join(caption.split())
+        if table.setdefault(name, text) != text:
             raise DataError("Table has two captions for one video", where=str(path), got=name)
     return table
 
@@ -112,58 +111,49 @@ class VideoFolderSourceConfig(ForeignSourceConfig):
     require_caption: bool = Field(default=False, description="quarantine videos without a caption")
 
 
-class VideoFolderSource:
+class VideoFolderSource(EpisodeFiles[VideoFolderSourceConfig]):
     """Lists every video below the root; ids are the label and the path.
 
     Raises: DataError or ConfigError when a table of captions is configured and cannot be used.
     """
 
     def __init__(self, config: VideoFolderSourceConfig, root: AnyPath) -> None:
-        self._config = config
-        self._root = root
         self.looked_for = "files that end in " + ", ".join(config.suffixes)
         suffixes = {suffix.lower() for suffix in config.suffixes}
-        found = [path for path in find_files(root, "*") if path.suffix.lower() in suffixes]
-        self._files = file_ids(config.label, root, found, lambda file: file.with_suffix("").parts)
+        super().__init__(config, root, [path for path in find_files(root, "*") if path.suffix.lower() in suffixes])
         table = config.captions
         self._captions = None if table is None else caption_table(inside(root, table.file), table.video, table.caption)
 
-    def episode_ids(self) -> list[str]:
-        return sorted(self._files)
-
     def load(self, episode_id: str) -> LoadedEpisode:
-        config = self._config
-        relative = self._files[episode_id]
-        path = inside(self._root, str(relative))
+        config, relative, path = self.config, self.files[episode_id], self.path(episode_id)
         rate = video_size(path)[2]
         times = frame_times(path)
         if not rate > 0:
             raise RejectedInputError("wrong_fps", "Video states no frame rate", where=str(path), got=rate)
-        nothing = np.zeros((len(times), 0), dtype=np.float32)
-        episode = Episode(
-            **config.declared("-".join([config.label, *relative.parent.parts])),
-            episode_id=episode_id,
-            embodiment=config.embodiment,
-            instruction=self._caption(relative, path),
-            outcome=config.outcome,
-            fps=rate,
+        nothing = np.zeros((len(times), 0))
+        episode = self.episode(
+            episode_id,
+            "-".join([config.label, *relative.parent.parts]),
+            layout="video_folder",
             state=nothing,
             action=nothing,
+            instruction=self._caption(relative, path),
+            fps=rate,
             timestamps=times,
             primary_view=config.view,
             state_kind="none",
-            conventions={"layout": "video_folder", "file": printable(str(relative))},
+            conventions={"file": printable(str(relative))},
         )
         return LoadedEpisode(episode, (config.view,), clips={config.view: VideoClip.whole_file(path, len(times), rate)})
 
     def _caption(self, relative: PurePosixPath, path: AnyPath) -> str:
         if self._captions is None:
-            text = inside(self._root, str(relative.with_suffix(".txt")))
+            text = inside(self.root, str(relative.with_suffix(".txt")))
             found = read_text(text, max_bytes=MAX_CAPTION_BYTES, encoding="utf-8-sig") if is_file(text) else None
             caption = None if found is None else " ".join(found.split())
         else:
             caption = self._captions.get(str(relative))
-        if not caption and self._config.require_caption:
+        if not caption and self.config.require_caption:
             raise RejectedInputError(
                 "missing_column",
                 "Video has no caption",

@@ -1,18 +1,85 @@
-"""Ids of episodes: made from file names and metadata that nobody has checked, unique and storable."""
+"""What sources of foreign recordings share: episodes that are files below a folder, under ids that are unique and storable,
+and what the configuration declares of them."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
+from typing import Any
 
+import numpy as np
+
+from worldline_core.data.episodes.episode import REPEATS_STATE, Episode
+from worldline_core.data.episodes.source import ForeignSourceConfig
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.data.guards.source_paths import AnyPath, relative_name
+from worldline_core.data.guards.source_paths import AnyPath, inside, relative_name
 
 MAX_LENGTH = 512
 _DIGITS = re.compile(r"(\d+)")
+
+
+class EpisodeFiles[C: ForeignSourceConfig]:
+    """A source whose episodes are files or folders below its own.
+
+    Args:
+        parts_of: the parts of a path that name the episode; by default all, without the suffix.
+    """
+
+    def __init__(
+        self,
+        config: C,
+        root: AnyPath,
+        found: Iterable[AnyPath],
+        parts_of: Callable[[PurePosixPath], Sequence[str]] = lambda file: file.with_suffix("").parts,
+    ) -> None:
+        self.config = config
+        self.root = root
+        self.files = file_ids(config.label, root, found, parts_of)
+
+    def episode_ids(self) -> list[str]:
+        return sorted(self.files, key=by_number)
+
+    def path(self, episode_id: str) -> AnyPath:
+        """File of an episode.
+
+        Raises: RejectedInputError (path_traversal) for a link that leads out of the source's folder.
+        """
+        return inside(self.root, str(self.files[episode_id]))
+
+    def episode(
+        self,
+        episode_id: str,
+        scene: str,
+        *,
+        layout: str,
+        state: np.ndarray,
+        action: np.ndarray | None = None,
+        overshoot: int = 0,
+        conventions: Mapping[str, Any] | None = None,
+        **fields: Any,
+    ) -> Episode:
+        """An episode of what a recording holds and the configuration declares; see `Episode` for the fields.
+
+        Args:
+            scene: where the configuration names none.
+            action: None: no commands are recorded, the action repeats the state.
+            overshoot: how many gripper readings were clipped.
+        """
+        config: Any = self.config
+        declared = {name: getattr(config, name) for name in ("embodiment", "fps", "outcome") if name not in fields}
+        notes: dict[str, Any] = {"layout": layout, "gripper_overshoot": overshoot}
+        if action is None:
+            action, notes["action"] = state, REPEATS_STATE
+        fields = {"instruction": "", **config.declared(scene), **declared, **fields}
+        fields.setdefault("timestamps", np.arange(len(state)) / fields["fps"])
+        with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
+            state, action = state.astype(np.float32), action.astype(np.float32)
+        return Episode(
+            episode_id=episode_id, state=state, action=action, conventions=notes | dict(conventions or {}), **fields
+        )
 
 
 def file_ids(
