@@ -32,7 +32,7 @@ from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.evaluation.planning.bracket import planning_indices
 from worldline_core.evaluation.policy.evidence import establishes_success, route
-from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts, measure, score
+from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, facts, measure
 from worldline_core.evaluation.scores import bootstrap_mean
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.evaluation.segmenters.segmenter import MaskStream, Segmenter
@@ -180,7 +180,7 @@ def main() -> None:
         shown = {view: video[chosen] for view, video in frames.items()}
         measured = measure(segmenter, row.instruction, family, shown, None)
         done = establishes_success(facts(measured, row.instruction, family))
-        value = UNSEEN_SCORE if measured is None else score(measured)
+        value = UNSEEN_SCORE if measured is None else measured.score()
         judged[task_of(row.instruction)].append((value, done, outcome == "success", row.bank))
     table = {}
     for task, rows in sorted(judged.items()):

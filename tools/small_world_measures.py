@@ -27,7 +27,7 @@ from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.evaluation.metrics import frame_iou
 from worldline_core.evaluation.planning.bracket import planning_indices
 from worldline_core.evaluation.policy.evidence import route
-from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure, score
+from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure
 from worldline_core.evaluation.segmenters.coloured_things import named_things, own_colour, thing_share
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.evaluation.video.episode_measurement import MOVED_IOU
@@ -137,7 +137,7 @@ def judged(shown: Shown) -> dict[str, float | None]:
     for name, views in (("area", shown.views), ("area_head", ("head",))):
         frames = {view: videos[view] for view in views}
         measured = measure(KnownMasks(shown.robot[chosen]), shown.instruction, route(shown.instruction), frames, None)
-        scores[name] = UNSEEN_SCORE if measured is None else score(measured)
+        scores[name] = UNSEEN_SCORE if measured is None else measured.score()
     head, colour = shown.pixels[shown.views.index("head")], named_things(shown.instruction)[0].colour
     found = thing_share(head, colour, own_colour(head, colour)) > 0.5
     stays = frame_iou(shown.thing, shown.thing[:1].repeat(SHORT, 0))

@@ -15,7 +15,6 @@ from worldline_core.evaluation.policy.measured_judge import (
     measure_lift,
     measure_press,
     measure_push,
-    score,
 )
 from worldline_core.evaluation.segmenters.coloured_things import (
     ColouredThing,
@@ -39,7 +38,8 @@ def faded(frames: np.ndarray, share: float) -> np.ndarray:
 
 def lift_score(success: bool, share: float) -> float:
     frames, masks, _ = make_film(success, seed=3)
-    return score(measure_lift({view: faded(video, share) for view, video in frames.items()}, CUBE, masks[-LATE_COUNT:]))
+    shown = {view: faded(video, share) for view, video in frames.items()}
+    return measure_lift(shown, CUBE, masks[-LATE_COUNT:]).score()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6, 0.45])
@@ -98,7 +98,7 @@ def test_a_button_that_lights_up_is_pressed_though_something_hides_a_part_of_it(
         assert isinstance(measured, PressMeasurement)
         assert measured.growth == pytest.approx(growth, rel=0.02)
         assert establishes_success(facts(measured, instruction, "state_change")) is done
-        assert (score(measured) > 0.5) is done
+        assert (measured.score() > 0.5) is done
 
 
 def test_a_button_that_is_never_seen_proves_nothing() -> None:

@@ -19,7 +19,7 @@ from pydantic import StrictBool, StrictInt
 
 from worldline_core.errors import DataError
 from worldline_core.evaluation.policy.evidence import route
-from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure, score
+from worldline_core.evaluation.policy.measured_judge import UNSEEN_SCORE, measure
 from worldline_core.evaluation.recordings import Trajectory
 from worldline_core.evaluation.segmenters.segmenter import Segmenter
 from worldline_core.evaluation.vlm import PROMPTS, Answer, AnswerText, Part, Text, Video, VisionLanguageModel, ask
@@ -126,7 +126,7 @@ class MeasuredSelector:
         key = (instruction, candidate.digest)
         if key not in self._scores:
             measured = measure(self.segmenter, instruction, route(instruction), candidate.frames, candidate.points)
-            value = UNSEEN_SCORE if measured is None else score(measured)
+            value = UNSEEN_SCORE if measured is None else measured.score()
             self._scores[key] = CandidateScore(round(100.0 * value, 3))
         return self._scores[key]
 

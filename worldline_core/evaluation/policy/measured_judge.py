@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -44,6 +45,19 @@ _VISIBLE = 0.12  # of the thing's largest area
 _CLEAR = 0.35  # of the thing's largest area: enough to measure its position
 HELD_TOUCH = 0.5  # of the thing's area lies within a third of its size of the robot
 HELD_WRIST_SHARE = 0.065  # of a wrist frame
+MIN_RISE, RISE_WIDTH = 0.3, 0.25
+MIN_VACATED = 0.6
+DROP_PEAK = 1.0
+MIN_HELD = 0.6
+MAX_DISTANCE, DISTANCE_WIDTH = 0.5, 0.12
+MAX_REMAINING, REMAINING_WIDTH = 0.56, 0.12
+MIN_RETREAT, RETREAT_WIDTH = 0.53, 0.12
+MIN_GROWTH, GROWTH_WIDTH = 1.7, 0.2
+UNSEEN_SCORE = 0.25
+
+# What is to be pressed; what is to be pushed in or closed.
+_PRESSING = re.compile(r"\bpress(es|ed|ing)?\b")
+_CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
 
 
 @dataclass(frozen=True)
@@ -77,14 +91,41 @@ class Sighting:
         return self.area > max(fraction * self.full_area, least)
 
 
+def _above(value: float, threshold: float, width: float) -> float:
+    """Soft threshold, 0..1."""
+    return 1.0 / (1.0 + math.exp(-max(-60.0, min(60.0, (value - threshold) / width))))
+
+
+def _text(value: float | None) -> str:
+    return "(not visible)" if value is None else f"{value:.2f}"
+
+
+class Measurement(Protocol):
+    """A measured effect."""
+
+    def score(self) -> float:
+        """How likely the task is done, 0..1: the facts with soft thresholds, multiplied."""
+        ...
+
+    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
+        """The facts about the things of these names."""
+        ...
+
+
+def _final_state(done: bool | None, words: str) -> StateChangeEvidence:
+    dropped = None if done is None else False
+    return StateChangeEvidence(required_final_state_visible=done, wrong_object_or_drop=dropped, observations=words)
+
+
 @dataclass(frozen=True)
 class LiftMeasurement:
-    """Attributes:
-    rise: the least of the late heights against the resting height, in sizes or, of a wide thing, in its heights (up is
-        positive).
-    peak: the most it ever rose.
-    held: share of the late frames in which it is held.
-    vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
+    """A grasp or a lift.
+
+    Attributes:
+        rise: the least of the late heights against the resting height, in sizes or, of a wide thing, in its heights (up is positive).
+        peak: the most it ever rose.
+        held: share of the late frames in which it is held.
+        vacated: share of where it rested that late frames show empty: neither the thing nor the robot is there.
     """
 
     rise: float | None
@@ -92,29 +133,88 @@ class LiftMeasurement:
     held: float | None
     vacated: float | None = None
 
+    def score(self) -> float:
+        hidden = max(UNSEEN_SCORE, 0.8 * (self.vacated or 0.0))
+        rise = hidden if self.rise is None else _above(self.rise, MIN_RISE, RISE_WIDTH)
+        return rise * (UNSEEN_SCORE if self.held is None else 0.1 + 0.9 * self.held)
+
+    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
+        held = None if self.held is None else self.held >= MIN_HELD
+        raised = None if self.rise is None else self.rise > MIN_RISE
+        dropped = None
+        if self.rise is not None and self.peak is not None:
+            dropped = self.peak > DROP_PEAK and self.rise < MIN_RISE / 2
+        elif self.rise is None and held and self.vacated is not None and self.vacated > MIN_VACATED:
+            # Hidden behind the gripper in the head view, but in the hand of a wrist view, and gone from where it rested.
+            raised, dropped = True, False
+        words = (
+            f"{names[0]}: rose {_text(self.rise)} of its size, {_text(self.peak)} at most; held in {_text(self.held)} of the"
+            " late steps"
+        )
+        if family == "grasp":
+            return GraspEvidence(target_held_for_two_late_steps=held, wrong_object_or_drop=dropped, observations=words)
+        return LiftEvidence(
+            head_view_confirms_target_displacement=raised,
+            target_held_for_two_late_steps=held,
+            target_on_original_support_at_end=None if raised is None else not raised,
+            wrong_object_or_drop=dropped,
+            observations=words,
+        )
+
 
 @dataclass(frozen=True)
 class PlaceMeasurement:
-    """distance: between object and destination in the end, in destination sizes."""
+    """Distance between object and destination in the end, in destination sizes; placed is what is at its destination."""
 
     distance: float | None
+
+    def score(self) -> float:
+        return UNSEEN_SCORE if self.distance is None else _above(-self.distance, -MAX_DISTANCE, DISTANCE_WIDTH)
+
+    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
+        words = f"{names[0]}: {_text(self.distance)} destination sizes from the {names[1]} in the end"
+        return _final_state(None if self.distance is None else self.distance < MAX_DISTANCE, words)
 
 
 @dataclass(frozen=True)
 class PushMeasurement:
-    """remaining: late share of the visible area that no robot covers; retreat: how far its near edge moved up or its far
-    edge down (whichever is more, for a drawer closes away from the camera or towards it), in sizes; None when nothing
-    of it is visible any more."""
+    """A thing that is pushed in; closed is one of which little is left and whose edge has retreated.
+
+    Attributes:
+        remaining: late share of the visible area that no robot covers.
+        retreat: how far its near edge moved up or its far edge down (whichever is more, for a drawer closes away from the camera or
+            towards it), in sizes; None when nothing of it is visible any more.
+    """
 
     remaining: float | None
     retreat: float | None
 
+    def score(self) -> float:
+        if self.remaining is None:
+            return UNSEEN_SCORE
+        retreat = 1.0 if self.retreat is None else _above(self.retreat, MIN_RETREAT, RETREAT_WIDTH)
+        return retreat * _above(-self.remaining, -MAX_REMAINING, REMAINING_WIDTH)
+
+    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
+        done = None
+        if self.remaining is not None:
+            done = self.remaining < MAX_REMAINING and (self.retreat is None or self.retreat > MIN_RETREAT)
+        left, moved = _text(self.remaining), _text(self.retreat)
+        return _final_state(done, f"{names[0]}: {left} of it still visible, edge moved in by {moved} of its size")
+
 
 @dataclass(frozen=True)
 class PressMeasurement:
-    """growth: late area of the colour against its first, for a button that lights up while it is down."""
+    """Late area of the colour against its first; pressed is a button that has lit up."""
 
     growth: float | None
+
+    def score(self) -> float:
+        return UNSEEN_SCORE if self.growth is None else _above(self.growth, MIN_GROWTH, GROWTH_WIDTH)
+
+    def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
+        words = f"{names[0]}: its colour fills {_text(self.growth)} times its first area in the end"
+        return _final_state(None if self.growth is None else self.growth > MIN_GROWTH, words)
 
 
 def sight(frames: np.ndarray, thing: ColouredThing) -> Sighting:
@@ -236,71 +336,6 @@ def _edges(share: np.ndarray) -> tuple[float, float]:
     return float(np.searchsorted(rows, 0.1 * rows[-1])), float(np.searchsorted(rows, 0.9 * rows[-1]))
 
 
-Measurement = LiftMeasurement | PlaceMeasurement | PushMeasurement | PressMeasurement
-
-MIN_RISE, RISE_WIDTH = 0.3, 0.25
-MIN_VACATED = 0.6
-DROP_PEAK = 1.0
-MIN_HELD = 0.6
-MAX_DISTANCE, DISTANCE_WIDTH = 0.5, 0.12
-MAX_REMAINING, REMAINING_WIDTH = 0.56, 0.12
-MIN_RETREAT, RETREAT_WIDTH = 0.53, 0.12
-MIN_GROWTH, GROWTH_WIDTH = 1.7, 0.2
-UNSEEN_SCORE = 0.25
-
-# What is to be pressed; what is to be pushed in or closed.
-_PRESSING = re.compile(r"\bpress(es|ed|ing)?\b")
-_CLOSING = re.compile(r"\b(clos(e|ed|ing)|shut|push(ed|ing)?|slid(e|ing))\b")
-
-
-def lift_facts(measured: LiftMeasurement, name: str, family: EvidenceFamily) -> Evidence:
-    """Facts of a grasp or a lift."""
-    held = None if measured.held is None else measured.held >= MIN_HELD
-    raised = None if measured.rise is None else measured.rise > MIN_RISE
-    dropped = None
-    if measured.rise is not None and measured.peak is not None:
-        dropped = measured.peak > DROP_PEAK and measured.rise < MIN_RISE / 2
-    elif measured.rise is None and held and measured.vacated is not None and measured.vacated > MIN_VACATED:
-        # Hidden behind the gripper in the head view, but in the hand of a wrist view, and gone from where it rested.
-        raised, dropped = True, False
-    words = f"{name}: rose {_text(measured.rise)} of its size, {_text(measured.peak)} at most; held in {_text(measured.held)} of the late steps"
-    if family == "grasp":
-        return GraspEvidence(target_held_for_two_late_steps=held, wrong_object_or_drop=dropped, observations=words)
-    return LiftEvidence(
-        head_view_confirms_target_displacement=raised,
-        target_held_for_two_late_steps=held,
-        target_on_original_support_at_end=None if raised is None else not raised,
-        wrong_object_or_drop=dropped,
-        observations=words,
-    )
-
-
-def score(measured: Measurement) -> float:
-    """How likely the task is done, 0..1: the facts above with soft thresholds, multiplied."""
-    if isinstance(measured, LiftMeasurement):
-        hidden = max(UNSEEN_SCORE, 0.8 * (measured.vacated or 0.0))
-        rise = hidden if measured.rise is None else _above(measured.rise, MIN_RISE, RISE_WIDTH)
-        return rise * (UNSEEN_SCORE if measured.held is None else 0.1 + 0.9 * measured.held)
-    if isinstance(measured, PlaceMeasurement):
-        if measured.distance is None:
-            return UNSEEN_SCORE
-        return _above(-measured.distance, -MAX_DISTANCE, DISTANCE_WIDTH)
-    if isinstance(measured, PressMeasurement):
-        return UNSEEN_SCORE if measured.growth is None else _above(measured.growth, MIN_GROWTH, GROWTH_WIDTH)
-    if measured.remaining is None:
-        return UNSEEN_SCORE
-    retreat = 1.0 if measured.retreat is None else _above(measured.retreat, MIN_RETREAT, RETREAT_WIDTH)
-    return retreat * _above(-measured.remaining, -MAX_REMAINING, REMAINING_WIDTH)
-
-
-def _above(value: float, threshold: float, width: float) -> float:
-    return 1.0 / (1.0 + math.exp(-max(-60.0, min(60.0, (value - threshold) / width))))
-
-
-def _text(value: float | None) -> str:
-    return "(not visible)" if value is None else f"{value:.2f}"
-
-
 def measure(
     segmenter: Segmenter,
     instruction: str,
@@ -308,10 +343,10 @@ def measure(
     frames: Mapping[str, np.ndarray],
     points: np.ndarray | None,
 ) -> Measurement | None:
-    """Measure what the family's facts need, on chosen frames (n, h, w, 3) of each view.
+    """Measure the family's facts on chosen frames (n, h, w, 3) of each view.
 
-    None without a head view, when the instruction does not name what to follow by a colour, or asks for an effect that this cannot measure
-    (it measures holding, lifting, placing one thing on another, closing, and pressing what then lights up).
+    None without a head view, for an instruction that names nothing by its colour, or for an effect that cannot be measured (holding,
+    lifting, placing one thing on another, closing, and pressing something that then lights up can).
     """
     things = named_things(instruction)
     if len(things) == 0 or HEAD not in frames or len(frames[HEAD]) < LATE_COUNT:
@@ -328,33 +363,10 @@ def measure(
 
 
 def facts(measured: Measurement | None, instruction: str, family: EvidenceFamily) -> Evidence:
-    """The family's evidence from a measurement.
-
-    Placed is what lies at its destination; closed is what little is left of, and whose edge has retreated; pressed is
-    what has lit up.
-    """
+    """The family's evidence from a measurement; null without one."""
     if measured is None:
         return SCHEMAS[family](observations="nothing in the instruction can be followed by its colour")
-    names = [f"{thing.colour} {thing.noun}" for thing in named_things(instruction)]
-    if isinstance(measured, LiftMeasurement):
-        return lift_facts(measured, names[0], family)
-    done = None
-    if isinstance(measured, PlaceMeasurement):
-        if measured.distance is not None:
-            done = measured.distance < MAX_DISTANCE
-        words = f"{names[0]}: {_text(measured.distance)} destination sizes from the {names[1]} in the end"
-    elif isinstance(measured, PressMeasurement):
-        if measured.growth is not None:
-            done = measured.growth > MIN_GROWTH
-        words = f"{names[0]}: its colour fills {_text(measured.growth)} times its first area in the end"
-    else:
-        if measured.remaining is not None:
-            retreated = measured.retreat is None or measured.retreat > MIN_RETREAT
-            done = measured.remaining < MAX_REMAINING and retreated
-        left, moved = _text(measured.remaining), _text(measured.retreat)
-        words = f"{names[0]}: {left} of it still visible, edge moved in by {moved} of its size"
-    dropped = None if done is None else False
-    return StateChangeEvidence(required_final_state_visible=done, wrong_object_or_drop=dropped, observations=words)
+    return measured.evidence([f"{thing.colour} {thing.noun}" for thing in named_things(instruction)], family)
 
 
 def _robot_late(segmenter: Segmenter, head: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -368,7 +380,7 @@ class MeasuredEvidenceJudge:
     """Colour tracking in the head view, agreement of the wrist views, robot mask by a segmenter.
 
     Args:
-        states_confidence: how far what was measured is from the thresholds, as `score` says it.
+        states_confidence: distance of the measurement from the thresholds, by its soft score.
     """
 
     name = "measured"
@@ -405,5 +417,5 @@ class MeasuredEvidenceJudge:
         evidence = facts(measured, trajectory.instruction, family)
         if not self.states_confidence or measured is None:
             return evidence
-        done = score(measured)
+        done = measured.score()
         return evidence.model_copy(update={"confidence": done if establishes_success(evidence) else 1.0 - done})
