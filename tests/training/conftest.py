@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +21,7 @@ from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
 from worldline_core.model.world_model import WorldModelConfig
 from worldline_core.training.clip_source import LatentRow, group_key, single_key
+from worldline_core.training.trainer import TrainingRun
 
 FRAMES, CHANNELS, GRID, IMAGE = 17, 4, (4, 4), (32, 32)
 TINY_MODEL = {
@@ -182,6 +185,31 @@ def model_config() -> Callable[..., WorldModelConfig]:
         return WorldModelConfig.model_validate(TINY_MODEL | changes)
 
     return make
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.fixture
+def killed_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], AbstractContextManager[object]]:
+    """Within the context, training is killed after so many optimiser steps."""
+
+    @contextmanager
+    def killed(steps: int) -> Iterator[None]:
+        inner, calls = TrainingRun.step, [0]
+
+        def step(run: TrainingRun[Any], number: int) -> Any:
+            if calls[0] == steps:
+                raise Killed("killed")
+            calls[0] += 1
+            return inner(run, number)
+
+        with monkeypatch.context() as patch, pytest.raises(Killed, match="killed"):
+            patch.setattr(TrainingRun, "step", step)
+            yield
+
+    return killed
 
 
 @pytest.fixture(scope="session")

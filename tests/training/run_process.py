@@ -19,11 +19,11 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from worldline_core.training import trainer
 from worldline_core.training.processes import gathered
 from worldline_core.training.stage import Stage
 from worldline_core.training.stage1 import train_stage1
 from worldline_core.training.stage2 import train_stage2
+from worldline_core.training.trainer import TrainingRun
 from worldline_core.training.training_config import Stage1Config, Stage2Config
 
 STEPS = {"train_stage1": (Stage1Config, train_stage1), "train_stage2": (Stage2Config, train_stage2)}
@@ -31,7 +31,7 @@ STEPS = {"train_stage1": (Stage1Config, train_stage1), "train_stage2": (Stage2Co
 
 def kill_before(step: int) -> None:
     """The last process kills itself when it comes to a step, once the states before are on the disk."""
-    inner = trainer._step
+    inner = TrainingRun.step
 
     def stepping(run: Any, at: int) -> Any:
         if int(os.environ["WORLD_SIZE"]) - 1 == int(os.environ["RANK"]) and at == step:
@@ -40,7 +40,7 @@ def kill_before(step: int) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return inner(run, at)
 
-    trainer._step = stepping
+    TrainingRun.step = stepping
 
 
 def keep_weights(path: Path) -> None:
@@ -62,9 +62,9 @@ def work(rank: int, request: dict[str, Any]) -> None:
         os.dup2(log.fileno(), 2)
     os.environ.update(request["environment"] | {"RANK": str(rank)})
     torch.set_num_threads(1)
-    originals = trainer._step, Stage.save
+    originals = TrainingRun.step, Stage.save
     for run in request["runs"]:
-        trainer._step, Stage.save = originals
+        TrainingRun.step, Stage.save = originals
         if "kill_before" in run:
             kill_before(run["kill_before"])
         output = Path(run["output"])

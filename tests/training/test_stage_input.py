@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load_file
 
 from flows.pipeline import chain
@@ -18,7 +20,6 @@ from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.store.artifact_files import read_json_lines
-from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.encode_latents import encode_latents
 from worldline_core.training.stage1 import train_stage1
@@ -106,26 +107,10 @@ def stage2(**changes: Any) -> Stage2Config:
     return Stage2Config.model_validate(values | changes)
 
 
-class Killed(Exception):
-    pass
-
-
-def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    inner, calls = trainer_module._step, [0]
-
-    def step(*arguments: Any) -> Any:
-        if calls[0] == steps:
-            raise Killed("killed")
-        calls[0] += 1
-        return inner(*arguments)
-
-    monkeypatch.setattr(trainer_module, "_step", step)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("forked_loaders")
 def test_stage2_goes_on_with_the_same_bytes(
-    world: Any, tokenizer: Path, first_stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: Any, tokenizer: Path, first_stage: Path, tmp_path: Path, killed_after: Callable[[int], Any]
 ) -> None:
     """Undisturbed in this process; killed and continued with a loader process: one checkpoint, to the byte."""
     inputs = {
@@ -136,10 +121,8 @@ def test_stage2_goes_on_with_the_same_bytes(
     }
     train_stage2(stage2(input=FRAMES), inputs, tmp_path / "whole")
     ahead = stage2(input={**FRAMES, "workers": 1, "decoder": "auto"})
-    with monkeypatch.context() as patch:
-        kill_after(patch, 2)
-        with pytest.raises(Killed, match="killed"):
-            train_stage2(ahead, inputs, tmp_path / "parts")
+    with killed_after(2):
+        train_stage2(ahead, inputs, tmp_path / "parts")
     train_stage2(ahead, inputs, tmp_path / "parts")
     whole, parts = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "parts"))
     assert whole.keys() == parts.keys()
@@ -147,6 +130,16 @@ def test_stage2_goes_on_with_the_same_bytes(
     assert losses(tmp_path / "whole") == losses(tmp_path / "parts")
     _, info = load_checkpoint(tmp_path / "parts", expect_kind="stage2")
     assert "skipped_clips" not in info.metadata
+
+
+def test_resident_latents_train_the_same_bytes(world: Any, latents: Path, first_stage: Path, tmp_path: Path) -> None:
+    inputs = {"episodes": world.episodes, "latents": latents, "tracks": world.tracks, "stage1": first_stage}
+    for name, resident in (("read", False), ("resident", True)):
+        train_stage2(stage2(input={"kind": "latents", "resident": resident}), inputs, tmp_path / name)
+    read, resident = (load_file(tmp_path / name / "model.safetensors") for name in ("read", "resident"))
+    assert all(torch.equal(read[name], resident[name]) for name in read)
+    with pytest.raises(ValidationError, match="resident"):
+        stage2(input={"kind": "latents", "resident": True, "workers": 1})
 
 
 def test_the_teacher_is_shown_the_frames_that_were_read(

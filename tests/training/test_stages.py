@@ -10,17 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
-from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError, TrainingError
+from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import stage as stage_module
-from worldline_core.training import trainer as trainer_module
 from worldline_core.training.clip_source import training_rows
-from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.stage1 import stage1_groups, train_stage1
 from worldline_core.training.stage2 import stage2_groups, train_stage2
 from worldline_core.training.training_config import Stage1Config, Stage2Config, TeacherConfig
@@ -78,10 +75,6 @@ def stage1_folder(world: Any, tiny_model: dict[str, object], tmp_path_factory: p
     return folder
 
 
-class Killed(Exception):
-    pass
-
-
 def digested(folder: Path) -> dict[str, bytes]:
     """Everything that belongs to the artifact: all but run/."""
     return {
@@ -91,30 +84,16 @@ def digested(folder: Path) -> dict[str, bytes]:
     }
 
 
-def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    inner, calls = trainer_module._step, [0]
-
-    def step(*arguments: Any) -> Any:
-        if calls[0] == steps:
-            raise Killed("killed")
-        calls[0] += 1
-        return inner(*arguments)
-
-    monkeypatch.setattr(trainer_module, "_step", step)
-
-
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bytes(
-    world: Any, stage1_folder: Path, teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: Any, stage1_folder: Path, teacher: Path, tmp_path: Path, killed_after: Callable[[int], Any]
 ) -> None:
     config = stage2(14, relational={"ramp_steps": 5})
     inputs = {**world.inputs, "stage1": stage1_folder, "teacher": teacher}
     train_stage2(config, inputs, tmp_path / "whole")
     for steps in (7, 6):
-        with monkeypatch.context() as patch:
-            kill_after(patch, steps)
-            with pytest.raises(Killed, match="killed"):
-                train_stage2(config, inputs, tmp_path / "parts")
+        with killed_after(steps):
+            train_stage2(config, inputs, tmp_path / "parts")
     # The second part began at the state saved after step 4: it repeated three steps and their log lines.
     torch.rand(5)
     train_stage2(config, inputs, tmp_path / "parts")
@@ -124,23 +103,16 @@ def test_a_killed_run_ends_with_the_same_bytes(
     assert all(row["relational_intra"] > 0 for row in rows)
 
 
-def test_a_state_of_another_run_is_refused(world: Any, stage1_folder: Path, tmp_path: Path) -> None:
-    inputs = {**world.inputs, "stage1": stage1_folder}
-    train_stage2(stage2(2), inputs, tmp_path)
-    with pytest.raises(ArtifactError, match="belongs to another run") as refused:
-        train_stage2(stage2(3), inputs, tmp_path)
-    assert "give it the config that it began with" in str(refused.value)
-
-
-def test_a_state_that_was_trained_on_other_episodes_is_refused(
+def test_a_state_of_another_run_or_other_episodes_is_refused(
     world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs = {**world.inputs, "stage1": stage1_folder}
     train_stage2(stage2(2), inputs, tmp_path)
+    with pytest.raises(ArtifactError, match="give it the config"):
+        train_stage2(stage2(3), inputs, tmp_path)
     monkeypatch.setattr(stage_module, "training_rows", lambda *args, **kwargs: list(training_rows(*args, **kwargs))[1:])
-    with pytest.raises(ArtifactError, match="belongs to another run") as refused:
+    with pytest.raises(ArtifactError, match="give it the episodes"):
         train_stage2(stage2(2), inputs, tmp_path)
-    assert "give it the episodes that it began with" in str(refused.value)
 
 
 def test_training_learns_and_the_controls_matter(world: Any, model_config: MakeConfig, tmp_path: Path) -> None:
@@ -287,30 +259,6 @@ def test_wrong_checkpoint_and_missing_teacher_are_named(
     with pytest.raises(CheckpointError, match="holds no relational teacher"):
         inputs = {**world.inputs, "stage1": stage1_folder, "teacher": tmp_path}
         train_stage2(stage2(2, relational={}), inputs, tmp_path / "out")
-
-
-def test_latents_and_losses_that_are_not_finite_stop_the_run(
-    world: Any, stage1_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    damaged = tmp_path / "latents"
-    shutil.copytree(world.latents, damaged)
-    tensors = load_file(damaged / "00000.safetensors")
-    save_file(
-        {name: torch.full_like(value, float("nan")) for name, value in tensors.items()}, damaged / "00000.safetensors"
-    )
-    inputs = {**world.inputs, "stage1": stage1_folder}
-    with pytest.raises(DataError, match="values that are not finite"):
-        train_stage2(stage2(2), inputs | {"latents": damaged}, tmp_path / "a")
-
-    inner = FlowMatchingObjective.loss
-
-    def broken(self: FlowMatchingObjective, batch: Any, generator: torch.Generator, step: int) -> Any:
-        loss, values = inner(self, batch, generator, step)
-        return (loss * float("inf") if step == 1 else loss), values
-
-    monkeypatch.setattr(FlowMatchingObjective, "loss", broken)
-    with pytest.raises(TrainingError, match=r"loss is not finite[\s\S]*step 1, clips episode"):
-        train_stage2(stage2(3), inputs, tmp_path / "b")
 
 
 def test_a_teacher_is_trained_and_frozen(world: Any, teacher: Path) -> None:

@@ -194,7 +194,7 @@ def train[BatchT: NamedBatch](
     """
     if not any(group.parameters for group in groups):
         raise ConfigError("There is nothing to train.", where=title, expected="at least one trainable parameter")
-    run = _Run(config, groups, objective, load, models, output, title)
+    run = TrainingRun(config, groups, objective, load, models, output, title)
     settings, states, average = config.optimizer, run.states, run.average
     digests = identity_digests(identity)
     done, seconds, best = 0, 0.0, math.inf
@@ -277,7 +277,7 @@ def train[BatchT: NamedBatch](
     return TrainingResult(dict(zip(names, average.average.values(), strict=True)), last, done)
 
 
-class _Run[BatchT: NamedBatch]:
+class TrainingRun[BatchT: NamedBatch]:
     """The parts of a run, and its optimiser step."""
 
     def __init__(

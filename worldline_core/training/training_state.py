@@ -69,8 +69,8 @@ class RunningMeans:
             self._totals[name] = (total + value, count + 1)
 
     def values(self) -> dict[str, float]:
-        """The mean of every name."""
-        return {name: total / count for name, (total, count) in self._totals.items()}
+        """The mean of every name, by name."""
+        return {name: total / count for name, (total, count) in sorted(self._totals.items())}
 
     def state(self) -> dict[str, tuple[float | None, int]]:
         """JSON values to continue from."""
