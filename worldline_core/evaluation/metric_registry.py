@@ -14,7 +14,7 @@ from typing import Any, Literal
 from worldline_core.errors import ConfigError
 
 Needs = Literal["tool_paths", "frames", "changed_controls", "features"]
-"""What a metric on request is a function of (`compute`):
+"""Arguments of a metric on request (`compute`):
 
 - ``tool_paths``: (true, found) places of the tools (n, arms, 2) in hundredths of the frame's height;
 - ``frames``: some frames in a row, a `SceneFrames`;

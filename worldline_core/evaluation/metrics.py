@@ -28,7 +28,7 @@ from torch.nn import functional
 from worldline_core.errors import DataError
 
 # Frames are stored in 8 bits. Rounding alone leaves a mean squared error of 1/12 grey level squared, so a smaller
-# error cannot be told from none: PSNR ends there (58.9 dB) instead of at infinity, and a mean over time stays finite.
+# error cannot be distinguished from none: PSNR ends there (58.9 dB) instead of at infinity, and a mean over time stays finite.
 QUANTISATION_MSE = 1.0 / (12.0 * 255.0**2)
 MAX_PSNR_DB = -10.0 * math.log10(QUANTISATION_MSE)
 

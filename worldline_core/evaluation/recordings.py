@@ -1,4 +1,4 @@
-"""What evaluation reads from other artifacts: recorded videos, exact masks, projected tool centres, predictions."""
+"""Readers of other artifacts: recorded videos, exact masks, projected tool centres, predictions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pictures(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One recorded or predicted video, as judges and selectors are given it; nothing in it tells the recorded outcome.
+    """One recorded or predicted video, as judges and selectors see it, without its outcome.
 
     Attributes:
         frames: by view; the views are synchronised. Only the frames that are asked for are decoded.

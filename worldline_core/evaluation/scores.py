@@ -153,12 +153,12 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence
 
 
 def part_file(folder: Path, *of: str | int) -> Path:
-    """Where the part of an evaluation lies that `of` names (a method, an episode, a seed): in `folder`, whatever they are."""
+    """Path in `folder` of one part of an evaluation (a method, an episode, a seed), whatever characters its names have."""
     return folder / f"{digest_value(of)[:32]}.json"
 
 
 def kept_part(path: Path, make: Callable[[], Any]) -> Any:
-    """What `make` returns, as JSON: written to `path` the first time and read from there, so killed steps continue."""
+    """Returns what `make` returns, as JSON: written to `path` the first time and read from there, so killed steps continue."""
     if not path.exists():
         write_json_atomic(path, make())
     return json.loads(path.read_text())

@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 MAX_NEW_TOKENS = 256
 MAX_ANSWER_CHARACTERS = 20_000
-"""What of an answer is looked through: 256 tokens take some kilobytes."""
+"""Part of an answer that is searched; 256 tokens take some kilobytes."""
 PROMPTS: dict[str, str] = tomllib.loads(Path(__file__).with_name("prompts.toml").read_text(encoding="utf-8"))
 """The paper's prompts by name, to be filled by `str.format`."""
 
@@ -95,7 +95,7 @@ class UnansweredMessageError(UnavailableError):
 
 
 def ask[T: Answer](model: VisionLanguageModel, parts: Sequence[Part], schema: type[T]) -> tuple[T, bool]:
-    """What a model says, read by `parse_answer`. No answer is as good as one that cannot be read: null, and counted.
+    """Ask a model and read its answer by `parse_answer`; an unanswered message counts as a malformed answer.
 
     Raises: UnavailableError when the model cannot be used at all.
     """
@@ -142,10 +142,10 @@ def _objects(text: str) -> Iterator[dict[str, Any]]:
 
 
 MAX_ANSWER_BYTES = 1 << 20
-"""Of a server's whole reply."""
+"""Limit of a server's whole reply."""
 _TRANSIENT_STATUS = frozenset({408, 429, 500, 502, 503, 504})
 _REFUSED_STATUS = frozenset({301, 302, 303, 307, 308, 401, 403, 404, 405})
-"""What a server answers to every message: the key, the address or the model's name is wrong."""
+"""Statuses that every message would get: the key, the address or the model's name is wrong."""
 _PATIENCE = 3
 """Messages in a row without an answer, after which a server cannot be used."""
 
@@ -183,7 +183,7 @@ class OpenAICompatibleModel:
         self.url = f"{config.url}".rstrip("/") + "/chat/completions"
         self.backoff_s = backoff_s
         self._key = _key(config.api_key_variable)
-        self._unanswered = 0
+        self._unanswered_count = 0
 
     def answer(self, parts: Sequence[Part]) -> str:
         """The model's text.
@@ -203,11 +203,11 @@ class OpenAICompatibleModel:
         try:
             text = self._text(self._post(json.dumps(body).encode()))
         except UnansweredMessageError as error:
-            self._unanswered += 1
-            if self._unanswered < _PATIENCE:
+            self._unanswered_count += 1
+            if self._unanswered_count < _PATIENCE:
                 raise
             raise self._unusable(f"{error.got}, and no answer to the {_PATIENCE - 1} messages before") from None
-        self._unanswered = 0
+        self._unanswered_count = 0
         return text
 
     def _post(self, body: bytes) -> bytes:
@@ -230,22 +230,18 @@ class OpenAICompatibleModel:
             reason, there = f"HTTP {status}: {answer.decode(errors='replace')}", status not in _REFUSED_STATUS
             if status not in _TRANSIENT_STATUS:
                 break
-        raise self._no_answer(reason) if there else self._unusable(reason)
+        raise self._unanswered(reason) if there else self._unusable(reason)
 
     def _text(self, answer: bytes) -> str:
         try:
             if len(answer) > MAX_ANSWER_BYTES:
                 raise ValueError(f"more than {MAX_ANSWER_BYTES:,} bytes")
-            reply = json.loads(answer)
-        except (ValueError, RecursionError) as error:
-            raise self._no_answer(f"no JSON: {error}") from error
-        try:
-            text = reply["choices"][0]["message"]["content"]
-        except (KeyError, IndexError, TypeError) as error:
-            raise self._no_answer("another form than choices[0].message.content") from error
+            text = json.loads(answer)["choices"][0]["message"]["content"]
+        except (ValueError, RecursionError, LookupError, TypeError) as error:
+            raise self._unanswered(f"no JSON with choices[0].message.content: {error}") from error
         return text if isinstance(text, str) else ""
 
-    def _no_answer(self, reason: str) -> UnansweredMessageError:
+    def _unanswered(self, reason: str) -> UnansweredMessageError:
         return UnansweredMessageError("The judge's server gave no answer", where=self.url, got=self._hidden(reason))
 
     def _unusable(self, reason: str) -> UnavailableError:

@@ -23,7 +23,7 @@ ARRAY_KINDS = "biufSU"
 """`numpy.dtype.kind` of what may be in a message: booleans, integers, reals, texts of fixed width."""
 _DTYPE = re.compile(rf"[<>|=]?[{ARRAY_KINDS}][1-9][0-9]{{0,7}}")
 _SCALARS = {"b": bool, "i": int, "u": int, "f": int | float, "S": bytes, "U": str}
-"""What a NumPy scalar is packed as; a number in the place of a text would be taken for its length."""
+"""Types that a NumPy scalar is packed as; a number in the place of a text would be taken for its length."""
 MAX_MESSAGE_BYTES = 64 << 20
 MAX_AXES = 16
 MAX_ITEMS = 65_536

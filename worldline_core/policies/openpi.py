@@ -49,8 +49,8 @@ class OpenpiPolicy(MessageSocket):
             raise
 
     def infer(self, observation: Mapping[str, Any], *, deadline_s: float | None = None) -> dict[str, Any]:
-        """What the policy answers to an observation: ``actions`` as float64 ``(horizon, size)``, and whatever else the
-        server says (``server_timing``).
+        """The reply to an observation: ``actions`` as float64 ``(horizon, size)``, and whatever else the server adds
+        (``server_timing``).
 
         Args:
             observation: texts, numbers and arrays under the names that this policy expects.
@@ -82,7 +82,7 @@ class OpenpiPolicy(MessageSocket):
 
 
 def is_healthy(url: str, *, deadline_s: float = 5.0) -> bool:
-    """Whether the server at a websocket address answers ``GET /healthz`` with status 200.
+    """Returns True if the server at a websocket address answers ``GET /healthz`` with status 200.
 
     Raises: UnavailableError: no server answers.
     """

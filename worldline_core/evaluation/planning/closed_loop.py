@@ -39,7 +39,7 @@ Stopped = Literal["candidates", "time", "certain"]
 
 @dataclass(frozen=True)
 class Situation:
-    """Where proposals begin.
+    """The state of an episode that proposals begin at.
 
     Attributes:
         images: by view, ``uint8 (H, W, 3)``: what the cameras see now.
@@ -57,7 +57,7 @@ class Situation:
 Propose = Callable[[Situation, int, np.random.Generator], Sequences]
 """So many sequences of ``situation.frames`` commands each: from a policy, from recordings, or drawn."""
 Score = Callable[[Trajectory], float]
-"""How good a video is, the higher the better: real pictures so far, then predicted ones, at the model's size."""
+"""Rates a video, the higher the better: real pictures so far, then predicted ones, at the model's size."""
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ def candidate_loader(
 
 
 def read_outcomes(path: Path, episode_ids: Sequence[str]) -> dict[str, bool]:
-    """Whether each candidate succeeded.
+    """Success of each candidate by the sealed labels.
 
     Raises:
         ArtifactError: without the file.

@@ -134,11 +134,10 @@ def chosen_outcomes(config: PolicyEvaluationConfig) -> tuple[str, ...]:
 def choose_trajectories(
     config: PolicyEvaluationConfig, rows: Sequence[EpisodeRow], times: Mapping[str, int]
 ) -> list[EpisodeRow]:
-    """As many successes as failures in every split and task family (unknown outcomes, where they are judged: all), drawn with
-    the seed; sorted by episode.
+    """Draw as many successes as failures in every split and task family (and all unknown outcomes, where they are judged).
 
     Args:
-        times: by episode, how many methods predicted it; those that more have predicted are taken first.
+        times: number of methods that predicted each episode; those that more have predicted are taken first.
     """
     outcomes = chosen_outcomes(config)
     groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = defaultdict(lambda: {name: [] for name in outcomes})
@@ -168,7 +167,7 @@ def open_judge(config: PolicyEvaluationConfig, segmenter: Path | None) -> Judge:
 
 
 def _decision(row: EpisodeRow, method: str, seed: int, verdict: Mapping[str, Any]) -> dict[str, Any]:
-    """A verdict with what its recording is; ``whole`` where the video shows the recording to its end."""
+    """A row of the decisions; ``whole`` where the video shows the recording to its end."""
     return {
         **{label: getattr(row, label) for label in _LABELS},
         **{key: verdict[key] for key in ("decided_by", "answers", "malformed_answers")},
@@ -193,8 +192,7 @@ def open_trust(
     tracks: ActionTracks | None,
     chosen: Sequence[EpisodeRow],
 ) -> TrustModel | None:
-    """The saved calibration of trust that the config names, or the training recordings; before anything is judged, for both may
-    not fit."""
+    """The saved calibration of trust or the training recordings; opened before the judging, which takes long, for they may not fit."""
     if config.trust is None:
         return None
     if tracks is None:

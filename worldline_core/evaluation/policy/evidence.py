@@ -1,11 +1,8 @@
-"""Evidence of the task families, which family an instruction belongs to, and the rules that decide from evidence.
+"""Evidence schemas of the task families, the router from instructions to families, and the rules that decide from evidence.
 
-Schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view). An answer that cannot be
-parsed becomes evidence in which every fact is null; it is counted.
-
-Router and rules: appendix "Evidence-based trajectory evaluation". Placing is a state change: what counts is where the
-object ends. The paper does not print its router; this one goes by the verbs. Only facts that are stated decide: a null
-is never taken for the favourable value, and a wrong object or a drop fails.
+Schemas: prompts P3..P5 of the paper. A fact is true, false, or null (hidden in every view); an answer that cannot be parsed becomes
+evidence in which every fact is null, and is counted. Router and rules: appendix "Evidence-based trajectory evaluation". The paper does
+not print its router; this one goes by the verbs. A null is never taken for the favourable value, and a wrong object or a drop fails.
 """
 
 from __future__ import annotations
@@ -115,7 +112,7 @@ def _contains(text: str, words: tuple[str, ...]) -> bool:
 
 
 def establishes_success(evidence: Evidence) -> bool:
-    """Whether the evidence establishes that the task was completed."""
+    """Returns True if the evidence establishes that the task was completed."""
     if evidence.wrong_object_or_drop is not False:
         return False
     if isinstance(evidence, GraspEvidence):
@@ -140,11 +137,10 @@ def motion_establishes_success(motion: MotionEvidence, evidence: Evidence) -> bo
 
 
 def failure_kind(family: EvidenceFamily, stated: Mapping[str, Any]) -> str:
-    """What the evidence of an unsuccessful video says went wrong.
+    """Names the failure of an unsuccessful video.
 
-    ``dropped`` (or the wrong object), ``missed`` (it never left its place, or was never held), ``slipped`` (it was raised
-    and is not held in the end), ``not done`` (the final state of a placing, closing or pressing is not seen), or ``not seen``
-    where the facts are hidden in every view.
+    ``dropped`` (or the wrong object), ``missed`` (never moved or never held), ``slipped`` (raised, and not held in the end), ``not done``
+    (the final state of a placing, closing or pressing is not visible), or ``not seen`` where the facts are hidden in every view.
     """
     if stated.get("wrong_object_or_drop"):
         return "dropped"

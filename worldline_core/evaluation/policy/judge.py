@@ -31,7 +31,7 @@ from worldline_core.evaluation.vlm import PROMPTS, Answer, Image, Part, Text, Vi
 
 @dataclass(frozen=True)
 class Extracted[T: Answer]:
-    """What a judge stated; ``well_formed`` is False when its answer could not be read (then every fact is null)."""
+    """Stated evidence; ``well_formed`` is False when the answer could not be read (then every fact is null)."""
 
     evidence: T
     well_formed: bool = True
@@ -90,8 +90,8 @@ def frames_at(positions: np.ndarray | tuple[float, ...], num_frames: int) -> tup
 
 
 def confidence_of(judgement: Mapping[str, Any]) -> float | None:
-    """Confidence in a verdict (of a `Judgement` as a dict): that of the evidence which established success, else the least that
-    was stated, for a failure is as sure as the least sure of its passes. None where none was stated."""
+    """Confidence in a verdict (a `Judgement` as a dict): of the evidence that established success, else the least of all passes; None
+    where none was stated."""
     stated = [float(s["confidence"]) for s in judgement["statements"] if s.get("confidence") is not None]
     if not stated:
         return None

@@ -104,7 +104,7 @@ class Measurement(Protocol):
     """A measured effect."""
 
     def score(self) -> float:
-        """How likely the task is done, 0..1: the facts with soft thresholds, multiplied."""
+        """Likelihood that the task is done, 0..1: the facts with soft thresholds, multiplied."""
         ...
 
     def evidence(self, names: Sequence[str], family: EvidenceFamily) -> Evidence:
@@ -255,7 +255,7 @@ def measure_lift(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
 def measure_place(
     frames: Mapping[str, np.ndarray], thing: ColouredThing, destination: ColouredThing
 ) -> PlaceMeasurement:
-    """Where the object is in the end, against where the destination was seen best."""
+    """Final place of the object against the best view of the destination."""
     item, place = sight(frames[HEAD], thing), sight(frames[HEAD], destination)
     late = item.seen(_VISIBLE)
     late[:-LATE_COUNT] = False
@@ -271,7 +271,7 @@ def measure_place(
 
 
 def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_late: np.ndarray) -> PushMeasurement:
-    """How much of a drawer still sticks out."""
+    """Part of a drawer that still sticks out."""
     head = sight(frames[HEAD], thing)
     best = int(np.argmax(head.area))
     if not head.seen(_CLEAR)[best]:
@@ -289,7 +289,7 @@ def measure_push(frames: Mapping[str, np.ndarray], thing: ColouredThing, robot_l
 
 
 def measure_press(frames: Mapping[str, np.ndarray], thing: ColouredThing) -> PressMeasurement:
-    """How much larger a button's colour has become."""
+    """Growth of a button's colour."""
     head = sight(frames[HEAD], thing)
     first = float(head.area[:LATE_COUNT].max())
     if first < _MIN_AREA_FRACTION * head.shares[0].size:
@@ -331,7 +331,7 @@ def _held(
 
 
 def _edges(share: np.ndarray) -> tuple[float, float]:
-    """Rows above and below which a tenth of the area lies: the far and the near edge."""
+    """Far and near edge: the rows beyond which a tenth of the area is."""
     rows = np.cumsum(share.sum(axis=1))
     return float(np.searchsorted(rows, 0.1 * rows[-1])), float(np.searchsorted(rows, 0.9 * rows[-1]))
 

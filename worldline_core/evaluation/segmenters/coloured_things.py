@@ -45,7 +45,7 @@ def named_things(instruction: str) -> tuple[ColouredThing, ...]:
 
 
 def colour_share(frames: np.ndarray, colour: str) -> np.ndarray:
-    """How much of each pixel has the colour, 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3)."""
+    """Share of each pixel that has the colour, 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3)."""
     pixels = frames.reshape(1, -1, 3).astype(np.float32) / 255.0
     hue, saturation, value = np.moveaxis(cv2.cvtColor(pixels, cv2.COLOR_RGB2HSV)[0], -1, 0)
     distance = np.abs((hue - HUES_DEG[colour] + 180.0) % 360.0 - 180.0)
@@ -83,17 +83,17 @@ def own_colour(frames: np.ndarray, colour: str) -> OwnColour | None:
 
 
 def likeness(frames: np.ndarray, own: OwnColour) -> np.ndarray:
-    """How much of each pixel is of the thing, 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3)."""
+    """Share of each pixel that is of the thing, 0..1: float32 (n, h, w) for uint8 frames (n, h, w, 3)."""
     return np.clip((_projection(frames, own.rgb) - own.none) / _LIKENESS_RANGE, 0, 1).astype(np.float32)
 
 
 def thing_share(frames: np.ndarray, colour: str, own: OwnColour | None) -> np.ndarray:
-    """How much of each pixel is of the thing: by its own colour where that was seen, else by the colour's word."""
+    """Share of each pixel that is of the thing, by its own colour where that was seen, else by the colour's word."""
     return colour_share(frames, colour) if own is None else likeness(frames, own)
 
 
 def _projection(frames: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """Chroma (..., h, w) along that of ``rgb``, in its units, less what lies beside that line: another hue."""
+    """Chroma (..., h, w) along that of ``rgb``, in its units, less the chroma of another hue."""
     axis = rgb - rgb.mean()
     strength = max(float(np.linalg.norm(axis)), 1e-6)
     axis = axis / strength

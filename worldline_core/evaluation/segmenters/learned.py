@@ -93,7 +93,7 @@ def _double_convolution(cin: int, cout: int) -> nn.Sequential:
 
 
 class _Described(BaseModel):
-    """What of a description the network needs; trainings add what they did."""
+    """Fields of a description that the network needs."""
 
     widths: tuple[Annotated[int, Field(ge=_GROUPS, le=1 << 16, multiple_of=_GROUPS)], ...] = Field(
         min_length=1, max_length=16

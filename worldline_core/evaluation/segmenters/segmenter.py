@@ -33,7 +33,7 @@ class Segmenter(Protocol):
 
     @property
     def follows(self) -> bool:
-        """Whether it tracks the robot from the first frame on (rather than masking each frame by itself)."""
+        """True where it tracks the robot from the first frame on, False where it masks each frame by itself."""
         ...
 
     def segment(self, video: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -50,7 +50,7 @@ class Segmenter(Protocol):
         ...
 
     def stream(self) -> MaskStream:
-        """As :meth:`segment`, but for a video that comes piece by piece."""
+        """:meth:`segment` for a video that comes piece by piece."""
         ...
 
 

@@ -78,7 +78,7 @@ class ToolFinder:
 
 
 def _fit(true: np.ndarray, predicted: np.ndarray, point: np.ndarray, start: np.ndarray) -> np.ndarray | None:
-    """Where in ``predicted`` the outline around ``point`` in ``true`` fits best near ``start``; u, v [px]."""
+    """Place u, v [px] in ``predicted`` near ``start`` where the outline around ``point`` in ``true`` fits best."""
     height = len(true)
     half, step = (max(2, round(fraction * height)) for fraction in (OUTLINE_FRACTION, STEP_FRACTION))
     (u, v), (x, y) = np.rint(point).astype(int), np.rint(start).astype(int)
