@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from huggingface_hub import ModelCard
 
 from flows.command_line import main
 from tests.hub.conftest import Hub, Repository
@@ -75,6 +76,8 @@ def test_the_card_says_what_the_manifest_and_the_description_say(tmp_path: Path,
         "steps: 20, seed 0", "- loss: 0.25", "- sigma_px_ref: 40.0", "- fps: 8.0", "torch 2.11", "Of the weights: not stated",
     ):  # fmt: skip
         assert said in card
+    results = ModelCard.load(tmp_path / "out" / "README.md").data.eval_results
+    assert ("loss", 0.25) in [(found.metric_type, found.metric_value) for found in results]
 
 
 @pytest.mark.parametrize("absolute", [False, True])

@@ -6,11 +6,11 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import torch
-import yaml
 
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
@@ -154,18 +154,32 @@ def model_card(info: CheckpointInfo, manifest: Mapping[str, Any], license_name: 
         manifest: of the step that trained it; an empty one leaves out what it would say.
         license_name: of the weights; nothing is claimed where it is not given.
     """
-    header = {"library_name": "worldline", "tags": ["robotics", "world-model", "image-to-video"]}
-    header |= {"license": license_name} if license_name else {}
+    from huggingface_hub import EvalResult, ModelCard, ModelCardData
+
+    metrics = _metrics(info, manifest)
+    dataset = {
+        "task_type": "image-to-video",
+        "dataset_type": "robotics",
+        "dataset_name": "the recordings that it was trained on",
+    }
+    data = ModelCardData(
+        library_name="worldline",
+        license=license_name,
+        tags=["robotics", "world-model", "image-to-video"],
+        model_name=f"WorldLine {info.kind}" if metrics else None,
+        eval_results=[EvalResult(**dataset, metric_type=name, metric_value=value) for name, value in metrics.items()]
+        or None,
+    )
     sections = [
-        f"---\n{yaml.safe_dump(header, sort_keys=True)}---",
+        f"---\n{data.to_yaml()}\n---",
         f"# WorldLine {info.kind}\n\nA {_KINDS[info.kind]}.",
         _usage(info),
         "## Trained on\n\n" + "\n".join(_training(info, manifest)),
-        "## Reached\n\n" + ("\n".join(_metrics(info, manifest)) or f"Metrics: {UNKNOWN}."),
+        "## Reached\n\n" + ("\n".join(f"- {name}: {value:.4g}" for name, value in metrics.items()) or f"Metrics: {UNKNOWN}."),
         "## Contract\n\nData that contradict it are refused by name before the first step.\n\n" + "\n".join(_contract(info)),
         f"## Licence\n\nOf the weights: {license_name or UNKNOWN}. The licences of what it was trained on hold as well.",
     ]  # fmt: skip
-    return "\n\n".join(sections) + "\n"
+    return str(ModelCard("\n\n".join(sections) + "\n"))
 
 
 def write_model_card(folder: Path, info: CheckpointInfo, license_name: str | None = None) -> Path:
@@ -215,11 +229,11 @@ def _training(info: CheckpointInfo, manifest: Mapping[str, Any]) -> Iterator[str
         yield f"- made by: step {manifest.get('step')} version {manifest.get('version')}, {packages}"
 
 
-def _metrics(info: CheckpointInfo, manifest: Mapping[str, Any]) -> Iterator[str]:
+def _metrics(info: CheckpointInfo, manifest: Mapping[str, Any]) -> dict[str, float]:
     found = info.metadata.get("metrics") or manifest.get("metrics", {})
-    for name, value in sorted(found.items()):
-        if isinstance(value, int | float):
-            yield f"- {name}: {value:.4g}"
+    return {
+        n: v for n, v in sorted(found.items()) if isinstance(v, int | float) and not isinstance(v, bool) and isfinite(v)
+    }
 
 
 def _contract(info: CheckpointInfo) -> Iterator[str]:
