@@ -65,6 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="the EpisodeSet of tracks or predictions (default: see manifest)",
     )
     inspect.add_argument("--episode", metavar="ID", help="the episode to show (default: the first one)")
+    inspect.add_argument("--video", action="store_true", help="write a video of it: controls drawn over all views")
     inspect.add_argument("--rerun", action="store_true", help="write a Rerun recording of it (open with: rerun FILE)")
     inspect.add_argument("--json", action="store_true", help="print JSON")
     inspect.set_defaults(run=_inspect)
@@ -213,6 +214,7 @@ def _inspect(arguments: argparse.Namespace) -> None:
         arguments.output,
         episodes=arguments.episodes,
         episode_id=arguments.episode,
+        video=arguments.video,
         rerun=arguments.rerun,
     )
     if arguments.json:

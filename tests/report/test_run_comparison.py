@@ -82,14 +82,10 @@ def test_reports_and_nights_are_runs(tmp_path: Path, capsys: pytest.CaptureFixtu
     (report / "manifest.json").write_text(json.dumps({"inputs": {"evaluate_video": {"path": "evaluate_video/aa"}}}))
     history = tmp_path / "nightly"
     record_night(history, "monday", {"evaluate_video": b})
-    main(["compare", str(report), f"{history}:monday", "--json", "--scores", str(tmp_path / "tidy.parquet")])
+    main(["compare", str(report), f"{history}:monday", "--json"])
     rows = {(row["group"], row["metric"]): row for row in json.loads(capsys.readouterr().out)}
     direct = {(row.group, row.metric): row for row in compare_runs(f"{a}", f"{b}")}
     assert rows["test", "ssim@head"]["difference"] == direct["test", "ssim@head"].difference
-    tidy = pq.read_table(tmp_path / "tidy.parquet").to_pandas()
-    assert list(tidy.columns) == ["source", "evaluation", "group", "method", "metric", "recording", "value"]
-    assert not tidy.duplicated(["source", "group", "method", "metric", "recording"]).any()
-    assert len(tidy.query("group == 'test' and metric == 'ssim@head' and source.str.endswith('rr')")) == NUMBER
     main(["compare", str(report), str(b)])
     heading, *lines = capsys.readouterr().out.splitlines()
     assert heading.split() == ["metric", "group", "method", "first", "second", "difference", "95", "%", "n", "better"]

@@ -134,7 +134,6 @@ class Table:
 
     Attributes:
         numeric: positions of the columns with numbers, aligned right.
-        emphasise: numbers of the rows to set in bold.
         dense: intervals stand below their values, for tables of many columns.
     """
 
@@ -142,7 +141,6 @@ class Table:
     rows: Sequence[Sequence[object]]
     numeric: Iterable[int] = ()
     caption: str = ""
-    emphasise: Iterable[int] = ()
     dense: bool = False
 
     def __post_init__(self) -> None:
@@ -151,6 +149,4 @@ class Table:
             raise ValueError(f"a row of {len(wrong)} cells in a table of {len(self.headings)} columns: {list(wrong)}")
 
     def __html__(self) -> Markup:
-        return render_macro(
-            "pages/parts.html", "table", shown=self, numeric=set(self.numeric), bold=set(self.emphasise)
-        )
+        return render_macro("pages/parts.html", "table", shown=self, numeric=set(self.numeric))

@@ -38,7 +38,7 @@ from worldline_core.evaluation.paired import (
     sign_of,
     write_series,
 )
-from worldline_core.evaluation.scores import SCORES_FILE, SUMMARY_FILE, Interval, write_table
+from worldline_core.evaluation.scores import SCORES_FILE, SUMMARY_FILE, Interval
 from worldline_core.store.artifact_files import (
     MANIFEST_NAME,
     JsonObject,
@@ -219,18 +219,6 @@ def as_table(rows: Sequence[Difference]) -> str:
     lines = [tuple(map(visible, line)) for line in lines]
     widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
     return "\n".join("  ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)).rstrip() for line in lines)
-
-
-def write_tidy(path: Path, places: Sequence[str]) -> None:
-    """Write the scores of several runs as one Parquet table: a row each run, recording, method and metric of a group."""
-    columns = ("source", "evaluation", "group", "method", "metric", "recording", "value")
-    rows = []
-    for place in places:
-        for name, values in read_run(place).items():
-            what, group, method, metric = name.split("/", 3)
-            known = place, what, group.replace("|", "/"), method, metric
-            rows += [dict(zip(columns, (*known, *item), strict=True)) for item in values.items()]
-    write_table(path, rows, columns)
 
 
 # A night and the nights before it

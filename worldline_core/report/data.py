@@ -180,7 +180,6 @@ def data_section(context: ReportContext) -> Section:
         TITLE,
         facts.summary,
         facts=facts,
-        scenes=scene_table(facts),
         sheet=sheet,
         chart=funnel_chart(stages, title="Episodes from source to training"),
         kept=kept,
@@ -190,17 +189,6 @@ def data_section(context: ReportContext) -> Section:
         samples=sample_table(context),
         problems=[*(f"No picture of {line}" for line in unreadable), *problems],
     )
-
-
-def scene_table(facts: DatasetFacts) -> Table:
-    """Every scene with its robots and splits."""
-    counts = facts.count_table("Scene", lambda row: row.scene)
-    rows = []
-    for scene, _, *numbers in counts.rows:
-        own = [row for row in facts.rows if row.scene == scene]
-        robots, splits = sorted({row.embodiment for row in own}), sorted({words(row.split) for row in own})
-        rows.append([scene, ", ".join(robots), ", ".join(splits), *numbers])
-    return Table(("Scene", "Embodiments", "Split", *counts.headings[2:]), rows, range(3, 8))
 
 
 def reason_table(refusals: Sequence[Refusal]) -> Table | None:

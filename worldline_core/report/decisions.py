@@ -235,7 +235,6 @@ def planning_evaluation(summary: JsonObject) -> dict[str, object]:
         "charts": [success, gain],
         "budgets": Table(headings, rows, range(1, len(headings)), caption),
         "families": family_table(summary),
-        "bank_table": bank_table(summary),
     }
 
 
@@ -271,18 +270,6 @@ def family_table(summary: JsonObject) -> Table:
         rows.append([words(family), len(values), share(sum(values) / len(values)), *cells])
     headings = ["Task", "Banks", "Direct", *[m.long_label for m in methods]]
     return Table(headings, rows, range(1, len(headings)), "Success of the choice among the most candidates, by task")
-
-
-def bank_table(summary: JsonObject) -> Table:
-    """The share of runs (orders of the candidates) whose choice succeeds, by bank."""
-    methods = in_order(summary["methods"])
-    rows: list[list[object]] = []
-    for bank, facts in sorted(summary["banks"].items()):
-        chosen = [most_candidates(summary["methods"][m.name]).get("banks", {}).get(bank) for m in methods]
-        known = [facts[key] for key in ("embodiment", "instruction", "candidates")]
-        rows.append([bank, *known, share(facts["direct_success"]), *map(share, chosen)])
-    headings = ["Bank", "Embodiment", "Instruction", "N", "Direct", *[m.long_label for m in methods]]
-    return Table(headings, rows, range(3, len(headings)))
 
 
 def share(value: float | None) -> str | None:

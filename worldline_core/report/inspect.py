@@ -24,6 +24,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
+from worldline_core.evaluation.recordings import stride_of
 from worldline_core.exports.export import export_rollout, recording_content, shown_tracks
 from worldline_core.exports.rerun_recording import write_filter_recording, write_rerun_recording
 from worldline_core.filters.filter import inspect as find_defects
@@ -88,6 +89,7 @@ def inspect(
     *,
     episodes: Path | None = None,
     episode_id: str | None = None,
+    video: bool = False,
     rerun: bool = False,
 ) -> Inspection:
     """Verify and describe an artifact, and write a page with pictures of it.
@@ -96,6 +98,7 @@ def inspect(
         output: folder of `index.html` and its media; default: `run/inspect` of the artifact, which belongs to no digest.
         episodes: the EpisodeSet of tracks or predictions, or the one that was filtered; default: by the manifest.
         episode_id: the episode to show; default: the first one.
+        video: also write a video of the episode, with its controls drawn over all views or its prediction beside the truth.
         rerun: also write Rerun recordings of the episode.
 
     Raises:
@@ -107,11 +110,11 @@ def inspect(
     kind = kind_of(folder)
     lines = describe(kind, folder)
     if kind not in PICTURED:
-        if rerun or episode_id is not None:
+        if video or rerun or episode_id is not None:
             raise ConfigError("There are no pictures of this kind of artifact", expected=" | ".join(PICTURED), got=kind)
         return Inspection(kind, lines)
     subject = _Subject(kind, folder, episodes, output or folder / "run" / "inspect")
-    subject.write(episode_id, rerun=rerun)
+    subject.write(episode_id, video=video, rerun=rerun)
     page = render(
         "report/inspect.html",
         title=f"{kind} {folder.resolve().name}",
@@ -224,7 +227,7 @@ class _Subject:
         self.written.append(self.output / f"{name}.jpg")
         write_bytes_atomic(self.written[-1], jpeg_bytes(picture))
 
-    def write(self, episode_id: str | None, *, rerun: bool) -> None:
+    def write(self, episode_id: str | None, *, video: bool, rerun: bool) -> None:
         """Write everything that the page shows."""
         if self.filtered is not None:
             whole = None
@@ -234,7 +237,7 @@ class _Subject:
             known = {row.episode_id for row in self.episodes.rows}
             if whole in self.filtered.outcomes and episode_id not in known:
                 return  # dropped, or cut into segments with other names
-        if self.episodes_folder is None and episode_id is None and not rerun:
+        if self.episodes_folder is None and episode_id is None and not (video or rerun):
             self.notes.append("one episode is not shown: the EpisodeSet is unknown (--episodes FOLDER)")
             if self.kind == "RolloutSet":
                 self.picture("contact_sheet", contact_sheet(self.prediction_rows()))
@@ -247,7 +250,7 @@ class _Subject:
             rows = self.prediction_rows() if self.kind == "RolloutSet" else []
         if rows:
             self.picture("contact_sheet", contact_sheet(rows))
-        self.write_episode(self.first_episode if episode_id is None else episode_id, rerun=rerun)
+        self.write_episode(self.first_episode if episode_id is None else episode_id, video=video, rerun=rerun)
 
     @property
     def first_episode(self) -> str:
@@ -272,27 +275,42 @@ class _Subject:
             rows.append(SheetRow(f"{self.rollouts.method}  ·  {name}", shown, views[name]))
         return rows
 
-    def write_episode(self, episode_id: str, *, rerun: bool) -> None:
-        """One episode: moments and a video with its controls, or its prediction beside the truth; and a Rerun recording."""
-        stem = safe_stem(episode_id)
-        if self.kind == "RolloutSet":
-            predicted = {self.rollouts.method: self.rollouts}
-            self.written += export_rollout(predicted, self.episodes, None, episode_id, self.output, ("mp4",))
-        position = self.episodes.position(episode_id)
+    def compared_rows(self, episode_id: str) -> list[SheetRow]:
+        """Recorded above predicted moments of one episode, in every view."""
+        if episode_id not in self.rollouts.episode_ids:
+            raise DataError("No prediction of this episode", where=self.folder, got=episode_id)
+        position, rows = self.episodes.position(episode_id), list[SheetRow]()
+        stride = stride_of(self.rollouts, self.episodes.rows[position])
+        for view in self.rollouts.views(episode_id):
+            predicted = VideoFrames(self.rollouts.clip(episode_id, view))
+            moments = evenly_spaced(len(predicted), MOMENTS)
+            recorded = np.asarray(self.episodes.frames(position, view, [stride * moment for moment in moments]))
+            rows += [SheetRow(f"{view}, recorded", recorded), SheetRow(f"{view}, predicted", predicted[moments])]
+        return rows
+
+    def write_episode(self, episode_id: str, *, video: bool, rerun: bool) -> None:
+        """Moments of one episode, with its controls or beside its prediction; a video and a Rerun recording of the same."""
+        stem, position = safe_stem(episode_id), self.episodes.position(episode_id)
         row = self.episodes.rows[position]
         tracks = None
         try:
             tracks = self.tracks(episode_id)
         except WorldLineError as error:
             self.notes.append(f"no controls are shown: {error.what} ({error.where})")
-        if tracks is not None and self.kind != "RolloutSet":
-            title = f"{row.embodiment}  ·  {row.instruction}"
+        title = f"{row.embodiment}  ·  {row.instruction}"
+        if self.kind == "RolloutSet":
+            self.picture(f"{stem}_prediction", contact_sheet(self.compared_rows(episode_id), title=title))
+            if video:
+                predicted = {self.rollouts.method: self.rollouts}
+                self.written += export_rollout(predicted, self.episodes, None, episode_id, self.output, ("mp4",))
+        elif tracks is not None:
             sheet = episode_overlay(self.episodes, position, tracks, self.sigma_px_ref, f"{episode_id}  ·  {title}")
             self.picture(f"{stem}_controls", sheet)
-            frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
-            path = self.output / f"{stem}.mp4"
-            write_overlay_video(path, frames, tracks, row.fps, style=OverlayStyle(self.sigma_px_ref), title=title)
-            self.written.append(path)
+            if video:
+                frames = {view: VideoFrames(self.episodes.clip(position, view)) for view in row.views}
+                self.written.append(self.output / f"{stem}.mp4")
+                style = OverlayStyle(self.sigma_px_ref)
+                write_overlay_video(self.written[-1], frames, tracks, row.fps, style=style, title=title)
         if rerun:
             rollouts = {self.rollouts.method: self.rollouts} if self.kind == "RolloutSet" else {}
             content = recording_content(rollouts, self.episodes, tracks, episode_id, sigma_px_ref=self.sigma_px_ref)
