@@ -56,7 +56,7 @@ from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.filters.filter import filter_episodes
 from worldline_core.filters.filter_config import FilterConfig
-from worldline_core.scale.mapping import Shard, TakeOutcome, do_shard
+from worldline_core.scale.mapping import Outcome, Shard, do_shard
 from worldline_core.store.store import ArtifactStore
 
 SIZE, FPS, TURNS = (480, 640), 30.0, 3
@@ -174,10 +174,10 @@ class Processes:
     def __init__(self, count: int) -> None:
         self.pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"))
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
         del one_at_a_time
         for shard, _ in zip(shards, self.pool.map(do_shard, shards), strict=True):
-            take(shard, None)
+            yield shard, None
 
 
 def processor_seconds(work: Callable[[], object]) -> float:

@@ -10,7 +10,7 @@ from prefect import flow
 
 from flows.pipeline import Inputs, choose, evaluate, predict, prepare, prepare_banks, train
 from tasks.ablation_table import ablation_table
-from tasks.execution.chain import variant
+from tasks.execution.artifact_task import variant
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.pipeline.ablations import FULL, METHOD, LoadConfig, choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig

@@ -13,7 +13,8 @@ from tasks.encode_latents import encode_latents
 from tasks.evaluate_planning import evaluate_planning
 from tasks.evaluate_policy import evaluate_policy
 from tasks.evaluate_video import evaluate_video
-from tasks.execution.chain import TaskCall, outline
+from tasks.execution.artifact_task import TaskCall
+from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from tasks.filter import filter_episodes

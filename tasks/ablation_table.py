@@ -13,4 +13,6 @@ ablation_table = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    ablation_table.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(ablation_table)

@@ -13,4 +13,6 @@ curate = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    curate.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(curate)

@@ -14,4 +14,6 @@ distill = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    distill.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(distill)

@@ -13,4 +13,6 @@ encode_latents = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    encode_latents.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(encode_latents)

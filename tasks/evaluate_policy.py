@@ -13,4 +13,6 @@ evaluate_policy = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    evaluate_policy.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(evaluate_policy)

@@ -13,4 +13,6 @@ filter_episodes = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    filter_episodes.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(filter_episodes)

@@ -12,4 +12,6 @@ import_backbone = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    import_backbone.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(import_backbone)

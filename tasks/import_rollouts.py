@@ -12,4 +12,6 @@ import_rollouts = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    import_rollouts.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(import_rollouts)

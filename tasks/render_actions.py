@@ -13,4 +13,6 @@ render_actions = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    render_actions.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(render_actions)

@@ -12,4 +12,6 @@ report = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    report.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(report)

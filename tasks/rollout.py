@@ -13,4 +13,6 @@ rollout = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    rollout.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(rollout)

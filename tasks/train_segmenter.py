@@ -13,4 +13,6 @@ train_segmenter = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    train_segmenter.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(train_segmenter)

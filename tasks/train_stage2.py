@@ -14,4 +14,6 @@ train_stage2 = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    train_stage2.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(train_stage2)

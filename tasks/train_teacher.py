@@ -12,4 +12,6 @@ train_teacher = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    train_teacher.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(train_teacher)

@@ -13,4 +13,6 @@ train_tokenizer = ArtifactTask(
 )
 
 if __name__ == "__main__":
-    train_tokenizer.main()
+    from tasks.execution.command_line import run_task_command
+
+    run_task_command(train_tokenizer)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tasks
-from tasks.execution.chain import TaskCall, active_run
 from worldline_core.config import StrictModel
 from worldline_core.errors import ConfigError
 from worldline_core.scale.process import same_threads
@@ -92,23 +93,17 @@ class ArtifactTask:
 
         return store.run(self.name, self.version, work, config, inputs, distributed=self.distributed)
 
-    def main(self) -> None:
-        """Run the verb alone, from the command line: ``python -m tasks.<name>``."""
-        from tasks.execution.command_line import run_task_command
-
-        run_task_command(self)
-
     def key(self, store: ArtifactStore, config: StrictModel, digests: Mapping[str, str]) -> str:
         """Content key of the artifact, given the digests of its inputs."""
         return store.key(self.name, self.version, config, dict(sorted(digests.items())))
 
     def load_function(self) -> Callable[..., dict[str, Any]]:
         """The core function."""
-        return _load(self.function)
+        return load_object(self.function)
 
     def load_config(self) -> type[StrictModel]:
         """The configuration's class."""
-        return _load(self.config)
+        return load_object(self.config)
 
     def check_inputs(self, names: Mapping[str, Any]) -> None:
         """Raises ConfigError for a missing or an unknown input."""
@@ -122,6 +117,89 @@ class ArtifactTask:
                 got=f"missing {missing}, unknown {unknown}",
                 next_step=f"give each as --input NAME=FOLDER, or run the steps before {self.name} with the same preset",
             )
+
+
+@dataclass(frozen=True, eq=False)
+class TaskCall:
+    """One call of a task: its name in the run, its configuration, and where its inputs come from."""
+
+    name: str
+    task: ArtifactTask
+    config: StrictModel
+    inputs: Mapping[str, TaskCall | Path]
+
+    @property
+    def upstream(self) -> list[TaskCall]:
+        """The calls whose results this one needs."""
+        return [source for source in self.inputs.values() if isinstance(source, TaskCall)]
+
+    @property
+    def command(self) -> str:
+        """The command that runs this call alone."""
+        return f"worldline task {self.task.name}" + ("" if self.name == self.task.name else f" --name {self.name}")
+
+
+class Outline:
+    """The calls of a chain, by name and in order. Equal calls are one call, so that variants share what they can.
+
+    Attributes:
+        suffix: appended to the names of new calls (``.head_only``): tells the variants of a run apart.
+    """
+
+    def __init__(self) -> None:
+        self.calls: dict[str, TaskCall] = {}
+        self.suffix = ""
+        self._by_content: dict[tuple[Any, ...], TaskCall] = {}
+
+    def call(
+        self, task: ArtifactTask, config: StrictModel, name: str, inputs: Mapping[str, TaskCall | Path]
+    ) -> TaskCall:
+        sources = sorted((key, s.name if isinstance(s, TaskCall) else s) for key, s in inputs.items())
+        content = (task.name, config.model_dump_json(), tuple(map(str, sources)))
+        if content not in self._by_content:
+            new = TaskCall(name + self.suffix, task, config, dict(inputs))
+            if new.name in self.calls:
+                raise ConfigError("Two different calls have one name", got=new.name, next_step="give one a name")
+            self._by_content[content] = self.calls[new.name] = new
+            self.begin(new)
+        return self._by_content[content]
+
+    def begin(self, call: TaskCall) -> None:
+        """Receive a new call; an outline only keeps it."""
+
+
+_active: ContextVar[Outline] = ContextVar("active_run")
+
+
+def active_run() -> Outline:
+    """The run that receives calls now. Raises ConfigError outside of a run."""
+    run = _active.get(None)
+    if run is None:
+        raise ConfigError(
+            "A task was submitted outside of a run", next_step="call it in a flow of this project, or use `run`"
+        )
+    return run
+
+
+@contextmanager
+def activated(run: Outline) -> Iterator[None]:
+    """Let `run` receive the calls made in the context."""
+    token = _active.set(run)
+    try:
+        yield
+    finally:
+        _active.reset(token)
+
+
+@contextmanager
+def variant(name: str) -> Iterator[None]:
+    """Append a variant to the names of new calls in the context: ``train_stage2.<name>``; none for the empty name."""
+    run = active_run()
+    before, run.suffix = run.suffix, f".{name}" if name else ""
+    try:
+        yield
+    finally:
+        run.suffix = before
 
 
 def task_names() -> list[str]:
@@ -140,7 +218,8 @@ def find_task(name: str) -> ArtifactTask:
     return next(value for value in vars(module).values() if isinstance(value, ArtifactTask))
 
 
-def _load(address: str) -> Any:
+def load_object(address: str) -> Any:
+    """The object at ``module:name``."""
     module, _, name = address.partition(":")
     return getattr(importlib.import_module(module), name)
 

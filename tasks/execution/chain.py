@@ -1,109 +1,18 @@
-"""Calls of tasks in a chain, and the runs that receive them.
+"""A chain as data: which call needs what, for whoever must know it without running it.
 
-A chain is a plain function that calls ``task.submit``; `flows/pipeline.py` has the project's. What a call does is the
-business of the active run: `PrefectRun` makes Prefect tasks of them, `Outline` writes them down, so that whoever must know
-the chain (a step run alone, the rehearsal, a test) walks the same function instead of a second description of it.
+A chain is a plain function that calls ``task.submit``; `flows/pipeline.py` has the project's. A step run alone, the rehearsal
+and the tests walk the same function as an outline instead of a second description of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from worldline_core.config import StrictModel
+from tasks.execution.artifact_task import Outline, TaskCall, activated
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.store.store import Artifact, ArtifactStore
-
-if TYPE_CHECKING:
-    from tasks.execution.artifact_task import ArtifactTask
-
-
-@dataclass(frozen=True, eq=False)
-class TaskCall:
-    """One call of a task: its name in the run, its configuration, and where its inputs come from."""
-
-    name: str
-    task: ArtifactTask
-    config: StrictModel
-    inputs: Mapping[str, TaskCall | Path]
-
-    @property
-    def upstream(self) -> list[TaskCall]:
-        """The calls whose results this one needs."""
-        return [source for source in self.inputs.values() if isinstance(source, TaskCall)]
-
-    @property
-    def command(self) -> str:
-        """The command that runs this call alone."""
-        return f"worldline task {self.task.name}" + ("" if self.name == self.task.name else f" --name {self.name}")
-
-
-class Outline:
-    """The calls of a chain, by name and in order. Equal calls are one call, so that variants share what they can.
-
-    Attributes:
-        suffix: appended to the names of new calls (``.head_only``): tells the variants of a run apart.
-    """
-
-    def __init__(self) -> None:
-        self.calls: dict[str, TaskCall] = {}
-        self.suffix = ""
-        self._by_content: dict[tuple[Any, ...], TaskCall] = {}
-
-    def call(
-        self, task: ArtifactTask, config: StrictModel, name: str, inputs: Mapping[str, TaskCall | Path]
-    ) -> TaskCall:
-        sources = sorted((key, s.name if isinstance(s, TaskCall) else s) for key, s in inputs.items())
-        content = (task.name, config.model_dump_json(), tuple(map(str, sources)))
-        if content not in self._by_content:
-            new = TaskCall(name + self.suffix, task, config, dict(inputs))
-            if new.name in self.calls:
-                raise ConfigError("Two different calls have one name", got=new.name, next_step="give one a name")
-            self._by_content[content] = self.calls[new.name] = new
-            self.begin(new)
-        return self._by_content[content]
-
-    def begin(self, call: TaskCall) -> None:
-        """Receive a new call; an outline only keeps it."""
-
-
-_active: ContextVar[Outline] = ContextVar("active_run")
-
-
-def active_run() -> Outline:
-    """The run that receives calls now. Raises ConfigError outside of a run."""
-    run = _active.get(None)
-    if run is None:
-        raise ConfigError(
-            "A task was submitted outside of a run", next_step="call it in a flow of this project, or use `run`"
-        )
-    return run
-
-
-@contextmanager
-def activated(run: Outline) -> Iterator[None]:
-    """Let `run` receive the calls made in the context."""
-    token = _active.set(run)
-    try:
-        yield
-    finally:
-        _active.reset(token)
-
-
-@contextmanager
-def variant(name: str) -> Iterator[None]:
-    """Append a variant to the names of new calls in the context: ``train_stage2.<name>``; none for the empty name."""
-    run = active_run()
-    before, run.suffix = run.suffix, f".{name}" if name else ""
-    try:
-        yield
-    finally:
-        run.suffix = before
 
 
 def outline[**P](chain: Callable[P, object], *arguments: P.args, **options: P.kwargs) -> dict[str, TaskCall]:

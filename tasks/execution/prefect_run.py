@@ -30,8 +30,7 @@ from prefect.serializers import JSONSerializer
 from prefect.settings import PREFECT_LOCAL_STORAGE_PATH
 from prefect.task_runners import ProcessPoolTaskRunner
 
-from tasks.execution.artifact_task import find_task
-from tasks.execution.chain import Outline, TaskCall, activated
+from tasks.execution.artifact_task import Outline, TaskCall, activated, find_task
 from tasks.execution.command_line import log_to_stderr
 from tasks.execution.run_page import LATEST_REPORT, RunPage
 from tasks.execution.shard_mapper import limited_threads, process_runner, shard_mapper, shared_server

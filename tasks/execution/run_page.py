@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from tasks.execution.chain import TaskCall
+from tasks.execution.artifact_task import TaskCall
 from worldline_core.report.progress import FinishedStep, write_finished_page, write_progress_page
 
 REFRESH_SECONDS = 10.0

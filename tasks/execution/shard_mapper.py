@@ -1,7 +1,6 @@
-"""Shards of a step mapped by Prefect's task runners: processes of this machine, Dask or Ray.
+"""Shards of a step as tasks of Prefect's task runners: processes of this machine, Dask or Ray.
 
-The step stays one task of its flow; inside, a small flow has one task a shard, named after it. Few shards are handed out
-at a time, so memory does not grow with the number of episodes.
+A shard is a task run named after it. Few are handed out at a time, so memory does not grow with the number of episodes.
 """
 
 from __future__ import annotations
@@ -10,25 +9,23 @@ import os
 import pickle
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from contextvars import ContextVar
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from tasks.execution.temporary_server import set_up_temporary_server
 from worldline_core.errors import UnavailableError, installing
 from worldline_core.scale.mapping import (
+    Outcome,
     RunnerConfig,
     SerialMapper,
     Shard,
     ShardMapper,
-    TakeOutcome,
     WorkerDiedError,
-    do_shard,
+    try_shard,
 )
 from worldline_core.scale.process import end_with_pool
-from worldline_core.store.remote import is_transient, process_cache
+from worldline_core.store.remote import process_cache
 from worldline_core.store.store import helper_lock
 
 _DEATHS = frozenset(
@@ -44,24 +41,34 @@ def shard_mapper(config: RunnerConfig) -> ShardMapper:
 
 
 class PrefectMapper:
-    """Does shards in a Prefect flow. `auto` does few episodes in this process, without Prefect."""
+    """Does shards as tasks of a Prefect task runner. `auto` does few episodes in this process, without Prefect."""
 
     def __init__(self, config: RunnerConfig) -> None:
         self.config = config
         self.episodes_per_shard = config.episodes_per_shard
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
         config = self.config
         workers = self._workers(shards)
         few = config.kind == "auto" and (sum(map(len, shards)) < config.serial_below or workers == 1)
-        # What killed a worker must not get the chance to kill this process.
-        if not shards or (few and not one_at_a_time):
-            SerialMapper(config).map(shards, take)
+        # A shard that killed a worker must not get the chance to kill this process.
+        if few and not one_at_a_time:
+            yield from SerialMapper(config).run(shards)
             return
-        waiting = deque(shards)
         limit = 1 if one_at_a_time else config.in_flight or 2 * workers
-        while waiting:  # a process pool that lost a worker is at its end: the next round has a new one
-            self._round(waiting, take, min(workers, limit), limit)
+        waiting = deque(shards)
+        while waiting:  # a pool of processes ends with the worker that it loses: the next round has a new one
+            set_up_temporary_server()
+            with limited_threads(1), shared_server(), self._task_runner(min(workers, limit)) as runner:
+                handed_out: deque[tuple[Shard[Any], Any]] = deque()
+                broken = False
+                while handed_out or (waiting and not broken):
+                    while waiting and not broken and len(handed_out) < limit:
+                        handed_out.append((waiting[0], self._submit(runner, waiting.popleft())))
+                    shard, future = handed_out.popleft()
+                    error = _outcome(shard, future)
+                    broken = broken or isinstance(error, WorkerDiedError)
+                    yield shard, error
 
     def _workers(self, shards: Sequence[Shard[Any]]) -> int:
         """As many as are configured, but no more than the work has devices for."""
@@ -69,48 +76,19 @@ class PrefectMapper:
         most = shards[0].work.processes if shards else None
         return wanted if most is None else max(1, min(wanted, most))
 
-    def _round(self, waiting: deque[Shard[Any]], take: TakeOutcome, workers: int, limit: int) -> None:
-        """One flow, until no shard waits or the runner has lost a worker."""
-        set_up_temporary_server()
-        from prefect import Flow, Task
+    def _submit(self, runner: Any, shard: Shard[Any]) -> Any:
+        from prefect import Task
 
-        task = Task(
-            fn=_work,
-            name="shard",
-            retries=self.config.retries,
-            retry_delay_seconds=self.config.pauses,
-            retry_condition_fn=_may_pass,
-            persist_result=False,
-            log_prints=False,
-        )
+        task = Task(fn=_work, name="shard", task_run_name=shard.label, persist_result=False, log_prints=False)
         room = int(self.config.remote_cache_gb * 2**30)
-
-        def hand_out(shard: Shard[Any]) -> Any:
-            with self._one_try():
-                return task.with_options(task_run_name=shard.label).submit(pickle.dumps(shard), room)
-
-        first = waiting[0]
-        flow = Flow(
-            fn=_hand_out_shards,
-            name=f"{first.work.step} shards",
-            flow_run_name=f"{first.work.step}: {len(waiting)} shards from {first.label}",
-            task_runner=self._task_runner(workers),
-            persist_result=False,
-        )
-        token = _round.set(_Round(waiting, hand_out, take, limit))
-        try:
-            with limited_threads(1), shared_server():
-                flow()
-        finally:
-            _round.reset(token)
-
-    def _one_try(self) -> AbstractContextManager[Any]:
-        """In which a shard is handed out: doing it again after its worker died is `map_episodes`' business, not Ray's."""
-        if self.config.kind != "ray":  # Dask's is said of the whole cluster, pools have none
-            return nullcontext()
+        parameters = {"payload": pickle.dumps(shard), "pauses": self.config.pauses, "remote_cache_bytes": room}
+        if self.config.kind != "ray":
+            return runner.submit(task, parameters)
         from prefect_ray.context import remote_options
 
-        return remote_options(max_retries=0)
+        # Doing a shard again after its worker died is the business of `map_episodes`.
+        with remote_options(max_retries=0):
+            return runner.submit(task, parameters)
 
     def _task_runner(self, workers: int) -> Any:
         match self.config.kind:
@@ -122,34 +100,7 @@ class PrefectMapper:
                 return process_runner(workers)
 
 
-@dataclass(frozen=True)
-class _Round:
-    waiting: deque[Shard[Any]]
-    hand_out: Callable[[Shard[Any]], Any]
-    take: TakeOutcome
-    limit: int
-
-
-# Prefect sends the flow along with every task: its function must not hold the shards.
-_round: ContextVar[_Round] = ContextVar("_round")
-
-
-def _hand_out_shards() -> None:
-    """The body of the flow: hand out a bounded number of shards, take what comes back in their order."""
-    current = _round.get()
-    handed_out: deque[tuple[Shard[Any], Any]] = deque()
-    broken = False
-    while handed_out or (current.waiting and not broken):
-        while current.waiting and not broken and len(handed_out) < current.limit:
-            shard = current.waiting.popleft()
-            handed_out.append((shard, current.hand_out(shard)))
-        shard, future = handed_out.popleft()
-        error = _error(shard, future)
-        broken = broken or isinstance(error, WorkerDiedError)
-        current.take(shard, error)
-
-
-def _work(payload: bytes, remote_cache_bytes: int) -> None:
+def _work(payload: bytes, pauses: list[float], remote_cache_bytes: int) -> None:
     """The body of every shard's task, in a worker: one thread per worker, since there is one worker per core."""
     import cv2
 
@@ -159,20 +110,15 @@ def _work(payload: bytes, remote_cache_bytes: int) -> None:
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     with helper_lock(shard.work.output):
-        end_with_pool()  # with the lock held: who takes this work over waits until this process has ended
-        do_shard(shard)
+        end_with_pool()  # with the lock held: a process that takes this work over waits until this one has ended
+        if (error := try_shard(shard, pauses)) is not None:
+            raise error
 
 
-def _may_pass(_task: Any, _run: Any, state: Any) -> bool:
-    """Only what may pass is tried again: a network, a busy store; never bad data."""
-    error = state.result(raise_on_failure=False)
-    return isinstance(error, BaseException) and is_transient(error)
-
-
-def _error(shard: Shard[Any], future: Any) -> Exception | None:
+def _outcome(shard: Shard[Any], future: Any) -> Exception | None:
     try:
         future.result()
-    except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
+    except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which decides whether it ends the run
         if type(error).__name__ not in _DEATHS:
             return error
         return WorkerDiedError(

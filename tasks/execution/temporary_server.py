@@ -12,6 +12,8 @@ _SETTINGS = {
     # The file in Prefect's home belongs to all runs of a user: they lock each other out of it, two that start together both
     # try to make its tables, and one that another version of Prefect left does not open.
     "PREFECT_API_DATABASE_CONNECTION_URL": "sqlite+aiosqlite:///:memory:",
+    # Shards of a step that runs alone belong to no flow run.
+    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     # They note events, some seconds late, for pages that this server does not show; the end of a short run would
     # interrupt them in a transaction.

@@ -14,8 +14,8 @@ from prefect.settings import PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 import tasks
 from flows.pipeline import chain, choose, evaluate, predict, prepare, prepare_banks
 from tasks.curate import curate
-from tasks.execution.artifact_task import find_task, task_names
-from tasks.execution.chain import TaskCall, find_artifacts, find_call, load_chain, outline, ready_inputs
+from tasks.execution.artifact_task import TaskCall, find_task, task_names
+from tasks.execution.chain import find_artifacts, find_call, load_chain, outline, ready_inputs
 from tasks.execution.prefect_run import PrefectRun
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError

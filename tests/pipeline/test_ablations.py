@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from flows.ablations import compare_variants
-from tasks.execution.chain import TaskCall, outline
+from tasks.execution.artifact_task import TaskCall
+from tasks.execution.chain import outline
 from worldline_core.config import load_config
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.evaluation.scores import Score, summarise, write_scores

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,10 +15,10 @@ from number_work import NumberFileWork, NumberWork, attempts, do_numbers
 from tasks.execution.shard_mapper import shard_mapper
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.scale.mapping import (
+    Outcome,
     RunnerConfig,
     SerialMapper,
     Shard,
-    TakeOutcome,
     WorkerDiedError,
     do_shard,
     map_episodes,
@@ -74,7 +74,7 @@ class ForkingMapper:
 
     episodes_per_shard = 4
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
         for shard in shards:
             if not (process := os.fork()):
                 status = 1
@@ -84,7 +84,7 @@ class ForkingMapper:
                 finally:
                     os._exit(status)
             _, status = os.waitpid(process, 0)
-            take(shard, WorkerDiedError("A worker ended without an answer") if status else None)
+            yield shard, WorkerDiedError("A worker ended without an answer") if status else None
 
 
 def test_a_shard_with_one_file_is_made_again_without_the_episode_that_kills(tmp_path: Path) -> None:
@@ -132,13 +132,11 @@ def test_a_bounded_number_of_shards_is_handed_out(tmp_path: Path, monkeypatch: p
             self.episodes_per_shard = self.inner.episodes_per_shard
             self.done = 0
 
-        def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
-            def taken(shard: Shard[Any], error: Exception | None) -> None:
+        def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
+            for shard, error in self.inner.run(shards, one_at_a_time=one_at_a_time):
                 begun_before_taken.append(len((tmp_path / "log.txt").read_text().splitlines()) - self.done)
                 self.done += len(shard)
-                take(shard, error)
-
-            self.inner.map(shards, taken, one_at_a_time=one_at_a_time)
+                yield shard, error
 
     watched = Watched()
     do_numbers(watched, tmp_path, range(20, 40), 2)

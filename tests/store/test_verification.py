@@ -13,7 +13,8 @@ import pytest
 
 from flows.command_line import main
 from flows.pipeline import chain
-from tasks.execution.chain import TaskCall, outline, ready_inputs
+from tasks.execution.artifact_task import TaskCall
+from tasks.execution.chain import outline, ready_inputs
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.pipeline_config import PipelineConfig

@@ -22,7 +22,8 @@ from prefect.client.schemas.filters import FlowFilter, FlowFilterName
 from prefect.settings import PREFECT_API_URL, PREFECT_LOCAL_STORAGE_PATH, temporary_settings
 
 from flows.pipeline import prepare, prepare_banks
-from tasks.execution.chain import outline, variant
+from tasks.execution.artifact_task import variant
+from tasks.execution.chain import outline
 from tasks.execution.prefect_artifacts import is_worth_saying, show_in_prefect
 from tasks.execution.prefect_run import ArtifactReference, PrefectRun
 from worldline_core.errors import ConfigError, DataError

@@ -45,7 +45,7 @@ def threads() -> Iterator[int]:
 def test_a_step_is_continued_on_the_threads_that_it_began_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    monkeypatch.setattr("tasks.execution.artifact_task._load", _load)
+    monkeypatch.setattr("tasks.execution.artifact_task.load_object", _load)
     task = ArtifactTask("sum", "", 1, "work", "config")
     seen.clear()
     torch.set_num_threads(3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from tasks.execution.shard_mapper import PrefectMapper, shard_mapper
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.scale.account import read_account
-from worldline_core.scale.mapping import RunnerConfig, SerialMapper, Shard, TakeOutcome
+from worldline_core.scale.mapping import Outcome, RunnerConfig, SerialMapper, Shard
 from worldline_core.store.artifact_files import digest_folder
 from worldline_core.training import encode_latents as encoding
 from worldline_core.training.clip_config import EncodeLatentsConfig
@@ -37,8 +37,8 @@ def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactor
 class KilledMapper(SerialMapper):
     """Begins with the last shard and is killed after two."""
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
-        super().map(list(reversed(shards))[:2], take, one_at_a_time=one_at_a_time)
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
+        yield from super().run(list(reversed(shards))[:2], one_at_a_time=one_at_a_time)
         raise KeyboardInterrupt
 
 

@@ -180,11 +180,8 @@ def test_a_stage_that_cannot_fit_is_refused_before_it_begins(
         {"model": {"num_layers": 1}, "trainer": {"steps": 2}, "clips": {"lengths": [9], "view_weights": {"primary": 1}}}
     )
     with pytest.raises(ConfigError, match=r"stage I on cpu[\s\S]*weights[\s\S]*worldline plan"):
-        run_step(
-            ArtifactStore(tmp_path),
-            "train_stage1",
-            config,
-            {name: world.inputs[name] for name in ("episodes", "latents")},
+        find_task("train_stage1").run(
+            ArtifactStore(tmp_path), config, {name: world.inputs[name] for name in ("episodes", "latents")}
         )
 
 

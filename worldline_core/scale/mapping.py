@@ -13,8 +13,8 @@ import logging
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -187,22 +187,21 @@ def ends_the_run(error: BaseException) -> bool:
     return isinstance(error, ConfigError | UnavailableError | ArtifactError)
 
 
-type TakeOutcome = Callable[[Shard[Any], Exception | None], None]
-"""Called with each shard and the error that it ended with (None: it is done). If it raises, the work stops."""
+type Outcome = tuple[Shard[Any], Exception | None]
+"""A shard, and the error that it ended with; None: it is done."""
 
 
 class ShardMapper(Protocol):
-    """Runs shards (here, in processes, on a cluster), a bounded number at a time, and reports the outcome of each."""
+    """Runs shards here, in processes or on a cluster, a bounded number at a time."""
 
     @property
     def episodes_per_shard(self) -> int: ...
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
-        """Call `do_shard` for each shard, in any order.
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
+        """Call `try_shard` for each shard, and yield the outcomes.
 
         Args:
-            take: called in this process with each outcome, in the order in which shards end.
-            one_at_a_time: never run two shards at once, so that it is clear which one killed a worker.
+            one_at_a_time: never run two shards at once, nor in this process: shows which one kills its worker.
         """
         ...
 
@@ -218,49 +217,40 @@ def map_episodes[E](mapper: ShardMapper, work: EpisodeWork[E, Any], pieces: Sequ
     """
     shards = [Shard(work, number, tuple(piece)) for number, piece in enumerate(pieces)]
     unfinished = [shard for shard in shards if work.remaining(shard.number, shard.episodes)]
-    suspects: list[Shard[E]] = []
-    crashed: dict[E, dict[str, Any]] = {}
     unreachable: dict[int, Exception] = {}
-
-    def taking(failed: Callable[[Shard[E], Exception], None], done: Callable[[int], object]) -> TakeOutcome:
-        def take(shard: Shard[Any], error: Exception | None) -> None:
-            if error is None:
-                done(len(shard))
-            elif ends_the_run(error):
-                raise error
-            elif is_transient(error):
-                unreachable[shard.number] = error
-            else:
-                failed(shard, error)
-
-        return take
-
-    def suspect(shard: Shard[E], error: Exception) -> None:
-        logger.warning("%s: %s; its episodes are done again one at a time", shard.label, first_line(error))
-        suspects.append(shard)
-
-    def crash(shard: Shard[E], error: Exception) -> None:
-        crashed[shard.episodes[0]] = crash_evidence(error)
-
-    def give_up(shard: Shard[E], error: Exception) -> None:
-        raise DataError(
-            "Some episodes could not be processed",
-            where=shard.label,
-            got=first_line(error),
-            next_step="run the step again; if it fails again, check how much memory the machine has left",
-        ) from error
-
     total = sum(map(len, shards))
-    done = total - sum(map(len, unfinished))
-    with Progress(work.step, total, "episode", done=done) as progress:
+    with Progress(work.step, total, "episode", done=total - sum(map(len, unfinished))) as progress:
+
+        def failures(
+            shards: Sequence[Shard[E]], *, one_at_a_time: bool = False
+        ) -> Iterator[tuple[Shard[E], Exception]]:
+            """Run shards; yields those that failed."""
+            with closing(mapper.run(shards, one_at_a_time=one_at_a_time)) as outcomes:  # pyright: ignore[reportArgumentType]
+                for shard, error in outcomes:
+                    if error is None:
+                        progress.advance(0 if shard.alone else len(shard))
+                    elif ends_the_run(error):
+                        raise error
+                    elif is_transient(error):
+                        unreachable[shard.number] = error
+                    else:
+                        yield shard, error
+
         try:
-            mapper.map(unfinished, taking(suspect, progress.advance))
+            suspects: list[Shard[E]] = []
+            for shard, error in failures(unfinished):
+                logger.warning("%s: %s; its episodes are done again one at a time", shard.label, first_line(error))
+                suspects.append(shard)
             singles = [replace(shard, episodes=(one,), alone=True) for shard in suspects for one in shard.episodes]
-            mapper.map(singles, taking(crash, lambda _: None), one_at_a_time=True)
-            again = [
-                replace(shard, crashed={e: crashed[e] for e in shard.episodes if e in crashed}) for shard in suspects
-            ]
-            mapper.map(again, taking(give_up, progress.advance))
+            crashed = {s.episodes[0]: crash_evidence(error) for s, error in failures(singles, one_at_a_time=True)}
+            again = [replace(s, crashed={e: crashed[e] for e in s.episodes if e in crashed}) for s in suspects]
+            for shard, error in failures(again):
+                raise DataError(
+                    "Some episodes could not be processed",
+                    where=shard.label,
+                    got=first_line(error),
+                    next_step="run the step again; if it fails again, check how much memory the machine has left",
+                ) from error
         finally:
             _current_work.pop(work.run, None)
     if unreachable:
@@ -313,6 +303,15 @@ class RunnerConfig(StrictModel):
         return retry_pauses(self.retries, self.retry_seconds)
 
 
+def try_shard(shard: Shard[Any], pauses: Sequence[float]) -> Exception | None:
+    """Do a shard, again after each of `pauses` seconds while its input cannot be reached; returns what it ends with."""
+    try:
+        with_retries(partial(do_shard, shard), shard.label, pauses)
+    except Exception as error:  # noqa: BLE001 - returned to `map_episodes`, which decides whether it ends the run
+        return error
+    return None
+
+
 class SerialMapper:
     """Does the shards in this process, one after the other."""
 
@@ -320,12 +319,7 @@ class SerialMapper:
         self._config = config or RunnerConfig()
         self.episodes_per_shard = self._config.episodes_per_shard
 
-    def map(self, shards: Sequence[Shard[Any]], take: TakeOutcome, *, one_at_a_time: bool = False) -> None:
+    def run(self, shards: Sequence[Shard[Any]], *, one_at_a_time: bool = False) -> Iterator[Outcome]:
         del one_at_a_time  # always
         for shard in shards:
-            fault: Exception | None = None
-            try:
-                with_retries(partial(do_shard, shard), shard.label, self._config.pauses)
-            except Exception as error:  # noqa: BLE001 - handed to `map_episodes`, which knows what ends the run
-                fault = error
-            take(shard, fault)
+            yield shard, try_shard(shard, self._config.pauses)
