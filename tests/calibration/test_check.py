@@ -52,14 +52,6 @@ def explained(conventions: RecordedConventions) -> Explanation:
 # --- the line that repairs
 
 
-def test_lines_name_the_source_by_its_number(episode: Episode, images: dict[str, np.ndarray]) -> None:
-    item = replace(listed(episode, images), config_prefix="curate.sources[3].conventions")
-    assert repairing_lines(item, explained(RecordedConventions(quaternion="wxyz"))) == (
-        "curate.sources[3].conventions.quaternion: wxyz",
-    )
-    assert repairing_lines(item, Explanation(RecordedConventions(), 0.0, {})) == ()
-
-
 def test_what_is_declared_already_is_counted_in(episode: Episode, images: dict[str, np.ndarray]) -> None:
     declared = RecordedConventions(extrinsics="base_to_camera", camera_lag_frames=1)
     item = replace(listed(episode, images), declared=declared)
@@ -365,9 +357,3 @@ def test_wrong_usage_ends_with_status_2(
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
-
-
-def test_the_arguments_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run() == 2
-    assert run("a.yaml", "--artifact", "b") == 2
-    assert "not allowed with" in capsys.readouterr().err

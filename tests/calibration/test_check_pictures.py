@@ -99,31 +99,6 @@ def test_an_explained_episode_is_shown_twice(episode: Episode, images: dict[str,
     assert blue(right) > 15
 
 
-def test_a_consistent_episode_is_shown_once(episode: Episode, images: dict[str, np.ndarray]) -> None:
-    picture = diagnosis_picture(
-        diagnosis_of(RecordedConventions(), "consistent"), episode, images, None, moments=2, tile_height=120
-    )
-    assert MIN_WIDTH <= picture.shape[1] < 2 * MIN_WIDTH
-
-
-@pytest.mark.parametrize(
-    "conventions",
-    [
-        RecordedConventions(camera_lag_frames=2, image_lag_frames=-3),
-        RecordedConventions(image_lag_frames=4),
-        RecordedConventions(camera_lag_frames=-5),
-        RecordedConventions(tool_offset_z_m=0.08, pose_unit="mm"),
-    ],
-)
-def test_every_lag_can_be_drawn(
-    episode: Episode, images: dict[str, np.ndarray], conventions: RecordedConventions
-) -> None:
-    wrong = corrupt(episode, conventions)
-    shown = {view: clip[: wrong.num_frames] for view, clip in images.items()}
-    picture = diagnosis_picture(diagnosis_of(conventions), wrong, shown, None, moments=3, tile_height=60)
-    assert picture.shape[1] >= 2 * MIN_WIDTH
-
-
 @pytest.mark.parametrize(
     "conventions",
     [

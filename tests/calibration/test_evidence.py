@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.calibration.calibration_doctor import camera_lags, intrinsics_sizes, tool_offset
+from worldline_core.calibration.calibration_doctor import camera_lags, intrinsics_sizes
 from worldline_core.calibration.evidence import (
     Typical,
     correlation_log_likelihood,
@@ -21,7 +21,7 @@ from worldline_core.calibration.evidence import (
     stopped_share,
     wrist_flow_agreement,
 )
-from worldline_core.calibration.observation import cell_centres, cell_means, observe, read, small_gray
+from worldline_core.calibration.observation import observe, read
 from worldline_core.data.episodes.conventions import RecordedConventions
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.cameras import project_points
@@ -92,16 +92,6 @@ def wrist_pictures() -> np.ndarray:
 @pytest.fixture(scope="module")
 def seen() -> dict[str, np.ndarray]:
     return {"head": head_pictures(), "right_wrist": wrist_pictures()}
-
-
-def test_cells_cover_the_picture() -> None:
-    values = np.arange(2 * 10 * 13, dtype=np.float32).reshape(2, 10, 13)
-    cells = cell_means(values)
-    assert cells.shape == (2, 2, 3)
-    assert cells[1, 1, 2] == pytest.approx(values[1, 4:8, 8:12].mean())
-    assert cell_centres(10, 13)[1, 2].tolist() == [9.5, 5.5]
-    big = np.random.default_rng(0).integers(0, 255, (3, 128, 192, 3), dtype=np.uint8)
-    assert small_gray(big).shape == (3, 64, 96)
 
 
 def test_flow_of_the_tool_agrees_with_a_right_camera_only(seen: dict[str, np.ndarray]) -> None:
@@ -259,13 +249,6 @@ def test_pose_terms_blame_the_right_thing() -> None:
     reading = read(observation, RecordedConventions())
     assert reading is not None
     assert pose_terms(observation, reading)["workspace"] == -40.0
-
-
-def test_no_stated_mount_no_offset() -> None:
-    observation = observe(episode(), {}, None)
-    reading = read(observation, RecordedConventions())
-    assert reading is not None
-    assert tool_offset(observation, reading) is None
 
 
 def test_log_likelihoods_fall_with_disagreement() -> None:

@@ -1,19 +1,19 @@
-"""Foxglove's schemas: protobuf with descriptors built here by hand after the published .proto files, video, and JSON."""
+"""Foxglove's schemas: protobuf by its published classes, video, and JSON."""
 
 from __future__ import annotations
 
 import base64
 import json
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, timestamp_pb2
-from google.protobuf.descriptor_pool import DescriptorPool
-from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.reader import make_reader
 from mcap.writer import Writer as RawWriter
 from mcap_protobuf.writer import Writer
@@ -24,53 +24,16 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.exported import Encoding, write_episode_mcap
 from worldline_core.data.sources.open import open_source
 
-Field = descriptor_pb2.FieldDescriptorProto
-TIMESTAMP = ".google.protobuf.Timestamp"
-# Field numbers and types as in Foxglove's published .proto files.
-MESSAGES: dict[str, list[tuple[str, int, int, str | None, bool]]] = {
-    "Vector3": [("x", 1, Field.TYPE_DOUBLE, None, False), ("y", 2, Field.TYPE_DOUBLE, None, False), ("z", 3, Field.TYPE_DOUBLE, None, False)],
-    "Quaternion": [(axis, number, Field.TYPE_DOUBLE, None, False) for number, axis in enumerate("xyzw", 1)],
-    "Pose": [("position", 1, Field.TYPE_MESSAGE, ".foxglove.Vector3", False), ("orientation", 2, Field.TYPE_MESSAGE, ".foxglove.Quaternion", False)],
-    "PoseInFrame": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 2, Field.TYPE_STRING, None, False), ("pose", 3, Field.TYPE_MESSAGE, ".foxglove.Pose", False)],
-    "FrameTransform": [
-        ("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("parent_frame_id", 2, Field.TYPE_STRING, None, False),
-        ("child_frame_id", 3, Field.TYPE_STRING, None, False), ("translation", 4, Field.TYPE_MESSAGE, ".foxglove.Vector3", False),
-        ("rotation", 5, Field.TYPE_MESSAGE, ".foxglove.Quaternion", False),
-    ],
-    "FrameTransforms": [("transforms", 1, Field.TYPE_MESSAGE, ".foxglove.FrameTransform", True)],
-    "CompressedImage": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 4, Field.TYPE_STRING, None, False), ("data", 2, Field.TYPE_BYTES, None, False), ("format", 3, Field.TYPE_STRING, None, False)],
-    "CompressedVideo": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 2, Field.TYPE_STRING, None, False), ("data", 3, Field.TYPE_BYTES, None, False), ("format", 4, Field.TYPE_STRING, None, False)],
-    "CameraCalibration": [
-        ("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("frame_id", 9, Field.TYPE_STRING, None, False), ("width", 2, Field.TYPE_FIXED32, None, False),
-        ("height", 3, Field.TYPE_FIXED32, None, False), ("distortion_model", 4, Field.TYPE_STRING, None, False),
-        *((name, number, Field.TYPE_DOUBLE, None, True) for number, name in enumerate("DKRP", 5)),
-    ],
-    "JointState": [("name", 1, Field.TYPE_STRING, None, False), *((name, number, Field.TYPE_DOUBLE, "optional", False) for number, name in enumerate(("position", "velocity", "acceleration", "effort"), 2))],
-    "JointStates": [("timestamp", 1, Field.TYPE_MESSAGE, TIMESTAMP, False), ("joints", 2, Field.TYPE_MESSAGE, ".foxglove.JointState", True)],
-}  # fmt: skip
+NAMES = (
+    "CameraCalibration", "CompressedImage", "CompressedVideo", "FrameTransform", "FrameTransforms", "JointStates",
+    "PoseInFrame",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def foxglove() -> dict[str, Any]:
-    """Message classes by name."""
-    pool = DescriptorPool()
-    pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
-    file = descriptor_pb2.FileDescriptorProto(
-        name="foxglove/all.proto", package="foxglove", syntax="proto3", dependency=["google/protobuf/timestamp.proto"]
-    )
-    for name, fields in MESSAGES.items():
-        message = file.message_type.add(name=name)
-        for field, number, kind, of, repeated in fields:
-            added = message.field.add(
-                name=field, number=number, type=kind, label=Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
-            )
-            if of == "optional":
-                added.proto3_optional, added.oneof_index = True, len(message.oneof_decl)
-                message.oneof_decl.add(name=f"_{field}")
-            elif of is not None:
-                added.type_name = of
-    pool.AddSerializedFile(file.SerializeToString())
-    return {name: GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}")) for name in MESSAGES}
+    """Published message classes by name."""
+    return {name: getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name) for name in NAMES}
 
 
 def coloured(number: int) -> np.ndarray:
@@ -107,7 +70,7 @@ def write(
 
     def at(seconds: float) -> tuple[int, Any]:
         time_ns = toy.start_ns + round(seconds * 1e9)
-        return time_ns, timestamp_pb2.Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString()
+        return time_ns, Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString()
 
     def stamped(name: str, seconds: float, **values: Any) -> Any:
         message = foxglove[name](**values)
@@ -239,7 +202,7 @@ def in_json(message: Any) -> dict[str, Any]:
         elif field.message_type is not None:
             is_list = not hasattr(value, "DESCRIPTOR")
             values[field.name] = [in_json(each) for each in value] if is_list else in_json(value)
-        elif field.type == Field.TYPE_BYTES:
+        elif field.type == FieldDescriptor.TYPE_BYTES:
             values[field.name] = base64.b64encode(value).decode()
         elif not (field.has_presence and not message.HasField(field.name)):
             values[field.name] = value if isinstance(value, int | float | str) else list(value)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.images import frames_after_loss
-from worldline_core.data.mcap.timing import in_order, instants, nearest, resampled, resampled_poses
+from worldline_core.data.mcap.resampling import in_order, instants, nearest, resampled, resampled_poses
 
 MS = 1_000_000
 

@@ -36,7 +36,7 @@ from worldline_core.data.guards.rejection import RejectedInputError, check_lengt
 from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.images import ImageTrack
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
-from worldline_core.data.mcap.transforms import add_camera
+from worldline_core.data.mcap.resampling import add_camera
 from worldline_core.data.video.frames import Frames, MadeFrames, in_step
 from worldline_core.errors import DataError
 from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation

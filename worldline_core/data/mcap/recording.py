@@ -14,10 +14,13 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.data.mcap.file import McapFile, Stream
 from worldline_core.data.mcap.images import ImageTrack, frames_after_loss
 from worldline_core.data.mcap.messages import IMAGE_KINDS, Calibration, Joints, Kind
-from worldline_core.data.mcap.timing import (
+from worldline_core.data.mcap.resampling import (
     Arrivals,
     Clocks,
+    TransformTree,
+    add_camera,
     check_gaps,
+    checked_poses,
     in_order,
     instants,
     largest_distance_ms,
@@ -26,7 +29,6 @@ from worldline_core.data.mcap.timing import (
     resampled_poses,
 )
 from worldline_core.data.mcap.topics_config import ArmReadings, McapTopicsSourceConfig, TopicReadings
-from worldline_core.data.mcap.transforms import TransformTree, add_camera, checked_poses
 
 LAYOUT = "mcap topics"
 _KINDS: dict[str, tuple[Kind, ...]] = {
