@@ -9,7 +9,7 @@ train_tokenizer = ArtifactTask(
     function="worldline_core.training.train_tokenizer:train_tokenizer",
     config="worldline_core.training.training_config:TokenizerConfig",
     inputs=("episodes",),
-    optional_inputs=("start", "encoder", "held_out"),
+    optional_inputs=("encoder", "held_out"),
 )
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from tasks.train_tokenizer import train_tokenizer as tokenizer_task
-from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
@@ -47,19 +46,6 @@ def test_the_step_writes_a_tokenizer_its_losses_and_its_metrics(trained: Path) -
     assert PatchTokenizer.load(trained).latent_channels == 8
 
 
-def test_a_decoder_is_trained_further_on_the_bases_of_its_start(world: Any, trained: Path, tmp_path: Path) -> None:
-    inputs = {"episodes": world.episodes, "start": trained, "held_out": world.episodes}
-    tokenizer_task.check_inputs(inputs)
-    metrics = train_tokenizer(CONFIG, inputs, tmp_path)
-    before, after = PatchTokenizer.load(trained), PatchTokenizer.load(tmp_path)
-    assert after.encoder_digest == before.encoder_digest
-    assert not torch.equal(after.refinement.leave.weight, before.refinement.leave.weight)
-    assert metrics["held_out_episodes"] == 1
-    # A state of this training is no state of another start.
-    with pytest.raises(ArtifactError, match=r"belongs to another run[\s\S]*give it the start"):
-        train_tokenizer(CONFIG, {"episodes": world.episodes}, tmp_path)
-
-
 def test_without_steps_only_the_bases_are_fitted(world: Any, tmp_path: Path) -> None:
     changes = {"steps": 0, "max_episodes": 2}
     counts = train_tokenizer(CONFIG.model_copy(update=changes), {"episodes": world.episodes}, tmp_path)
@@ -87,8 +73,6 @@ def test_a_small_decoder_is_trained_for_the_latents_of_an_existing_tokenizer(
     tokenizer = PatchTokenizer.load(trained)
     assert SmallDecoder.load(tmp_path / "12", tokenizer, tokenizer.encoder_digest[:16]).config.width == 4
     assert not (tmp_path / "12" / "tokenizer.json").exists()
-    with pytest.raises(ConfigError, match="A start and an encoder"):
-        train_tokenizer(CONFIG, {**inputs, "start": trained}, tmp_path / "both")
 
 
 def test_a_wan_autoencoder_gets_one_too(world: Any, tmp_path: Path) -> None:

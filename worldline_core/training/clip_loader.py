@@ -10,6 +10,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -68,36 +69,60 @@ class ClipDataset(Dataset[ReadBatch | WorldLineError]):
 
     def __getitem__(self, index: int) -> ReadBatch | WorldLineError:
         try:
-            wanted = self.sampler.clips(index)
-            data = empty_batch(self.source, wanted, self.views)
-            clips, skipped = list(wanted.clips), list[tuple[Clip, str]]()
-            for place, clip in enumerate(wanted.clips):
-                clips[place] = self._read(index, place, clip, wanted, data.numpy()[place], skipped)
+            return read_batch(
+                self.source, self.sampler.clips(index), self.views,
+                None if self.reading.on_unreadable == "raise" else partial(self.sampler.replacement, index),
+            )  # fmt: skip
         except WorldLineError as error:
             return error
-        return ReadBatch(replace(wanted, clips=tuple(clips)), data, tuple(skipped))
 
-    def _read(
-        self, index: int, place: int, clip: Clip, batch: ClipBatch, out: np.ndarray, skipped: list[tuple[Clip, str]]
-    ) -> Clip:
-        """The clip that was read into ``out``: the wanted one, or a replacement."""
+
+def read_batch(
+    source: ClipSource,
+    batch: ClipBatch,
+    views: tuple[str, ...],
+    replacement: Callable[[int, int], Clip] | None = None,
+) -> ReadBatch:
+    """Read the clips of a batch; in a loader process into shared memory, so that nothing is copied later.
+
+    Args:
+        views: the model's view slots.
+        replacement: of a clip that cannot be read, by its place and the attempt; None: reading ends there.
+
+    Raises:
+        DataError: a clip cannot be read, or nothing readable can be found for it.
+        ArtifactError: the source does not hold what is asked of it.
+    """
+    slots = batch.slots(views)
+    shape = (len(batch.clips), len(slots), *source.shape(batch.clips[0].num_frames))
+    data = torch.empty(shape, dtype=torch.from_numpy(np.empty(0, source.dtype)).dtype)
+    if get_worker_info() is not None:
+        data.share_memory_()
+    clips: list[Clip] = []
+    skipped: list[tuple[Clip, str]] = []
+    for place, (clip, out) in enumerate(zip(batch.clips, data.numpy(), strict=True)):
         for attempt in range(_ATTEMPTS):
+            # The task-facing view of a recording has a name of its own.
+            recorded = (source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else slots
             try:
-                self.source.read(clip, recorded_views(self.source, clip, batch, self.views), out)
+                source.read(clip, recorded, out)
             except DataError as error:
-                if self.reading.on_unreadable == "raise":
+                if replacement is None:
                     raise
                 skipped.append((clip, str(error)))
-                clip = self.sampler.replacement(index, place, attempt)
+                clip = replacement(place, attempt)
             else:
-                return clip
-        raise DataError(
-            "No readable clip was found.",
-            where=f"micro-step {index}, clip {place}",
-            expected=f"one of {_ATTEMPTS} clips that can be read",
-            got=skipped[-1][1],
-            next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
-        )
+                clips.append(clip)
+                break
+        else:
+            raise DataError(
+                "No readable clip was found.",
+                where=str(batch.clips[place]),
+                expected=f"one of {_ATTEMPTS} clips that can be read",
+                got=skipped[-1][1],
+                next_step="run filter on this EpisodeSet again; its videos may have been damaged since",
+            )
+    return ReadBatch(replace(batch, clips=tuple(clips)), data, tuple(skipped))
 
 
 def read_ahead(
@@ -123,18 +148,6 @@ def read_ahead(
         generator=torch.Generator(),  # its own: training's random state stays as it is
     )
     return iter(loader)
-
-
-def recorded_views(source: ClipSource, clip: Clip, batch: ClipBatch, views: tuple[str, ...]) -> tuple[str, ...]:
-    """The views of a clip of the batch that fill its slots, by the names they have in the recording."""
-    return (source.row(clip.episode_id).primary_view,) if batch.view == PRIMARY else batch.slots(views)
-
-
-def empty_batch(source: ClipSource, batch: ClipBatch, views: tuple[str, ...]) -> Tensor:
-    """A tensor (b, v, *shape) for a batch; in a loader process it is in shared memory, so that nothing is copied later."""
-    shape = (len(batch.clips), len(batch.slots(views)), *source.shape(batch.clips[0].num_frames))
-    data = torch.empty(shape, dtype=torch.from_numpy(np.empty(0, source.dtype)).dtype)
-    return data if get_worker_info() is None else data.share_memory_()
 
 
 class SkippedClips:
@@ -293,10 +306,7 @@ class ClipLoader:
             ArtifactError: if the source or the tracks lack an episode.
             DataError: if a clip is damaged, or cached latents are not finite.
         """
-        data = empty_batch(self.source, batch, self.views)
-        for clip, out in zip(batch.clips, data.numpy(), strict=True):
-            self.source.read(clip, recorded_views(self.source, clip, batch, self.views), out)
-        return self.finish(ReadBatch(batch, data))
+        return self.finish(read_batch(self.source, batch, self.views))
 
     def finish(self, read: ReadBatch) -> Batch:
         """What a model sees of clips that were read.

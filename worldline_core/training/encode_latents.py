@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import batched
 from pathlib import Path
-from typing import IO, Any, ClassVar, NoReturn, Protocol
+from typing import IO, Any, ClassVar, NoReturn
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -25,7 +25,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import resized_video
+from worldline_core.model.video_tokenizer import VideoTokenizer, resized_video
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic
@@ -36,30 +36,22 @@ SHARD_FILE = "{:05d}.safetensors"
 _SPAN = 2 * TEMPORAL_FACTOR + 1
 
 
-class Encoder(Protocol):
-    """The part of a video tokenizer that is needed here."""
-
-    def encode(self, video: Float[Tensor, "b 3 t h w"]) -> Float[Tensor, "b c t_l h_l w_l"]: ...
-
-
-def encode_clip(tokenizer: Encoder, video: UInt8[Tensor, "3 n h w"], device: str) -> Float[Tensor, "c t h_l w_l"]:
+def encode_clip(
+    tokenizer: VideoTokenizer, video: UInt8[Tensor, "3 n h w"], device: str
+) -> Float[Tensor, "c t h_l w_l"]:
     """Latents of one clip, rounded to half precision as they are stored."""
     with torch.no_grad():
         return tokenizer.encode((video.float() / 127.5 - 1.0)[None].to(device))[0].to("cpu", torch.float16)
 
 
 def encode_episode(
-    tokenizer: Encoder,
+    tokenizer: VideoTokenizer,
     episode_id: str,
     videos: Sequence[UInt8[Tensor, "3 n h w"]],
     layout: Layout,
     config: EncodeLatentsConfig,
 ) -> dict[str, Float[Tensor, "v c t h_l w_l"]]:
-    """All tensors of one episode, by their names in the shard.
-
-    Args:
-        videos: of its views.
-    """
+    """All tensors of one episode, given as the videos of its views, by their names in the shard."""
     count = videos[0].shape[1]
     tensors: dict[str, Tensor] = {}
 
@@ -89,7 +81,7 @@ def encode_episode(
     return tensors
 
 
-def choose_layout(tokenizer: Encoder, video: UInt8[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
+def choose_layout(tokenizer: VideoTokenizer, video: UInt8[Tensor, "3 n h w"], config: EncodeLatentsConfig) -> Layout:
     """``groups`` where a latent frame depends on its own four frames alone, else ``clips``.
 
     Raises:
@@ -175,7 +167,7 @@ class EncodeWork(ShardFilesWork[EncodedEpisode]):
         return claim_device(self.config.device, self.output / "run")
 
     @cached_property
-    def _tokenizer(self) -> Encoder:
+    def _tokenizer(self) -> VideoTokenizer:
         return load_tokenizer(self.codec, self._device[0])
 
     def do(self, episode: int) -> EncodedEpisode:
@@ -254,7 +246,6 @@ def encode_latents(
         "strides": list(config.strides),
         "views": list(config.views),
         "image_size": list(config.image_size),
-        "temporal_compression": TEMPORAL_FACTOR,
         "tokenizer": fingerprint,
         "latent_shape": summaries[0]["latent_shape"],
     }

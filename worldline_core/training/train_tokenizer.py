@@ -20,7 +20,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
 from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer, Refinement, fit_patch_tokenizer
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig, windows
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
@@ -161,20 +160,16 @@ class DecoderObjective(Objective[DecoderBatch]):
 
 
 def train_decoder(
-    tokenizer: PatchTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, output: Path, start: str = ""
+    tokenizer: PatchTokenizer, views: Sequence[LoadedView], config: TokenizerConfig, output: Path
 ) -> None:
     """Train the decoder in place (its average is kept); continues from ``output/run`` if training was cut short.
-
-    Args:
-        start: digest of the tokenizer that is trained further, if any: a state of another start is refused.
 
     Raises:
         TrainingError: the loss or the gradient is not finite.
     """
-    objective = DecoderObjective(tokenizer.refine)
     load = partial(decoder_batch, tokenizer, views, config)
-    begun = {"encoder": tokenizer.encoder_digest, "start": start, "episodes": [view.name for view in views]}
-    _train(tokenizer.refinement, objective, load, config, output, begun)
+    begun = {"encoder": tokenizer.encoder_digest, "episodes": [view.name for view in views]}
+    _train(tokenizer.refinement, DecoderObjective(tokenizer.refine), load, config, output, begun)
 
 
 def train_small_decoder(
@@ -276,8 +271,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
     """Fit, train and measure a patch tokenizer on ``inputs["episodes"]`` (an EpisodeSet).
 
     It is measured on the held-out splits of that set, or of ``inputs["held_out"]`` when that is given. With
-    ``inputs["start"]``, a patch tokenizer, its bases are kept (latents stay valid) and its decoder is trained further.
-    With ``inputs["encoder"]``, any tokenizer, only a small decoder of its latents is trained and written
+    ``inputs["encoder"]``, any tokenizer, only a small decoder of its latents is trained and written
     (``decoder.safetensors``, ``decoder.json``), and what the tokenizer's own decoder reaches is measured beside it.
 
     Writes ``tokenizer.safetensors``, ``tokenizer.json``, ``metrics.jsonl`` (the losses) and ``metrics.json`` into
@@ -285,15 +279,7 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
 
     Returns:
         reconstruction metrics on held-out scenes; {"found", "kept", "left_out"} count the episodes.
-
-    Raises:
-        ConfigError: both a start and an encoder are given.
     """
-    if {"start", "encoder"} <= inputs.keys():
-        raise ConfigError(
-            "A start and an encoder", expected="start: a patch tokenizer whose decoder is trained further; or encoder: "
-            "any tokenizer, for whose latents a small decoder is trained", got=sorted(inputs),
-        )  # fmt: skip
     encoder = load_tokenizer(Path(inputs["encoder"]), config.device) if "encoder" in inputs else None
     episodes = EpisodeSet.open(inputs["episodes"])
     rows = episodes.rows
@@ -315,17 +301,12 @@ def train_tokenizer(config: TokenizerConfig, inputs: Mapping[str, Path], output:
         decoder.save(output, metadata)
         measured = {"held_out": SmallDecoder.load(output, encoder, name, config.device), "own_decoder": encoder}
     else:
-        if "start" in inputs:
-            tokenizer = PatchTokenizer.load(Path(inputs["start"]))
-            start = tokenizer.weights_sha256
-        else:
-            start = ""
-            tokenizer = _fitted(config, views, output / BASES)
-            torch.manual_seed(config.seed)
-            tokenizer.refinement = Refinement(
-                tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
-            )
-        train_decoder(tokenizer.to(config.device), views, config, output, start)
+        tokenizer = _fitted(config, views, output / BASES)
+        torch.manual_seed(config.seed)
+        tokenizer.refinement = Refinement(
+            tokenizer.temporal_compression, config.refinement_width, config.refinement_depth
+        )
+        train_decoder(tokenizer.to(config.device), views, config, output)
         tokenizer.save(output, metadata)
         measured = {"held_out": PatchTokenizer.load(output).to(config.device)}
     if "held_out" in inputs:
