@@ -18,7 +18,6 @@ from tasks.execution.chain import outline, ready_inputs
 from worldline_core.config import StrictModel, load_config
 from worldline_core.errors import ArtifactError
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.scale.mapping import RunnerConfig
 from worldline_core.store import artifact_files
 from worldline_core.store.artifact_files import VerifyMode, check_artifacts, find_damage, folder_files, write_manifest
 from worldline_core.store.store import Artifact, ArtifactStore
@@ -151,14 +150,6 @@ def test_a_process_reads_each_file_once(artifact: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(artifact_files, "digest_file", lambda path: read.append(path) or "")
     assert not find_damage(artifact)
     assert not read
-
-
-def test_how_inputs_are_compared_is_read_from_the_runner() -> None:
-    found = {
-        load_config(RunnerConfig, preset="smoke", overrides=[f"runner.verify={mode}"], section="runner").verify
-        for mode in ("off", "fast", "full")
-    }
-    assert found == {"off", "fast", "full"}
 
 
 def test_verify_names_damaged_files_and_how_to_rebuild(
