@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
@@ -65,7 +66,8 @@ def _dropped(topic: str, number: int) -> _Change:
 def _bomb(found: str, index: int, message: Any) -> Any:
     """A PNG header that claims 30,000 x 30,000 pixels."""
     if found == "/head/image":
-        message.data = message.data[:16] + struct.pack(">II", 30_000, 30_000) + message.data[24:]
+        header = message.data[12:16] + struct.pack(">II", 30_000, 30_000) + message.data[24:29]
+        message.data = message.data[:12] + header + struct.pack(">I", zlib.crc32(header)) + message.data[33:]
     return message
 
 
