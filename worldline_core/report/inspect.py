@@ -24,7 +24,6 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
-from worldline_core.evaluation.recordings import stride_of
 from worldline_core.exports.export import export_rollout, recording_content, shown_tracks
 from worldline_core.exports.rerun_recording import write_filter_recording, write_rerun_recording
 from worldline_core.filters.filter import inspect as find_defects
@@ -46,6 +45,7 @@ from worldline_core.pictures import (
 )
 from worldline_core.report.data import KEPT, FilteredEpisode, episode_of, episode_overlay, numbers_text, read_outcomes
 from worldline_core.report.dataset_card import choose_rows, sheet_rows
+from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import (
     JsonObject,
@@ -275,19 +275,6 @@ class _Subject:
             rows.append(SheetRow(f"{self.rollouts.method}  ·  {name}", shown, views[name]))
         return rows
 
-    def compared_rows(self, episode_id: str) -> list[SheetRow]:
-        """Recorded above predicted moments of one episode, in every view."""
-        if episode_id not in self.rollouts.episode_ids:
-            raise DataError("No prediction of this episode", where=self.folder, got=episode_id)
-        position, rows = self.episodes.position(episode_id), list[SheetRow]()
-        stride = stride_of(self.rollouts, self.episodes.rows[position])
-        for view in self.rollouts.views(episode_id):
-            predicted = VideoFrames(self.rollouts.clip(episode_id, view))
-            moments = evenly_spaced(len(predicted), MOMENTS)
-            recorded = np.asarray(self.episodes.frames(position, view, [stride * moment for moment in moments]))
-            rows += [SheetRow(f"{view}, recorded", recorded), SheetRow(f"{view}, predicted", predicted[moments])]
-        return rows
-
     def write_episode(self, episode_id: str, *, video: bool, rerun: bool) -> None:
         """Moments of one episode, with its controls or beside its prediction; a video and a Rerun recording of the same."""
         stem, position = safe_stem(episode_id), self.episodes.position(episode_id)
@@ -299,7 +286,8 @@ class _Subject:
             self.notes.append(f"no controls are shown: {error.what} ({error.where})")
         title = f"{row.embodiment}  ·  {row.instruction}"
         if self.kind == "RolloutSet":
-            self.picture(f"{stem}_prediction", contact_sheet(self.compared_rows(episode_id), title=title))
+            rows = compared_rows(self.rollouts, self.episodes, episode_id, self.rollouts.views(episode_id))
+            self.picture(f"{stem}_prediction", contact_sheet(rows, title=title))
             if video:
                 predicted = {self.rollouts.method: self.rollouts}
                 self.written += export_rollout(predicted, self.episodes, None, episode_id, self.output, ("mp4",))

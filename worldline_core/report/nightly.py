@@ -10,13 +10,12 @@ from pathlib import Path
 from markupsafe import Markup
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import RegressionError
-from worldline_core.evaluation.recordings import HEAD, stride_of
+from worldline_core.evaluation.recordings import HEAD
 from worldline_core.pages.charts import Series as Line
 from worldline_core.pages.charts import line_chart
 from worldline_core.pages.page import Table, code, interval, render, words
-from worldline_core.pictures import SheetRow, contact_sheet, evenly_spaced, jpeg_bytes
+from worldline_core.pictures import contact_sheet, jpeg_bytes
 from worldline_core.report.comparison import (
     DRIFT_NIGHTS,
     Change,
@@ -29,6 +28,7 @@ from worldline_core.report.comparison import (
 from worldline_core.report.context import ReportConfig, ReportContext, Section
 from worldline_core.report.decisions import decisions_section
 from worldline_core.report.quality import quality_section
+from worldline_core.report.videos import compared_rows
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.store.artifact_files import digest_value
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
@@ -37,7 +37,7 @@ PICTURES = "pictures"
 HEADLINES = ("robot_iou_exact@head", "robot_iou@head", "ssim@head", "accuracy", "success")
 MOST_CHARTS, MOST_LINES, MOST_TICKS = 8, 8, 8
 MOST_NIGHTS, MOST_COLUMNS = 30, 6
-MOST_PICTURES, MOMENTS = 4, 6
+MOST_PICTURES = 4
 QUESTIONS = {
     "step": "",
     "level": f" beside the median of the last {DRIFT_NIGHTS} good nights",
@@ -100,11 +100,7 @@ def _write_pictures(history: Path, compared: NightlyComparison, artifacts: Mappi
         rollout, what = rollouts.get(method), f"{recording}, {method}"
         if rollout is None or recording not in recorded or what in written or HEAD not in rollout.views(recording):
             continue
-        predicted, position = VideoFrames(rollout.clip(recording, HEAD)), episodes.position(recording)
-        moments = evenly_spaced(len(predicted), MOMENTS)
-        stride = stride_of(rollout, episodes.rows[position])
-        true = episodes.frames(position, HEAD, [stride * moment for moment in moments])
-        rows = [SheetRow("recorded", true), SheetRow(f"predicted by {method}", predicted[moments])]
+        rows = compared_rows(rollout, episodes, recording, [HEAD])
         written[what] = f"{PICTURES}/{digest_value([compared.night, what])[:16]}.jpg"
         sheet = contact_sheet(rows, title=f"{compared.night}: {recording}")
         write_bytes_atomic(history / written[what], jpeg_bytes(sheet))

@@ -19,10 +19,21 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frames import VideoFrames
+from worldline_core.errors import DataError
+from worldline_core.evaluation.recordings import stride_of
 from worldline_core.exports.export import export_rollout
 from worldline_core.pages.page import words
-from worldline_core.pictures import Picture, draw_tag, side_by_side, write_side_by_side, write_video
+from worldline_core.pictures import (
+    Picture,
+    SheetRow,
+    draw_tag,
+    evenly_spaced,
+    side_by_side,
+    write_side_by_side,
+    write_video,
+)
 from worldline_core.report.context import SPLIT_LABELS, Method, ReportContext, Section, VideoScores, in_order
+from worldline_core.rollout.rollout_set import RolloutSet
 
 TITLE = "Predicted videos"
 GROUP_CAPTIONS = {
@@ -30,6 +41,7 @@ GROUP_CAPTIONS = {
     "run": "This run: what its own training reached",
 }
 MOST_COLUMNS = 6
+MOMENTS = 6
 
 
 @dataclass(frozen=True)
@@ -190,3 +202,21 @@ def overview_video(context: ReportContext) -> dict[str, Any] | None:
     pictures = (np.concatenate(tiles, axis=0) for tiles in islice(zip(*rows, strict=False), count))
     made = write_video(context.media / "overview.mp4", pictures, count, row.fps)
     return {"video": made, "item": item, "row": row, "method": method}
+
+
+def compared_rows(rollout: RolloutSet, episodes: EpisodeSet, episode_id: str, views: Sequence[str]) -> list[SheetRow]:
+    """Moments of an episode in some views, recorded above predicted, for a contact sheet.
+
+    Raises: DataError when the set has no prediction of this episode.
+    """
+    if episode_id not in rollout.episode_ids:
+        raise DataError("No prediction of this episode", where=rollout.root, got=episode_id)
+    position, rows = episodes.position(episode_id), list[SheetRow]()
+    stride = stride_of(rollout, episodes.rows[position])
+    for view in views:
+        predicted = VideoFrames(rollout.clip(episode_id, view))
+        moments = evenly_spaced(len(predicted), MOMENTS)
+        recorded = np.asarray(episodes.frames(position, view, [stride * moment for moment in moments]))
+        rows.append(SheetRow(f"{words(view)}, recorded", recorded))
+        rows.append(SheetRow(f"{words(view)}, predicted by {rollout.method}", predicted[moments]))
+    return rows
