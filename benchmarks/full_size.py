@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
@@ -30,7 +30,7 @@ from worldline_core.model.tokenizers import WanTokenizer, tokenizer_outline
 from worldline_core.model.video_tokenizer import VideoTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
-from worldline_core.pipeline.memory_estimate import Checkpointing, ClipShape, Placement, Training, to_bfloat16
+from worldline_core.pipeline.memory_estimate import ClipShape, Training, to_bfloat16
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import PEAK_FLOPS, Machine, SizeSheet
 from worldline_core.rollout.captured import Captured, Run, run_now
@@ -138,7 +138,7 @@ SIZES = (
 )
 
 
-CASES: tuple[tuple[int, Checkpointing], ...] = ((1, "none"), (2, "block"))
+CASES: tuple[tuple[int, Literal["none", "block"]], ...] = ((1, "none"), (2, "block"))
 
 
 def memory(config: WorldModelConfig, frames: int, grid: tuple[int, int], trainer: TrainerConfig) -> tuple[float, float]:
@@ -152,7 +152,7 @@ def memory(config: WorldModelConfig, frames: int, grid: tuple[int, int], trainer
     training = Training(
         "memory", trainer, clips, config, config.views, grid, objective, lambda shape: shape.batch(config)
     )
-    parts = training.estimate(Placement.of(trainer, 1)).parts
+    parts = training.estimate(1).parts
     planned = sum(size for name, size in parts.items() if name != "state being written")
     model = WorldModel(config)
     model.initialise(torch.Generator().manual_seed(0))

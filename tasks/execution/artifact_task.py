@@ -88,6 +88,10 @@ class ArtifactTask:
 
         def work(config: StrictModel, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
             function = self.load_function()
+            if self.distributed:
+                from worldline_core.pipeline.memory_estimate import require_memory
+
+                require_memory(config, inputs)
             with same_threads(output):
                 return function(config, inputs, output, **options)
 

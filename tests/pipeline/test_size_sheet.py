@@ -11,7 +11,7 @@ import pytest
 from flows.command_line import main
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
-from worldline_core.pipeline.memory_estimate import Estimate, Placement
+from worldline_core.pipeline.memory_estimate import Estimate
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import Machine, SizeSheet
 from worldline_core.rollout.rollout_config import RolloutConfig
@@ -88,7 +88,7 @@ def test_a_rollout_that_does_not_fit_names_what_can_still_be_smaller(changes: di
 )
 def test_the_full_size_fits_cards_of_80_gb(title: str, parameters: tuple[float, float]) -> None:
     (training,) = (one for one in sheet("cosmos3-nano", devices=8).trainings() if one.title == title)
-    need = training.estimate(Placement.of(training.trainer, 8))
+    need = training.estimate(8)
     assert parameters[0] < need.parameters < parameters[1]
     assert need.fits(80e9), need.describe_parts()
-    assert training.estimate(Placement.of(training.trainer, 64)).total < need.total
+    assert training.estimate(64).total < need.total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from tasks.train_stage1 import train_stage1
 from worldline_core.config import load_config
 from worldline_core.errors import ConfigError
 from worldline_core.model.world_model import WorldModel
@@ -19,7 +21,6 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline import memory_estimate
 from worldline_core.pipeline.memory_estimate import (
     Cost,
-    Placement,
     Training,
     device_memory,
     extrapolated,
@@ -77,11 +78,11 @@ def training_of(config: WorldModelConfig, lengths: tuple[int, ...] = (17, 33), *
 
 
 def test_a_deep_model_costs_what_two_shallow_ones_predict(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = WorldModelConfig(towers="generation", num_layers=6)
+    config = WorldModelConfig(towers="generation", num_layers=9)
     training = training_of(config)
-    line = training.micro_step("none", sharded=False, frames=33)
+    line = training.micro_step(0, sharded=False)
     monkeypatch.setattr(memory_estimate, "extrapolated", lambda trace, size, _: trace(size))
-    whole = training.micro_step("none", sharded=False, frames=33)
+    whole = training.micro_step(0, sharded=False)
     assert line.all_flops == pytest.approx(whole.all_flops, rel=1e-9)
     assert line.activations == pytest.approx(whole.activations, rel=1e-3)
     assert line.gradients == whole.gradients == 4 * parameter_counts(config)[0]
@@ -102,22 +103,26 @@ def test_operations_are_those_of_the_matrix_products() -> None:
 
 def test_attention_is_counted_apart_and_scaled_with_the_square_of_the_clip() -> None:
     config = WorldModelConfig(towers="generation", num_layers=2)
-    short = training_of(config, (17,)).estimate(Placement()).flops
-    long = training_of(config, (33,)).estimate(Placement()).flops
-    assert training_of(config).estimate(Placement()).flops == pytest.approx((short + long) / 2, rel=0.1)
+    short = training_of(config, (17,)).estimate(1).flops
+    long = training_of(config, (33,)).estimate(1).flops
+    assert training_of(config).estimate(1).flops == pytest.approx((short + long) / 2, rel=0.1)
+
+
+BLOCK = {"checkpointing": "block", "reduce_every_micro_step": True}
 
 
 def test_shards_checkpointing_and_shorter_clips_are_proposed_in_this_order() -> None:
-    training = training_of(WorldModelConfig(towers="generation", num_layers=2))
-    plain, block = training.estimate(Placement()), training.estimate(Placement(checkpointing="block"))
-    assert block.total < 0.9 * plain.total
+    config = WorldModelConfig(towers="generation", num_layers=2)
+    training = training_of(config)
+    plain, block = training.estimate(1).total, training_of(config, sharding=BLOCK).estimate(1).total
+    assert block < 0.9 * plain
 
     def proposal(memory: float) -> str:
-        return training.fitting_setting(Placement(), memory / memory_estimate.USABLE)
+        return training.fitting_setting(1, memory / memory_estimate.USABLE)
 
-    assert proposal(block.total).startswith("trainer.sharding.checkpointing: block (")
-    assert "over 2 devices" in proposal(0.8 * block.total)
-    assert "at most 17 frames" in proposal(0.9 * training.estimate(Placement(1024, "block")).total)
+    assert proposal(block).startswith("trainer.sharding.checkpointing: block (")
+    assert "over 2 devices" in proposal(0.8 * block)
+    assert "at most 17 frames" in proposal(0.9 * training_of(config, sharding=BLOCK).estimate(1024).total)
     assert proposal(1e3) == "devices of more memory, or a smaller model"
 
 
@@ -125,24 +130,24 @@ def test_parts_are_shared_out_but_for_what_is_frozen_and_whole(monkeypatch: pyte
     cost = Cost(forward=100, held=60, gradients=4000, peak=4050)
     monkeypatch.setattr(Training, "micro_step", lambda *_args, **_named: cost)
     monkeypatch.setattr(memory_estimate, "parameter_counts", lambda *_: (1000, 10))
-    training = training_of(WorldModelConfig(towers="generation", num_layers=2))
-    training = Training(**{**vars(training), "scores": 1, "before": lambda _: {"tokenizer": (7, Cost(forward=50))}})
-    assert training.estimate(Placement(micro_steps=2)).parts == {
+
+    def parts(devices: int, **trainer: Any) -> Any:
+        training = training_of(WorldModelConfig(towers="generation", num_layers=2), **trainer)
+        frozen = {"tokenizer": (7, Cost(forward=50))}
+        return replace(training, scores=1, before=lambda _: frozen).estimate(devices).parts
+
+    assert parts(1, accumulation=2) == {
         "weights": 4000, "moments": 8000, "average": 4000, "tokenizer": 7, "state being written": 16000,
         "frozen scores": 4000, "gradients": 4000, "activations": 100,
     }  # fmt: skip
-    assert training.estimate(Placement(4)).parts == {
+    assert parts(4) == {
         "weights": 1000, "moments": 2000, "average": 1000, "tokenizer": 7, "state being written": 4000,
         "frozen scores": 1000, "gathered": 100, "gradients": 1000, "activations": 100,
     }  # fmt: skip
-    assert training.estimate(Placement(4, reduced_at_once=False)).parts["gradients"] == 4000
-
-
-def test_micro_steps_follow_from_a_global_batch() -> None:
-    trainer = TrainerConfig(steps=1, batch_size=2, global_batch=64)
-    assert Placement.of(trainer, 8).micro_steps == 4
-    assert not Placement.of(trainer, 8).reduced_at_once
-    assert Placement.of(trainer, 32).reduced_at_once
+    # Micro-steps follow from a global batch; their gradients are whole unless each is summed at once.
+    assert parts(4, global_batch=8)["gradients"] == 4000
+    assert parts(8, global_batch=8)["gradients"] == 500
+    assert parts(4, global_batch=8, sharding=BLOCK)["gradients"] == 1000
 
 
 @pytest.mark.slow
@@ -152,7 +157,7 @@ def test_distillation_from_frames_holds_what_encodes_them() -> None:
         config = load_config(PipelineConfig, preset="smoke", overrides=overrides)
         sheet = SizeSheet(config, PROJECT, Machine.model_validate({"memory": "16GB"}))
         found = trainings(config.distill, sheet.generation, sheet.source(config.distill))
-        needs.append([one.estimate(Placement()) for one in found[:2]])
+        needs.append([one.estimate(1) for one in found[:2]])
     for cached, online in zip(*needs, strict=True):
         assert online.total >= cached.total + online.parts["encoder"] > cached.total
 
@@ -169,7 +174,7 @@ def test_small_presets_are_cleared_for_8_gb_by_the_upper_bound(preset: str) -> N
 
 def test_the_upper_bound_is_above_the_estimate() -> None:
     training = training_of(WorldModelConfig(towers="generation", num_layers=2))
-    assert training.estimate(Placement()).total < training.upper_bound
+    assert training.estimate(1).total < training.upper_bound
 
 
 def test_a_stage_that_cannot_fit_is_refused_before_it_begins(
@@ -180,7 +185,7 @@ def test_a_stage_that_cannot_fit_is_refused_before_it_begins(
         {"model": {"num_layers": 1}, "trainer": {"steps": 2}, "clips": {"lengths": [9], "view_weights": {"primary": 1}}}
     )
     with pytest.raises(ConfigError, match=r"stage I on cpu[\s\S]*weights[\s\S]*worldline plan"):
-        find_task("train_stage1").run(
+        train_stage1.run(
             ArtifactStore(tmp_path), config, {name: world.inputs[name] for name in ("episodes", "latents")}
         )
 
@@ -195,7 +200,7 @@ def test_what_fits_by_a_hair_is_let_through(
     source = memory_estimate._source(config, world.inputs)
     assert source is not None
     (training,) = trainings(config, config.model, source)
-    need = training.estimate(Placement.of(training.trainer, 1))
+    need = training.estimate(1)
     memory = share * need.total / memory_estimate.USABLE
     assert training.upper_bound > memory
     monkeypatch.setattr(memory_estimate, "device_memory", lambda _device: memory)

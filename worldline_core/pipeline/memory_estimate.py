@@ -1,6 +1,6 @@
 """Memory and operations of a training, counted by running its own objective on tensors that have shapes and no values.
 
-`worldline plan` prints these estimates (`size_sheet.py`), and `run_step` refuses a training that its device cannot hold.
+`worldline plan` prints these estimates (`size_sheet.py`), and a training's task refuses what its device cannot hold.
 torch's own MemTracker gives the same figures within 0.4 % for a single pass, but refuses modules that are called several times
 before a backward pass, as the tokenizers and Stage III do; operations are counted by the formulas of its FlopCounterMode.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -49,9 +49,10 @@ from worldline_core.training.trainer import autocast
 from worldline_core.training.training_config import RelationalConfig, Stage1Config, Stage2Config, TrainerConfig
 from worldline_core.training.video_teacher import teacher_outline
 
+_SMALL = 8
+"""Largest size (layers, latent frames) that is traced whole; presets for a CPU have no more layers, and so an exact peak."""
 USABLE = 0.92
 """Share of a device's memory that a stage may fill; the rest is for the driver, communication and fragmentation."""
-Checkpointing = Literal["none", "block", "selective"]
 
 _aten = torch.ops.aten
 _ATTENTION = {
@@ -184,7 +185,7 @@ def extrapolated(trace: Callable[[int], Cost], size: int, traced_at: tuple[int, 
     The ``peak`` becomes the sum of activations and gradients, at most too high: where it lies depends on the size.
     """
     small, large = traced_at
-    if size <= large:
+    if size <= _SMALL:
         return trace(size)
     share = (size - small) / (large - small)
     line = Cost(*(a + (b - a) * share for a, b in zip(trace(small), trace(large), strict=True)))
@@ -245,31 +246,6 @@ class ClipShape:
 
 
 @dataclass(frozen=True)
-class Placement:
-    """How a training is spread over its devices.
-
-    Attributes:
-        shards: parts of every weight; checkpointing: as in `ShardingConfig`.
-        micro_steps: of an optimiser step, whose gradients add up.
-        reduced_at_once: gradients are summed over processes after every micro-step, so that no device keeps whole ones.
-    """
-
-    shards: int = 1
-    checkpointing: Checkpointing = "none"
-    micro_steps: int = 1
-    reduced_at_once: bool = True
-
-    @classmethod
-    def of(cls, trainer: TrainerConfig, devices: int) -> Placement:
-        """The placement that a trainer's configuration asks for on so many devices."""
-        sharding, micro_steps = trainer.sharding, trainer.accumulation
-        if trainer.global_batch is not None:
-            micro_steps = -(-trainer.global_batch // (trainer.batch_size * devices))
-        reduced = sharding.reduce_every_micro_step or micro_steps == 1
-        return cls(min(sharding.shards or devices, devices), sharding.checkpointing, micro_steps, reduced)
-
-
-@dataclass(frozen=True)
 class Estimate:
     """What one stage takes on one device.
 
@@ -306,7 +282,7 @@ def gigabytes(size: float) -> str:
 
 
 def upper_bound(model: WorldModelConfig, shape: ClipShape, models: int = 1) -> float:
-    """Cheap upper bound on the memory of a training of small pictures, some six times what it takes.
+    """Cheap upper bound on the memory of a training of small pictures, several times what it takes.
 
     Args:
         models: world models that are held, trained or not.
@@ -349,23 +325,22 @@ class Training:
     before: Callable[[ClipShape], Frozen] = lambda _: {}
     perceptual: Callable[[ClipShape], Frozen] | None = None
 
-    def shape(self, frames: int | None = None) -> ClipShape:
-        """The micro-batch that holds most: all views where steps are joint, else one; of the longest clips by default."""
-        weights, longest = self.clips.view_weights, frames or max(self.clips.lengths)
-        if weights is None or JOINT in weights:
-            return ClipShape(self.trainer.batch_size, self.views, longest, self.grid)
-        clips = self.trainer.batch_size * self.clips.single_view_factor
-        return ClipShape(clips, self.views[:1], longest, self.grid)
+    @property
+    def shape(self) -> ClipShape:
+        """The largest micro-batch: the longest clips, in all views where steps are joint, else in one."""
+        joint = self.clips.view_weights is None or JOINT in self.clips.view_weights
+        clips, views = (1, self.views) if joint else (self.clips.single_view_factor, self.views[:1])
+        return ClipShape(clips * self.trainer.batch_size, views, max(self.clips.lengths), self.grid)
 
     @property
     def upper_bound(self) -> float:
-        """See `upper_bound`."""
-        shape, (rows, columns) = self.shape(), self.grid
+        """Cheap upper bound on memory, with which most small models need no closer look."""
+        shape, (rows, columns) = self.shape, self.grid
         # Decoding eight frames of a view keeps some hundreds of values for each of their pixels.
         pictures = 4000 * 8 * 256 * shape.clips * len(shape.views) * rows * columns if self.perceptual else 0
         return upper_bound(self.model, shape, self.models + self.scores) + 2 * pictures
 
-    def micro_step(self, checkpointing: Checkpointing, step: int = 0, *, sharded: bool, frames: int | None) -> Cost:
+    def micro_step(self, step: int, *, sharded: bool) -> Cost:
         """Cost of one micro-step: the loss and its backward pass."""
         trainer = self.trainer.model_copy(update={"device": "cpu"})  # tensors without values follow a CPU's paths
         half = sharded and trainer.precision == "bf16"
@@ -379,10 +354,10 @@ class Training:
                 models = [value for value in vars(objective).values() if isinstance(value, nn.Module)]
                 for one in models:
                     if isinstance(one, WorldModel):
-                        one.checkpointing = checkpointing
+                        one.checkpointing = trainer.sharding.checkpointing
                     if half:
                         to_bfloat16(one)
-                batch = self.batch(self.shape(frames))
+                batch = self.batch(self.shape)
 
                 def loss() -> Tensor:
                     with autocast(trainer):
@@ -393,71 +368,78 @@ class Training:
 
         return extrapolated(trace, self.model.num_layers, (3, 4))
 
-    def estimate(self, placement: Placement, frames: int | None = None) -> Estimate:
-        """Memory and operations on one device, for clips of ``frames`` frames (default: of the configured lengths)."""
-        shape, shards = self.shape(frames), placement.shards
-        before, step, flops = self._costs(placement.checkpointing, shards > 1, frames)
+    def shards(self, devices: int) -> int:
+        """Parts of every weight on so many devices."""
+        return min(self.trainer.sharding.shards or devices, devices)
+
+    def estimate(self, devices: int) -> Estimate:
+        """Memory and operations on each of so many devices that share the training."""
+        trainer, shards = self.trainer, self.shards(devices)
+        micro_steps = trainer.accumulation
+        if trainer.global_batch is not None:
+            micro_steps = -(-trainer.global_batch // (trainer.batch_size * devices))
+        before, step, flops = self._costs(shards > 1)
         trained, block = parameter_counts(self.model, self.trained)
-        compared = self.perceptual(shape) if self.perceptual else {}
         own, average = 4 * self.models * trained / shards, 4 * trained / shards
-        frozen = {name: size for name, (size, _) in (self.before(shape) | compared).items()}
+        frozen = {name: size for name, (size, _) in (self.before(self.shape) | self._compared()).items()}
         parts: dict[str, float] = {"weights": own, "moments": 2 * own, "average": average, **frozen}
-        if torch.device(self.trainer.device).type == "cpu":
+        if torch.device(trainer.device).type == "cpu":
             parts["state being written"] = 3 * own + average  # elsewhere this copy lies in the host's memory
         parts["frozen scores"] = 4 * self.scores * trained / shards
         # Two blocks are gathered at a time, and the gradients of one are summed, in bfloat16 and float32.
         parts["gathered"] = 0 if shards == 1 else block * (2 * 2 + 2 + 4)
-        if shards == 1 and placement.micro_steps == 1:
+        if shards == 1 and micro_steps == 1:
             # Gradients come as activations go.
             during = {"gradients": step.gradients, "activations": step.peak - step.gradients}
         else:
-            kept = step.gradients / shards if placement.reduced_at_once else step.gradients
-            during = {"gradients": kept, "activations": step.activations}
+            reduced = micro_steps == 1 or trainer.sharding.reduce_every_micro_step
+            gradients = step.gradients / shards if reduced else step.gradients
+            during = {"gradients": gradients, "activations": step.activations}
         if sum(during.values()) < before:
             during = {"encoding clips": before}
         parts = {name: size for name, size in (parts | during).items() if size}
-        state = 4 * trained * (3 * self.models + 1)
-        facts = {
-            "tokens of a clip": {str(n): replace(shape, frames=n).tokens(self.model)
-                                 for n in sorted({min(self.clips.lengths), max(self.clips.lengths)})},
-            "shards": shards, "checkpointing": placement.checkpointing, "bytes of a training state": state,
-            "host bytes of loading": 6 * self.models * trained,
-        }  # fmt: skip
-        return Estimate(
-            self.title, self.models * trained, parts, placement.micro_steps * flops, self.trainer.steps, facts
-        )
+        lengths = sorted({min(self.clips.lengths), max(self.clips.lengths)})
+        tokens = {str(frames): replace(self.shape, frames=frames).tokens(self.model) for frames in lengths}
+        facts = {"tokens of a clip": tokens, "bytes of a training state": 4 * trained * (3 * self.models + 1)}
+        return Estimate(self.title, self.models * trained, parts, micro_steps * flops, trainer.steps, facts)
+
+    def _compared(self) -> Frozen:
+        return self.perceptual(self.shape) if self.perceptual else {}
 
     @cache  # noqa: B019 - a few trainings a process
-    def _costs(self, checkpointing: Checkpointing, sharded: bool, frames: int | None) -> tuple[float, Cost, float]:
+    def _costs(self, sharded: bool) -> tuple[float, Cost, float]:
         """Most bytes before the model's own micro-step, its cost at its worst, and the mean operations of both."""
-        shape = self.shape(frames)
         first = Cost()
-        for _, cost in self.before(shape).values():
+        for _, cost in self.before(self.shape).values():
             first = first.then(cost)
-        turns = [self.micro_step(checkpointing, step, sharded=sharded, frames=frames) for step, _ in self.turns]
-        for _, cost in (self.perceptual(shape) if self.perceptual else {}).values():
+        turns = [self.micro_step(step, sharded=sharded) for step, _ in self.turns]
+        for _, cost in self._compared().values():
             # It comes last in the forward pass, and is over when the backward pass begins.
-            held = turns[-1].held + cost.activations
-            later = turns[-1]._replace(forward=max(turns[-1].forward, held), peak=max(turns[-1].peak, held))
-            turns[-1] = later._replace(flops=later.flops + cost.flops)
+            last, held = turns[-1], turns[-1].held + cost.activations
+            changed = {"forward": max(last.forward, held), "peak": max(last.peak, held)}
+            turns[-1] = last._replace(**changed, flops=last.flops + cost.flops)
         worst, mean = Cost(), first
         for (_, share), turn in zip(self.turns, turns, strict=True):
             worst, mean = worst.then(turn), mean.then(turn.repeated(share))
-        lengths = [latent_frame_count(n) / latent_frame_count(shape.frames) for n in self.clips.lengths]
+        lengths = [latent_frame_count(n) / latent_frame_count(self.shape.frames) for n in self.clips.lengths]
         linear, square = (sum(n**power for n in lengths) / len(lengths) for power in (1, 2))
         return first.activations, worst, linear * mean.flops + square * mean.attention_flops
 
-    def fitting_setting(self, placement: Placement, memory: float) -> str:
+    def fitting_setting(self, devices: int, memory: float) -> str:
         """The nearest setting with which this training would fit devices of ``memory`` bytes, in words."""
-        block = replace(placement, checkpointing="block", reduced_at_once=True)
-        for shards in (placement.shards * 2**power for power in range(11)):
-            need = self.estimate(replace(block, shards=shards))
+        sharding, shards = self.trainer.sharding, self.shards(devices)
+        changes = {"checkpointing": "block", "reduce_every_micro_step": True, "shards": None}
+        trainer = self.trainer.model_copy(update={"sharding": sharding.model_copy(update=changes)})
+        block = replace(self, trainer=trainer)
+        for count in (shards * 2**power for power in range(11)):
+            need = block.estimate(count)
             if need.fits(memory):
-                devices = "" if shards == placement.shards else f" over {shards} devices"
-                summed = "" if placement.reduced_at_once or shards == 1 else ", reduce_every_micro_step: true"
-                return f"trainer.sharding.checkpointing: block{summed}{devices} ({gigabytes(need.total)} GB a device)"
+                wider = "" if count == shards else f" over {count} devices"
+                summed = "" if sharding.reduce_every_micro_step or count == 1 else ", reduce_every_micro_step: true"
+                return f"trainer.sharding.checkpointing: block{summed}{wider} ({gigabytes(need.total)} GB a device)"
         for frames in sorted(set(self.clips.lengths), reverse=True)[1:]:
-            if self.estimate(replace(block, shards=placement.shards * 1024), frames).fits(memory):
+            shorter = replace(block, clips=self.clips.model_copy(update={"lengths": (frames,)}))
+            if shorter.estimate(shards * 1024).fits(memory):
                 return f"trainer.sharding.checkpointing: block, and clips of at most {frames} frames, over more devices"
         return "devices of more memory, or a smaller model"
 
@@ -502,13 +484,10 @@ class _OutlinedSimilarities(ClipSimilarities):
     def similarities(
         self, clips: Sequence[Clip], views: Sequence[str], grid: tuple[int, int, int], frames: Tensor | None = None
     ) -> SimilarityMatrices:
-        bins, rows, columns = common_shape(self.config, grid)
-        cells = rows * columns
-        return SimilarityMatrices(
-            (bins, rows, columns),
-            torch.empty(len(clips), len(views), bins - 1, cells, cells),
-            torch.empty(len(clips), len(views) - 1, bins, cells, cells),
-        )
+        shape = bins, rows, columns = common_shape(self.config, grid)
+        clip_views, cells = (len(clips), len(views)), rows * columns
+        intra = torch.empty(*clip_views, bins - 1, cells, cells)
+        return SimilarityMatrices(shape, intra, torch.empty(len(clips), len(views) - 1, bins, cells, cells))
 
 
 def _distillation(config: DistillConfig, model: WorldModelConfig, source: ClipFrames) -> list[Training]:
@@ -719,13 +698,15 @@ def require_memory(config: StrictModel, inputs: Mapping[str, Path]) -> None:
             next_step=f"set {setting(memory)}; `worldline plan` shows every stage",
         )
 
+    devices = int(os.environ.get("WORLD_SIZE", "1"))
     for one in trainings(config, model, source):
-        placement = Placement.of(one.trainer, int(os.environ.get("WORLD_SIZE", "1")))
-        device = one.trainer.device
-        check(one.upper_bound, device, partial(one.estimate, placement), partial(one.fitting_setting, placement))
+        setting = partial(one.fitting_setting, devices)
+        check(one.upper_bound, one.trainer.device, partial(one.estimate, devices), setting)
     if isinstance(config, DistillConfig):
-        bound = upper_bound(model, trajectory_clips(config, source.grid))
-        device = config.trajectory_regression.trainer.device
+        bound, device = (
+            upper_bound(model, trajectory_clips(config, source.grid)),
+            config.trajectory_regression.trainer.device,
+        )
         check(bound, device, partial(trajectory_shard, config, model, source), lambda _: "fewer clips_per_shard")
 
 

@@ -30,7 +30,6 @@ from worldline_core.pipeline.memory_estimate import (
     ClipShape,
     Cost,
     Estimate,
-    Placement,
     Training,
     encoding,
     extrapolated,
@@ -134,20 +133,13 @@ class SizeSheet:
         for training in self.trainings():
             if training.title == "distill: trajectory regression":
                 yield self._row(self._trajectories(), "fewer clips_per_shard")
-            placement = Placement.of(training.trainer, self.machine.devices)
-            need = training.estimate(placement)
-            trainer, devices = training.trainer, self.machine.devices
-            state = need.facts["bytes of a training state"] * devices // placement.shards
-            facts = {
-                **need.facts,
-                "clips a step": trainer.global_batch or trainer.batch_size * trainer.accumulation * devices,
-                "host bytes of a state being written, of all hosts": state,
-            }
-            if trainer.minutes:
-                need = replace(need, steps=round(60 * trainer.minutes / self.machine.seconds(need.flops)))
+            need = training.estimate(self.machine.devices)
+            if training.trainer.minutes:
+                seconds = self.machine.seconds(need.flops)
+                need = replace(need, steps=round(60 * training.trainer.minutes / seconds))
             fits = need.fits(self.machine.memory)
-            setting = "" if fits else training.fitting_setting(placement, self.machine.memory)
-            yield self._row(replace(need, facts=facts), setting)
+            setting = "" if fits else training.fitting_setting(self.machine.devices, self.machine.memory)
+            yield need, setting
         yield from self._rollouts()
         video, policy = self.config.evaluate_video, self.config.evaluate_policy
         judges = (video is not None and "sam3" in video.segmenters, policy is not None and policy.judge == "qwen3_vl")
@@ -157,9 +149,6 @@ class SizeSheet:
                 yield self._row(counted, "a device of more memory")
 
     def _row(self, need: Estimate, setting: str) -> tuple[Estimate, str]:
-        if need.flops:
-            floor = need.flops / PEAK_FLOPS[self.machine.card]
-            need = replace(need, facts={**need.facts, "PFLOP": need.flops / 1e15, "floor in seconds": floor})
         return need, "" if need.fits(self.machine.memory) else setting
 
     def _encoding(self) -> Estimate:
@@ -294,7 +283,8 @@ def as_json(machine: Machine, rows: Sequence[tuple[Estimate, str]]) -> dict[str,
         stages.append(
             {
                 "stage": row.title, "parameters": row.parameters, "bytes": dict(row.parts), "total_bytes": row.total,
-                "fits": not setting, "instead": setting, "seconds": seconds, "hours": hours, "facts": dict(row.facts),
+                "fits": not setting, "instead": setting, "flops": row.flops, "seconds": seconds, "hours": hours,
+                "facts": dict(row.facts),
             }
         )  # fmt: skip
     return {
@@ -321,7 +311,8 @@ def as_text(machine: Machine, rows: Sequence[tuple[Estimate, str]]) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for row, setting in rows:
-        facts = "; ".join(f"{name}: {_fact(name, value)}" for name, value in row.facts.items())
+        figures = {**row.facts, **({"PFLOP": row.flops / 1e15} if row.flops else {})}
+        facts = "; ".join(f"{name}: {_fact(name, value)}" for name, value in figures.items())
         lines.append(f"- {row.title}: {facts}" + (f". It does not fit: set {setting}" if setting else ""))
     return "\n".join(lines)
 
