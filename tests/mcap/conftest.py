@@ -6,9 +6,11 @@ head camera hangs on a static transform, the wrist camera on a moving one, 0.1 m
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cv2
@@ -253,24 +255,7 @@ def declared(path: Path, **changes: Any) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class Toy:
-    """What the tests use of this file (test modules cannot import one another)."""
-
-    robot: Callable[..., Recording] = robot
-    declared: Callable[..., dict[str, Any]] = declared
-    recording: type[Recording] = Recording
-    shifted: Callable[[Sent, float], Sent] = shifted
-    transform: Callable[..., dict[str, Any]] = transform
-    camera_info: Callable[..., dict[str, Any]] = camera_info
-    picture: Callable[[int], np.ndarray] = picture
-    number_of: Callable[[np.ndarray], np.ndarray] = number_of
-    joints: Callable[..., np.ndarray] = joints
-    finger: Callable[..., np.ndarray] = finger
-    wrist: Callable[[float], tuple[np.ndarray, np.ndarray]] = wrist
-    start_ns: int = START_NS
-
-
 @pytest.fixture(scope="session")
-def toy() -> Toy:
-    return Toy()
+def toy() -> ModuleType:
+    """This module, whose functions the tests use."""
+    return sys.modules[__name__]

@@ -69,7 +69,7 @@ def write(
     """Two seconds: a head camera (PNG or video), joints with an unset velocity, a moving head, a tool pose."""
 
     def at(seconds: float) -> tuple[int, Any]:
-        time_ns = toy.start_ns + round(seconds * 1e9)
+        time_ns = toy.START_NS + round(seconds * 1e9)
         return time_ns, Timestamp(seconds=time_ns // 10**9, nanos=time_ns % 10**9).SerializeToString()
 
     def stamped(name: str, seconds: float, **values: Any) -> Any:

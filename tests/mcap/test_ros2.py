@@ -174,7 +174,7 @@ def test_a_simulated_clock_is_met_by_topics_without_one(tmp_path: Path, toy: Any
     """Header times count from zero, log times are of the wall: commands have only the latter."""
     recording = toy.robot()
     for topic in ("/head/image/compressed", "/wrist/image/compressed", "/joint_states"):
-        recording.change(topic, lambda sent: [toy.shifted(each, -toy.start_ns / 1e9 + 100) for each in sent])
+        recording.change(topic, lambda sent: [toy.shifted(each, -toy.START_NS / 1e9 + 100) for each in sent])
     no_wrist = toy.declared(tmp_path)
     del no_wrist["views"]["right_wrist"]["calibration"]
     recording.write(tmp_path / "a.mcap")
