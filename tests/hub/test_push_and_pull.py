@@ -54,7 +54,8 @@ def test_a_set_comes_back_to_the_byte_with_its_card(hub: Any, folder: Path, tmp_
     assert repository.private
     assert hub.tokens == {"hf_test"}
     readme = repository.files["README.md"][0].decode()
-    assert readme.startswith("---\npretty_name: Toy arms\n")
+    assert readme.startswith("---\n")
+    assert "pretty_name: Toy arms\n" in readme
     assert not [path for path in repository.files if path.startswith("run/")]
     video = next(path for path in repository.files if path.endswith(".mp4"))
     assert repository.files[video][1]  # through LFS
