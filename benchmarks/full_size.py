@@ -1,9 +1,8 @@
 """Operations, bytes and the least time of every stage and rollout at full size, and, where a GPU is, the time they take.
 
     python benchmarks/full_size.py                                   # the floors: nothing is loaded, any machine will do
-    python benchmarks/full_size.py --set rollouts.causal.config.decoder=FOLDER  # with a small decoder (of the default size, if not there)
+    python benchmarks/full_size.py --set rollouts.causal.config.sampler.decoder=FOLDER  # with a small decoder (of the default size, if not there)
     python benchmarks/full_size.py --card H200 --time cuda           # rollouts with random weights, timed on this card
-    python benchmarks/full_size.py --time cuda --captured            # the model's passes replayed as CUDA graphs
     python benchmarks/full_size.py --memory                          # planned against measured memory at three small sizes
 
 The floor counts every matrix product, convolution and attention at the card's peak. Targets on one H200: causal 7 s, Stage II 50 s for 129 frames of three views (the paper: 21 s and 90 s).
@@ -33,7 +32,6 @@ from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.pipeline.memory_estimate import ClipShape, Training, to_bfloat16
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import PEAK_FLOPS, Machine, SizeSheet
-from worldline_core.rollout.captured import Captured, Run, run_now
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, rollout_full_clip
 from worldline_core.rollout.speed import device_name, timed
 from worldline_core.training.clip_config import ClipSampling
@@ -71,10 +69,9 @@ class Rollouts:
     frames: int
     grid: tuple[int, int]
     device: str
-    run: Run
 
     @classmethod
-    def of(cls, preset: str, device: str, run: Run = run_now) -> Rollouts:
+    def of(cls, preset: str, device: str) -> Rollouts:
         """Clips as long as the preset's longest; weights made in bfloat16 on the device, never in float32."""
         config = load_config(PipelineConfig, preset=preset)
         sheet = SizeSheet(config, Path.cwd(), Machine.model_validate({"memory": "80GB"}))
@@ -82,7 +79,7 @@ class Rollouts:
         if isinstance(tokenizer, WanTokenizer):
             to_bfloat16(tokenizer)
         grid, frames = sheet.source().grid, max(config.distill.clips.lengths)
-        return cls(random_model(sheet.generation, device), tokenizer, config.distill.spec, frames, grid, device, run)
+        return cls(random_model(sheet.generation, device), tokenizer, config.distill.spec, frames, grid, device)
 
     @torch.no_grad()
     def seconds(self, sampler: str) -> float:
@@ -96,13 +93,10 @@ class Rollouts:
             if sampler == "stage2":
                 clip = rollout_full_clip(
                     self.model, first, maps, noise=Noise([42]), steps=FULL_STEPS, views=views, bfloat16=True,
-                    run=self.run,
                 )  # fmt: skip
                 self.tokenizer.decode(clip[0])
                 return
-            simulator = BlockCausalSimulator(
-                self.model, self.spec, noise=Noise([42]), views=views, bfloat16=True, run=self.run
-            )
+            simulator = BlockCausalSimulator(self.model, self.spec, noise=Noise([42]), views=views, bfloat16=True)
             simulator.start(first, maps[:, :, :, :1])
             decode = self.tokenizer.decoder()
             decode(first[0][:, :, None])
@@ -196,9 +190,6 @@ def main() -> None:
     parser.add_argument("--card", choices=tuple(PEAK_FLOPS), default="H200")
     parser.add_argument("--set", action="append", default=[], metavar="a.b=value", help="of the floors' preset")
     parser.add_argument("--time", metavar="DEVICE", help="time the rollouts there (cuda)")
-    parser.add_argument(
-        "--captured", action="store_true", help="record the model's passes and replay them as CUDA graphs"
-    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--memory", action="store_true")
     options = parser.parse_args()
@@ -211,11 +202,10 @@ def main() -> None:
                 print(f"{config.num_layers} layers of {config.hidden_size}, {frames} frames, accumulation {accumulation}, checkpointing {checkpointing}: planned "
                       f"{planned / 1e6:.1f} MB, measured {measured / 1e6:.1f} MB, ratio {planned / measured:.4f}")  # fmt: skip
     elif options.time:
-        run = Captured(options.time) if options.captured else run_now
-        rollouts = Rollouts.of(options.preset, options.time, run)
+        rollouts = Rollouts.of(options.preset, options.time)
         for sampler, target in TARGETS.items():
             seconds = [rollouts.seconds(sampler) for _ in range(1 + options.repeats)][1:]
-            figures = {"device": device_name(options.time), "captured": options.captured, "seconds": seconds}
+            figures = {"device": device_name(options.time), "seconds": seconds}
             print(json.dumps({"sampler": sampler, "frames": rollouts.frames, "target": target, **figures}))
     else:
         for row in floors(options.preset, options.card, options.set):

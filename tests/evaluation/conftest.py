@@ -152,7 +152,10 @@ def attempts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SmallWorld, Smal
     root = tmp_path_factory.mktemp("attempts")
     made = _write(root, cases, split="test", bank=None, training=20, late=("try-29",))
     for method in ("good", "copy"):
-        told = {"config": {"sampler": "block_causal", "steps": None}, "inputs": {"checkpoint": {"digest": method}}}
+        told = {
+            "config": {"sampler": {"kind": "block_causal", "steps": None}},
+            "inputs": {"checkpoint": {"digest": method}},
+        }
         write_manifest(made.inputs[f"rollouts.{method}"], {"step": "rollout", **told})
     untold = root / "untold"
     shutil.copytree(made.inputs["episodes"], untold)

@@ -75,7 +75,7 @@ def test_distillation_from_frames_of_another_size_than_stage2s_is_refused() -> N
     ],
 )
 def test_a_rollout_that_does_not_fit_names_what_can_still_be_smaller(changes: dict[str, Any], instead: str) -> None:
-    config = RolloutConfig.model_validate({"sampler": "full_clip", "num_frames": 5, **changes})
+    config = RolloutConfig.model_validate({"sampler": {"kind": "full_clip"}, "num_frames": 5, **changes})
     assert sheet("smoke", memory="0.001GB").rollout("stage2", config)[1] == instead
 
 

@@ -65,13 +65,13 @@ def test_what_is_small_already_stays_as_it_is() -> None:
     overrides = [
         "train_stage1.trainer.steps=2",
         "rollouts.stage2.config.seeds=[7]",
-        "rollouts.causal.config.timed_blocks=0",
+        "rollouts.causal.config.sampler.timed_blocks=0",
     ]
     keys = {change.key for change in changes_of(PRESET, None, overrides)}
     assert not keys & {
         "train_stage1.trainer.steps",
         "rollouts.stage2.config.seeds",
-        "rollouts.causal.config.timed_blocks",
+        "rollouts.causal.config.sampler.timed_blocks",
     }
     with pytest.raises(ConfigError, match="unknown key"):
         changes_of(PRESET, None, ["train_stage1.trainer.stepps=2"])
@@ -123,13 +123,13 @@ def test_a_missing_folder_of_weights_is_named_before_the_first_step(name: str, p
 
 
 def test_a_baseline_s_text_tokenizer_is_looked_for_too(project: Path) -> None:
-    overrides = ["train_stage1=null", "rollouts.stage1={config: {sampler: copy_first_frame}}"]
+    overrides = ["train_stage1=null", "rollouts.stage1={config: {sampler: {kind: copy_first_frame}}}"]
     config = load_config(PipelineConfig, preset=PRESET, overrides=overrides)
     check_weights(config, project)
     shutil.rmtree(project / "weights" / "Cosmos3-Nano" / "text_tokenizer")
     with pytest.raises(
         UnavailableError,
-        match=r"(?s)rollouts\.backbone\.config\.text\.path: weights/.*next step: download the folder text_t",
+        match=r"(?s)rollouts\.backbone\.config\.sampler\.text\.path: weights/.*next step: download the folder text_t",
     ):
         check_weights(config, project)
 

@@ -174,9 +174,9 @@ def test_cost_shows_every_block_and_the_ratio_of_the_ends(full_report: Path) -> 
 
 
 def test_a_ratio_needs_enough_blocks_at_both_ends() -> None:
-    assert Timing("causal", {"block_seconds": [1.0] * 9}).ratio is None
-    assert Timing("causal", {"block_seconds": [1.0] * 5 + [2.0] * 5}).ratio == 2.0
-    assert Timing("causal", {"block_seconds": [1.0, 2.0]}).blocks == [1.0, 2.0]
+    assert Timing("causal", {"long_rollout": {"block_seconds": [1.0] * 9}}).ratio is None
+    assert Timing("causal", {"long_rollout": {"block_seconds": [1.0] * 5 + [2.0] * 5}}).ratio == 2.0
+    assert Timing("causal", {"long_rollout": {"block_seconds": [1.0, 2.0]}}).blocks == [1.0, 2.0]
     assert Timing("causal", {}).blocks == []
 
 

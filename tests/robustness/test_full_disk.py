@@ -21,7 +21,7 @@ from worldline_core.config import StrictModel
 from worldline_core.evaluation.evaluation_config import PlanningConfig, PolicyEvaluationConfig, VideoEvaluationConfig
 from worldline_core.evaluation.planning.evaluate_planning import SEALED_FILE
 from worldline_core.report.report import ReportConfig
-from worldline_core.rollout.rollout import RolloutConfig
+from worldline_core.rollout.rollout_config import CopyFirstFrameConfig, RolloutConfig
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.store import Artifact, ArtifactStore
 
@@ -112,7 +112,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Path
 
 
 CONFIGS: dict[str, StrictModel] = {
-    "rollout": RolloutConfig(method="copy", sampler="copy_first_frame", num_frames=17),
+    "rollout": RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), num_frames=17),
     "evaluate_video": VideoEvaluationConfig(segmenters=("colour",), resamples=100),
     "evaluate_policy": PolicyEvaluationConfig(segmenter="colour", splits=("test",), resamples=100),
     "evaluate_planning": PlanningConfig(segmenter="colour", budgets=(2,), runs=1, resamples=100),

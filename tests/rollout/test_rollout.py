@@ -20,9 +20,16 @@ from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, D
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rollout.predictions import shuffled_partners
 from worldline_core.rollout.rollout import rollout
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import (
+    BlockCausalConfig,
+    CopyFirstFrameConfig,
+    FullClipConfig,
+    RolloutConfig,
+    TextToVideoConfig,
+)
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter, video_path
 from worldline_core.store.artifact_files import digest_folder
 
@@ -62,19 +69,24 @@ def test_times_lie_beside_the_predictions_and_outside_their_digest(
         "steps": 4, "batch_size": 2, "device": "cpu", "dtype": "bfloat16",
     }  # fmt: skip
     assert speed["frames"] == 6 * N  # the first of four batches of two warms up
-    assert len(speed["block_seconds"]) == 2
-    assert 0 < sum(speed["block_seconds"]) * speed["trajectories"] < speed["seconds"]
+    assert speed["seconds_per_frame"] == speed["seconds"] / speed["frames"] > 0
     assert "long_rollout" not in speed
-    rollout(CONFIG.model_copy(update={"timed_blocks": 6}), inputs, tmp_path)
+    rollout(CONFIG.model_copy(update={"sampler": BlockCausalConfig(timed_blocks=6)}), inputs, tmp_path)
     long = json.loads((tmp_path / "run" / "speed.json").read_text())["long_rollout"]
     assert [len(long[name]) for name in ("block_seconds", "block_processor_seconds")] == [6, 6]
     assert min(long["block_seconds"]) > 0
     assert digests(tmp_path) == digests(output)
     assert digest_folder(tmp_path) == digest_folder(output)
-    with pytest.raises(ValidationError, match="shift needs the sampler full_clip"):
-        RolloutConfig(shift=5.0)
-    with pytest.raises(ValidationError, match="timed_blocks needs the sampler block_causal"):
-        RolloutConfig(sampler="full_clip", timed_blocks=2)
+    before = (output / "run" / "speed.json").read_bytes()
+    rollout(CONFIG, inputs, output)  # nothing is left to predict
+    assert (output / "run" / "speed.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(("kind", "option"), [("block_causal", "shift"), ("full_clip", "timed_blocks"), ("ge_sim", "steps"),
+                                              ("block_causal", "text"), ("copy_first_frame", "decoder")])  # fmt: skip
+def test_a_sampler_has_its_own_options_alone(kind: str, option: str) -> None:
+    with pytest.raises(ValidationError, match=rf"sampler\.{kind}\.{option}\n.*Extra inputs"):
+        RolloutConfig.model_validate({"sampler": {"kind": kind, "url": "http://host", option: 1}})
 
 
 def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(
@@ -91,7 +103,8 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(
         return forward(model, noisy, sigma, cache, **rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(WorldModel, "forward_block", watch)
-    config = CONFIG.model_copy(update={"timed_blocks": 3, "seeds": (42,), "embodiments": ("ur5e_pair",)})
+    timed = BlockCausalConfig(timed_blocks=3)
+    config = CONFIG.model_copy(update={"sampler": timed, "seeds": (42,), "embodiments": ("ur5e_pair",)})
     given = inputs | {"checkpoint": inputs["checkpoint"].parent / "small_blocks"}
     summary = rollout(config.model_copy(update={"num_frames": 31}), given, tmp_path)
     assert (summary["steps"], summary["recent_blocks"], summary["frames"]) == (2, 1, 25)
@@ -100,11 +113,10 @@ def test_a_model_of_other_blocks_is_rolled_out_and_timed_with_them(
     assert levels == [1.0, 0.5] * (len(levels) // 2)
     speed = json.loads((tmp_path / "run" / "speed.json").read_text())
     assert speed["steps"] == 2
-    assert len(speed["block_seconds"]) == 3
     assert len(speed["long_rollout"]["block_seconds"]) == 3
     # A wider window and other steps can be asked for.
     held.clear()
-    wider = config.model_copy(update={"recent_blocks": 2, "steps": 1, "timed_blocks": 0})
+    wider = config.model_copy(update={"sampler": BlockCausalConfig(recent_blocks=2, steps=1)})
     summary = rollout(wider, given, tmp_path / "wider")
     assert (summary["steps"], summary["recent_blocks"], summary["frames"]) == (1, 2, 33)
     assert max(held) == 1 + 4
@@ -138,7 +150,7 @@ def test_controls_matter_and_zero_differs_from_shuffled(
 
 
 def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs: dict[str, Path], tmp_path: Path) -> None:
-    config = RolloutConfig(method="copy", sampler="copy_first_frame", max_episodes_per_embodiment=1)
+    config = RolloutConfig(method="copy", sampler=CopyFirstFrameConfig(), max_episodes_per_embodiment=1)
     given = {name: path for name, path in inputs.items() if name != "checkpoint"}
     assert rollout(config, given, tmp_path)["checkpoint_kind"] is None
     frames = RolloutSet.open(tmp_path).frames("a-1", "head").astype(int)
@@ -148,7 +160,7 @@ def test_copying_needs_no_checkpoint_and_repeats_the_first_frame(inputs: dict[st
 
 
 def test_the_whole_clip_sampler_takes_stage2_checkpoints_only(inputs: dict[str, Path], tmp_path: Path) -> None:
-    config = RolloutConfig(method="stage2", sampler="full_clip", steps=2, embodiments=("ur5e_pair",))
+    config = RolloutConfig(method="stage2", sampler=FullClipConfig(steps=2), embodiments=("ur5e_pair",))
     with pytest.raises(CheckpointError, match="wrong kind"):
         rollout(config, inputs, tmp_path)
     stage2 = inputs | {"checkpoint": inputs["checkpoint"].parent / "stage2"}
@@ -160,7 +172,7 @@ def test_the_whole_clip_sampler_takes_stage2_checkpoints_only(inputs: dict[str, 
 def test_a_model_with_film_is_driven_by_the_control_vectors_of_the_recording(
     inputs: dict[str, Path], tmp_path: Path
 ) -> None:
-    config = RolloutConfig(method="film", sampler="full_clip", steps=2, num_frames=5, embodiments=("aloha_viperx",))
+    config = RolloutConfig(method="film", sampler=FullClipConfig(steps=2), num_frames=5, embodiments=("aloha_viperx",))
     film = inputs | {"checkpoint": inputs["checkpoint"].parent / "film"}
     seen = []
     for actions in ("true", "zero", "shuffled"):
@@ -175,7 +187,7 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
     """The paper's first rows: the pretrained backbone, and Stage I."""
     models = inputs["checkpoint"].parent
     config = RolloutConfig(
-        method="base", sampler="text_to_video", steps=2, num_frames=7, embodiments=("aloha_viperx",), bfloat16=False
+        method="base", sampler=TextToVideoConfig(steps=2), num_frames=7, embodiments=("aloha_viperx",), bfloat16=False
     )
     base = inputs | {"checkpoint": models / "base"}
     summary = rollout(config, base, tmp_path / "base")
@@ -184,10 +196,14 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
     assert set(found.views("b-1")) == set(VIEWS)
     assert found.frames("b-1", "head").shape == (5, *SIZE, 3)
     # A prediction does not depend on those beside it, but on its text and seed; controls reach nothing.
-    changes = {"alone": {"batch_size": 1}, "cut": {"text": {"max_length": 2}}, "seed": {"seeds": (7,)}}
+    changes = {
+        "alone": {"batch_size": 1},
+        "cut": {"sampler": TextToVideoConfig(steps=2, text=TextConfig(max_length=2))},
+        "seed": {"seeds": (7,)},
+    }
     frames = {}
     for name, change in changes.items():
-        rollout(RolloutConfig.model_validate({**config.model_dump(), **change}), base, tmp_path / name)
+        rollout(config.model_copy(update=change), base, tmp_path / name)
         frames[name] = RolloutSet.open(tmp_path / name).frames("b-1", "head").astype(int)
     reference = found.frames("b-1", "head")
     assert np.abs(frames["alone"] - reference).max() <= 2
@@ -200,10 +216,8 @@ def test_a_model_without_actions_predicts_every_view_from_its_image_and_the_text
     ):
         with pytest.raises((CheckpointError, ConfigError), match=message):
             rollout(config, inputs | {"checkpoint": models / folder}, tmp_path / folder)
-    with pytest.raises(ValidationError, match="text_to_video takes none"):
-        RolloutConfig(sampler="text_to_video", actions="zero")
-    with pytest.raises(ValidationError, match="text needs the sampler text_to_video"):
-        RolloutConfig.model_validate({"text": {}})
+    with pytest.raises(ValidationError, match="text_to_video cannot be driven by zero ones"):
+        RolloutConfig(sampler=TextToVideoConfig(), actions="zero")
 
 
 def test_another_frame_rate_or_an_empty_choice_is_refused(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -61,8 +61,8 @@ def inputs_of(
 
 def chain(folders: dict[str, str], kind: str, segmenter: Path | None, **rollout: Any) -> dict[str, Any]:
     inputs = {name: folders[name] for name in ("episodes", "tracks", "tokenizer")} | {"checkpoint": folders[kind]}
-    sampler = {"causal": {"sampler": "block_causal"}, "stage2": {"sampler": "full_clip", "steps": 1, "clip_frames": 33}}
-    config = {"method": "model", "num_frames": "whole", "bfloat16": False, **sampler[kind], **rollout}
+    sampler = {"causal": {"kind": "block_causal"}, "stage2": {"kind": "full_clip", "steps": 1, "clip_frames": 33}}
+    config = {"method": "model", "num_frames": "whole", "bfloat16": False, "sampler": sampler[kind], **rollout}
     return {"rollout": config, "inputs": inputs, "segmenter": None if segmenter is None else str(segmenter)}
 
 

@@ -131,7 +131,7 @@ def test_branches_share_their_history_and_equal_separate_rollouts(causal: WorldL
     simulation.step(shared)
     snapshot = simulation.copy()
     branches = simulation.fork(3)
-    cache = branches._session._sampler._simulator.cache  # type: ignore[attr-defined]
+    cache = branches._session._sampler.cache  # type: ignore[attr-defined]
     assert {len(keys) for block in cache.window.blocks for keys, _ in block.layers.values()} == {1}
     forked = branches.step(ways)
     for clip, controls in enumerate(ways):

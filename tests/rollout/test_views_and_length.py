@@ -25,7 +25,7 @@ from worldline_core.model.contracts import TrainedClips
 from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.rollout.predictions import plan_predictions
 from worldline_core.rollout.rollout import rollout
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.rollout.worldline import WorldLine
 
@@ -41,7 +41,7 @@ EPISODES = (
     ("short", "test", 9, VIEWS, VIEWS),
 )
 CONFIG = RolloutConfig(method="causal", batch_size=8, bfloat16=False)
-STAGE2 = RolloutConfig(method="chained", sampler="full_clip", steps=2, bfloat16=False)
+STAGE2 = RolloutConfig(method="chained", sampler=FullClipConfig(steps=2), bfloat16=False)
 
 
 @pytest.fixture(scope="module")
@@ -175,18 +175,18 @@ def test_stage2_goes_on_where_its_last_clip_ended(mixed: dict[str, Path], inputs
     session = world.session(images, [42])
     last = session.step(world.action_maps([tracks], range(0, 17, 4), start=0, views=VIEWS))[0]
     again = world.session(torch.stack([frames_to_video(last[view][-1:])[:, 0] for view in VIEWS])[None], [42])
-    again._sampler._sample.keywords["noise"] = session._sampler._sample.keywords["noise"]  # type: ignore[attr-defined]
+    again._sampler._noise = session._sampler._noise  # type: ignore[attr-defined]
     maps = world.action_maps([tracks], range(16, 33, 4), start=16, views=VIEWS)
     assert np.array_equal(again.step(maps)[0]["head"], chained[2])
-    with pytest.raises(ValidationError, match="clip_frames needs the sampler full_clip and 1 \\+ a multiple of 4"):
-        RolloutConfig(sampler="full_clip", clip_frames=16)
+    with pytest.raises(ValidationError, match=r"clip_frames\n.*1 \+ a multiple of 4"):
+        FullClipConfig(clip_frames=16)
 
 
 def test_chained_rollouts_lie_in_the_set_like_others(
     inputs: dict[str, Path], mixed: dict[str, Path], tmp_path: Path
 ) -> None:
     given = mixed | {"checkpoint": inputs["checkpoint"].parent / "stage2"}
-    chained = STAGE2.model_copy(update={"num_frames": "whole", "clip_frames": 33})
+    chained = STAGE2.model_copy(update={"num_frames": "whole", "sampler": FullClipConfig(steps=2, clip_frames=33)})
     summary = rollout(chained, given, tmp_path / "a")
     counts = {row.episode_id: row.num_frames for row in RolloutSet.open(tmp_path / "a").rows}
     assert counts["long"] == 70
@@ -249,8 +249,8 @@ from pathlib import Path
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 root, frames = Path(sys.argv[1]), int(sys.argv[2])
-config = RolloutConfig.model_validate({"sampler": sys.argv[3], "num_frames": frames, "batch_size": 1,
-    "bfloat16": False, **({"clip_frames": 33, "steps": 1} if sys.argv[3] == "full_clip" else {})})
+config = RolloutConfig.model_validate({"num_frames": frames, "batch_size": 1, "bfloat16": False, "sampler":
+    {"kind": sys.argv[3], **({"clip_frames": 33, "steps": 1} if sys.argv[3] == "full_clip" else {})}})
 names = dict(part.split("=") for part in sys.argv[4:])
 rollout(config, {name: Path(path) for name, path in names.items()}, root / f"{sys.argv[3]}-{frames}")
 # Not ru_maxrss: a process begins with that of the one that started it.

@@ -63,8 +63,7 @@ def test_a_prediction_is_the_rollout_steps(
     write_index(tmp_path / "tracks", write_shard(tmp_path / "tracks", 0, [tracks]), sigma_px_ref=36.0)
     config = RolloutConfig.model_validate(
         {
-            "sampler": sampler,
-            "steps": steps,
+            "sampler": {"kind": sampler, "steps": steps},
             "num_frames": FRAMES,
             "embodiments": ["ur5e_silver"],
             "max_episodes_per_embodiment": 1,

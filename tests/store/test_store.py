@@ -137,8 +137,10 @@ def test_steps_name_the_weights_and_tokenizers_that_they_read(tmp_path: Path) ->
     trainer = {"trainer": {"steps": 1}}
     assert read("train_stage1", trainer) == {}
     assert read("train_stage1", {**trainer, "text": {"kind": "cosmos3", "path": "qwen"}}) == {"text": Path("qwen")}
-    baseline = {"method": "backbone", "sampler": "text_to_video", "num_frames": 17}
-    assert read("rollout", {**baseline, "text": {"kind": "cosmos3", "path": "qwen"}}) == {"text": Path("qwen")}
+    baseline = {"method": "backbone", "sampler": {"kind": "text_to_video"}, "num_frames": 17}
+    assert read("rollout", {"sampler": {"kind": "text_to_video", "text": {"kind": "cosmos3", "path": "qwen"}}}) == {
+        "text": Path("qwen")
+    }
     assert read("rollout", baseline) == {}
 
 

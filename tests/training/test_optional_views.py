@@ -23,7 +23,7 @@ from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import WorldModelConfig
 from worldline_core.rollout.rollout import rollout
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader
@@ -166,7 +166,7 @@ def test_a_model_of_the_head_alone_trains_on_any_recording_and_rolls_out_the_hea
     train_stage2(stage2(clips=clips, input=frames), inputs, tmp_path / "model")
     info = read_checkpoint_info(tmp_path / "model")
     assert info.trained == TrainedClips(views=HEAD, strides=(1,))
-    config = RolloutConfig(sampler="full_clip", steps=1, splits=("train",), num_frames=17)
+    config = RolloutConfig(sampler=FullClipConfig(steps=1), splits=("train",), num_frames=17)
     summary = rollout(config, inputs | {"checkpoint": tmp_path / "model"}, tmp_path / "out")
     assert summary["predictions"] == 6
     assert {row.view for row in RolloutSet.open(tmp_path / "out").rows} == {"head"}

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 NATIVE_VECTORS = "none: native control vectors, zero-padded"
 """In place of maps: what drives a model with FiLM. Their layout is that of the embodiment's state."""
+FULL_STEPS = 35
+"""Euler steps of the whole-clip sampler, at even noise levels."""
 CAUSAL_SHIFT = 5.0
 CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
 """Nodes of the paper's four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4, 0."""

@@ -184,8 +184,8 @@ def check_weights(config: PipelineConfig, project: Path) -> None:
         named["evaluate_policy.sam3_weights"] = config.evaluate_policy.sam3_weights
         named["evaluate_policy.vlm.weights"] = config.evaluate_policy.vlm.weights
     for name, run in config.rollouts.items():
-        text = None if run.config is None else run.config.text
-        named[f"rollouts.{name}.config.text.path"] = None if text is None else text.path
+        text = getattr(run.config and run.config.sampler, "text", None)
+        named[f"rollouts.{name}.config.sampler.text.path"] = None if text is None else text.path
     for key, path in named.items():
         if path is None:
             continue

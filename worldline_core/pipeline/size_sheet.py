@@ -42,7 +42,7 @@ from worldline_core.pipeline.memory_estimate import (
     weight_bytes,
 )
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import BlockCausalConfig, FullClipConfig, RolloutConfig, TextToVideoConfig
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
 from worldline_core.shipped import project_path
 from worldline_core.training.clip_config import FrameInput
@@ -179,9 +179,7 @@ class SizeSheet:
     def _rollouts(self) -> Iterator[tuple[Estimate, str]]:
         """One row for all rollouts that cost the same."""
         alike: dict[str, list[str]] = {}
-        what = {
-            "sampler", "steps", "num_frames", "clip_frames", "batch_size", "bfloat16", "weights", "decoder", "text",
-        }  # fmt: skip
+        what = {"sampler", "num_frames", "batch_size", "bfloat16", "weights"}
         for name, run in self.config.rollouts.items():
             if run.checkpoint is not None and run.config is not None:
                 alike.setdefault(run.config.model_dump_json(include=what), []).append(name)
@@ -192,8 +190,10 @@ class SizeSheet:
 
     def rollout(self, names: str, config: RolloutConfig) -> tuple[Estimate, str]:
         """The row of a prediction: sampling its latents, block by block or at once, and decoding them."""
-        model = self.model if config.sampler == "text_to_video" else self.generation
-        frames = config.num_frames if config.num_frames != "whole" else config.clip_frames or 129
+        sampler = config.sampler
+        model = self.model if isinstance(sampler, TextToVideoConfig) else self.generation
+        longest = (sampler.clip_frames if isinstance(sampler, FullClipConfig) else None) or 129
+        frames = config.num_frames if config.num_frames != "whole" else longest
         shape = ClipShape(config.batch_size, model.views, frames, self.source().grid)
 
         def trace(layers: int) -> Cost:
@@ -221,18 +221,19 @@ def _sampling(
     model: WorldModelConfig, shape: ClipShape, config: RolloutConfig, pipeline: PipelineConfig
 ) -> tuple[Cost, float]:
     """Cost of sampling the latents of a batch, and bytes of the causal sampler's caches."""
-    with_text = config.sampler == "text_to_video"  # which predicts each view by itself
+    sampler = config.sampler
+    with_text = isinstance(sampler, TextToVideoConfig)  # which predicts each view by itself
     one = replace(shape, views=shape.views[:1]) if with_text else shape
     with FakeTensorMode(), torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
         network = WorldModel(model).requires_grad_(False)
         if config.weights == "bfloat16":
             to_bfloat16(network)
-        text = (config.text or TextConfig()).max_length if with_text else 0
+        text = (sampler.text or TextConfig()).max_length if isinstance(sampler, TextToVideoConfig) else 0
         batch = one.batch(model, maps=not with_text, text=text)
         maps = batch.action_maps
-        if config.sampler == "block_causal" and maps is not None:
+        if isinstance(sampler, BlockCausalConfig) and maps is not None:
             spec = pipeline.distill.spec
-            spec = spec.model_copy(update={"sigmas": sigmas_causal(spec, config.steps)})
+            spec = spec.model_copy(update={"sigmas": sigmas_causal(spec, sampler.steps)})
             noise = Noise(range(shape.clips))
             running = BlockCausalSimulator(network, spec, noise=noise, views=shape.views, bfloat16=config.bfloat16)
 
@@ -252,7 +253,7 @@ def _sampling(
         def euler_step() -> None:  # they cost the same, one after the other
             network(batch.latents, torch.rand(shape.clips), action_maps=maps, text=context, views=one.views)
 
-        steps = (config.steps or FULL_STEPS) * len(shape.views) // len(one.views)
+        steps = (getattr(sampler, "steps", None) or FULL_STEPS) * len(shape.views) // len(one.views)
         return traced(read_text).then(traced(euler_step).repeated(steps)), 0.0
 
 
@@ -265,7 +266,8 @@ def _decoding(tokenizer: Path | None, shape: ClipShape, config: RolloutConfig) -
         codec = tokenizer_outline(tokenizer)
         if config.weights == "bfloat16" and isinstance(codec, WanTokenizer):
             to_bfloat16(codec)
-        small = None if config.decoder is None else SmallDecoder.outline(config.decoder, codec)
+        decoder = getattr(config.sampler, "decoder", None)
+        small = None if decoder is None else SmallDecoder.outline(decoder, codec)
 
         def trace(frames: int) -> Cost:
             latents = torch.empty(len(shape.views), codec.latent_channels, frames, *shape.grid)

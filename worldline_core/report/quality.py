@@ -210,12 +210,12 @@ class Timing:
 
     @property
     def blocks(self) -> list[float]:
-        """Seconds of each block of the long rollout made to measure it, else of the predictions themselves.
+        """Seconds of each block of the long rollout made to measure it.
 
         Processor seconds where they were recorded: other programs do not stretch them. Empty for models of whole clips.
         """
         long = self.content.get("long_rollout") or {}
-        values = long.get("block_processor_seconds") or long.get("block_seconds") or self.content.get("block_seconds")
+        values = long.get("block_processor_seconds") or long.get("block_seconds")
         return [float(value) for value in values or []]
 
     @property

@@ -1,15 +1,24 @@
-"""Predictions of a GE-Sim 2.0 server as rollouts: what it is sent of our recordings, and what comes back.
+"""Predictions of a simulator behind HTTP in the protocol of GE-Sim 2.0 (github.com/AgibotTech/GE-Sim-V2: docs/replay.md and
+docs/adding_world_models.md), written against its description.
 
-It is driven by absolute joint targets of two arms of seven joints (AgiBot G1), and by a picture of the tools for every frame
-and view (its "band"): a disc at each tool, larger the nearer the camera, darker the wider closed, and three lines of 10 cm
-along the tool's axes. Its model was trained at 384 x 512.
+GET /healthz; POST /init gives a ``client_id`` that every later body carries (another client's /init ends the session). /reset,
+/set_task, /set_camera_params and /close take JSON; /set_episode_data, /set_episode_traj and /step take sections, each after its
+length in four bytes, big-endian, the last one JSON. A frame is one JPEG with the views side by side; numbers are float32,
+little-endian. /step takes at most 25 actions and answers with JSON (``frame_shape``: T 3 V H W; ``state_shape``, or null), T
+frames, and the state.
+
+The server is driven by absolute joint targets of two arms of seven joints (AgiBot G1), and by a picture of the tools for every
+frame and view (its "band"): a disc at each tool, larger the nearer the camera, darker the wider closed, and three lines of
+10 cm along the tool's axes.
 
 Axes: t frames, v views, a arms (left, right).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -17,22 +26,30 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from worldline_core.actions.episode_tracks import EpisodeTracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_set import EpisodeSet
+from worldline_core.data.guards.plain_files import decode_image
+from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.errors import DataError, UnavailableError
 from worldline_core.geometry.cameras import ImageTransform
+from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
 from worldline_core.model.video_tokenizer import resize_frame
-from worldline_core.rollout.ge_sim_client import CHUNK, GeSimClient, RefusedPredictionError
+from worldline_core.rollout.predictions import Prediction
 from worldline_core.rollout.rollout_config import GeSimConfig
 from worldline_core.rollout.session import Frames
+from worldline_core.untrusted_text import cut
 
-ACTIONS = 16
-GRIPPERS = (7, 15)
-"""Of an action: seven joints and the gripper of the left arm, then of the right one."""
+CHUNK = 25
+"""Most actions of a step."""
 REPLAYED = 2 * CHUNK
-"""From so many frames on the server takes a band as the whole episode's, and remembers its earlier parts."""
-_BACKGROUND = 50
-_AXIS_M, _AXIS_WIDTH = 0.1, 8
+"""From this many frames on the server takes a band as the whole episode's, and remembers its earlier parts."""
+ACTIONS, GRIPPERS = 16, (7, 15)
+"""Numbers of an action: seven joints and the gripper of the left arm, then of the right one."""
+_JPEG_QUALITY, _MAX_JSON_BYTES = 95, 1 << 16
+_PATIENCE = 3
+"""Refused predictions in a row after which the server counts as out of order."""
+_BACKGROUND, _AXIS_M, _AXIS_WIDTH = 50, 0.1, 8
 # The sequential maps "Greens" and "Reds" of ColorBrewer, from light to dark.
 _DISC = (
     np.array([(247, 252, 245), (229, 245, 224), (199, 233, 192), (161, 217, 155), (116, 196, 118), (65, 171, 93),
@@ -44,6 +61,12 @@ _AXES = (((0, 0, 255), (255, 255, 0), (0, 255, 255)), ((255, 0, 255), (255, 0, 0
 """Colours of the lines along x, y and z, of the left and the right tool."""
 
 
+class RefusedPredictionError(DataError):
+    """One prediction cannot be made, others may be; ``reason`` is its code in the quarantine."""
+
+    reason = "simulator_failed"
+
+
 class UnsupportedControlsError(RefusedPredictionError):
     """The controls are not those of two arms of seven joints."""
 
@@ -51,47 +74,50 @@ class UnsupportedControlsError(RefusedPredictionError):
 
 
 class GeSim:
-    """A server's model, as `rollout` asks for predictions."""
+    """One session with a server.
 
-    steps = causal = None
+    Raises:
+        UnavailableError: there is no such server.
+    """
+
+    steps = None
     views: tuple[str, ...] = VIEWS
     frames_per_unit = 4
     needs_cameras = True
-    block_seconds = ()
 
-    def __init__(self, config: GeSimConfig, episodes: EpisodeSet) -> None:
+    def __init__(self, config: GeSimConfig, episodes: EpisodeSet, tracks: ActionTracks, stride: int) -> None:
         height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
         self.image_size = (height, width)
-        self._config, self._episodes = config, episodes
-        self._client = GeSimClient(config.url, config.timeout_s)
+        self._config, self._episodes, self._tracks, self._stride = config, episodes, tracks, stride
+        self._url = config.url.rstrip("/")
+        self._refused = 0
+        self._post("/healthz", None)
+        answer = self._post("/init", b'{"user_name": "worldline"}')
+        try:
+            self._client = str(json.loads(answer)["client_id"])
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise self._unusable("/init", f"no client_id in its answer: {error!r}") from error
 
     def unit(self, frames: int) -> int:
-        """Frames come one by one."""
+        """Frames arrive one by one."""
         return 1
 
     def close(self) -> None:
         """End the session."""
-        self._client.close()
+        try:
+            self._tell("/close")
+        except (UnavailableError, RefusedPredictionError):
+            return  # the predictions are complete
 
-    def stream(
-        self,
-        images: Float[Tensor, "1 v 3 h w"],
-        tracks: Sequence[EpisodeTracks],
-        frames: int,
-        seeds: Sequence[int],
-        *,
-        views: Sequence[str],
-        stride: int,
-        without_actions: bool = False,
-    ) -> Iterator[Frames]:
-        """As :meth:`WorldLine.stream`, of one prediction; the protocol knows no seed.
+    def stream(self, images: Float[Tensor, "1 v 3 h w"], batch: Sequence[Prediction]) -> Iterator[Frames]:
+        """Frames of one prediction, the observed one first; the protocol has no seeds.
 
         Raises:
             RefusedPredictionError: the server cannot make this one.
             UnavailableError: the server cannot be used.
         """
-        del seeds, without_actions
-        (controls,), size = tracks, self._config.image_size
+        (item,), size, stride = batch, self._config.image_size, self._stride
+        controls = self._tracks.tracks(item.controls_of)
         if controls.native is None or controls.controls == "ee_pose" or controls.native.shape[1] != ACTIONS:
             raise UnsupportedControlsError(
                 "GE-Sim is driven by joint targets of two arms of seven joints and a gripper each",
@@ -99,25 +125,87 @@ class GeSim:
                 expected=f"{ACTIONS} numbers a frame",
                 got=f"{controls.controls} of {None if controls.native is None else controls.native.shape[1]} numbers",
             )
-        row = self._episodes.rows[self._episodes.position(controls.episode_id)]
         observed = rearrange((images[0] + 1) * 127.5, "v c h w -> v h w c").round().clamp(0, 255).byte().numpy()
-        yield [{view: picture[None] for view, picture in zip(views, observed, strict=True)}]
+        yield [{view: picture[None] for view, picture in zip(item.views, observed, strict=True)}]
         K = ImageTransform.of(controls.image_size).resize(size).intrinsics(controls.K)
-        client, now = self._client, controls.clip([0])
-        client.begin(row.instruction, K, now.T_base_camera[0], _resized(observed, size))
-        shown = controls.clip(range(stride, frames * stride, stride))
-        whole = frames - 1 >= REPLAYED
-        if whole:
-            client.condition(self._band(shown, K), shown.T_base_camera.swapaxes(0, 1))
-        for start in range(0, frames - 1, CHUNK):
-            chunk = shown.clip(range(start, min(start + CHUNK, frames - 1)))
+        cameras = controls.clip([0]).T_base_camera[0]
+        self._tell("/reset")
+        self._tell("/set_task", task=self._episodes.rows[item.position].instruction)
+        self._tell("/set_camera_params", intrinsic=K.tolist(), extrinsic=cameras.tolist())
+        picture = _jpeg(_resized(observed, size))
+        self._post("/set_episode_data", self._body([picture], frame_shape=[3, len(observed), *size]))
+        shown = controls.clip(range(stride, item.frames * stride, stride))
+        if whole := item.frames - 1 >= REPLAYED:
+            self._condition(shown, K)
+        for start in range(0, item.frames - 1, CHUNK):
+            chunk = shown.clip(range(start, min(start + CHUNK, item.frames - 1)))
             if not whole:
-                client.condition(self._band(chunk, K), chunk.T_base_camera.swapaxes(0, 1))
-            found = client.step(actions_of(chunk), size, len(views))
-            yield [{view: _resized(found[:, v], self.image_size) for v, view in enumerate(views)}]
+                self._condition(chunk, K)
+            found = self._step(actions_of(chunk))
+            yield [{view: _resized(found[:, v], self.image_size) for v, view in enumerate(item.views)}]
 
-    def _band(self, tracks: EpisodeTracks, K: np.ndarray) -> np.ndarray:
-        return tool_band(tracks, K, self._config.image_size, self._config.tool_offset_m)
+    def _condition(self, tracks: EpisodeTracks, K: np.ndarray) -> None:
+        """Send the pictures of the tools and the camera poses of the coming frames."""
+        band, poses = (
+            tool_band(tracks, K, self._config.image_size, self._config.tool_offset_m),
+            tracks.T_base_camera.swapaxes(0, 1),
+        )
+        shape = [3, band.shape[1], band.shape[0], *band.shape[2:4]]
+        sections = [_packed(_jpeg(views) for views in band), _floats(poses)]
+        self._post("/set_episode_traj", self._body(sections, traj_shape=shape, c2w_shape=poses.shape))
+
+    def _step(self, actions: np.ndarray) -> np.ndarray:
+        """Frames of the next actions (t, 16), uint8 (t, v, H, W, 3)."""
+        size, views = self._config.image_size, len(self.views)
+        # A JPEG is never much larger than its pixels.
+        most = _MAX_JSON_BYTES + 6 * len(actions) * views * math.prod(size) + 4 * CHUNK * ACTIONS
+        answer = self._post("/step", self._body([_floats(actions)], action_shape=actions.shape), most)
+        try:
+            _, *pictures, _ = _sections(answer)  # between JSON and the state
+            if len(pictures) != len(actions):
+                raise ValueError(f"{len(pictures)} frames for {len(actions)} actions")
+            frames = [_views(picture, size, views) for picture in pictures]
+        except (ValueError, RejectedInputError) as error:
+            raise self._refusal("/step", str(error)) from error
+        self._refused = 0
+        return np.stack(frames)
+
+    def _tell(self, path: str, **values: object) -> None:
+        self._post(path, json.dumps({"client_id": self._client, **values}).encode())
+
+    def _body(self, sections: Sequence[bytes], **values: object) -> bytes:
+        return _packed([*sections, json.dumps({"client_id": self._client, **values}).encode()])
+
+    def _post(self, path: str, body: bytes | None, most: int = _MAX_JSON_BYTES) -> bytes:
+        kind = "application/json" if body is None or body.startswith(b"{") else "application/octet-stream"
+        headers = {"Content-Type": kind, "Accept-Encoding": "identity"}
+        try:
+            status, answer = exchange(
+                self._url + path, body, headers=headers, timeout_s=self._config.timeout_s, max_bytes=most
+            )
+        except (UnreachableError, IncompleteResponseError) as error:
+            raise self._unusable(path, str(error)) from error
+        if status != 200:
+            refuses = self._refusal if status in (400, 500) else self._unusable  # these two understood the request
+            raise refuses(path, f"HTTP {status}: {answer.decode(errors='replace')}")
+        if len(answer) > most:
+            raise self._refusal(path, f"an answer of more than {most:,} bytes")
+        return answer
+
+    def _refusal(self, path: str, reason: str) -> RefusedPredictionError | UnavailableError:
+        self._refused += 1
+        if self._refused >= _PATIENCE:
+            return self._unusable(path, f"{_PATIENCE} refusals in a row, the last one: {reason}")
+        return RefusedPredictionError("The simulator refused", where=self._url + path, got=cut(reason, 500))
+
+    def _unusable(self, path: str, reason: str) -> UnavailableError:
+        return UnavailableError(
+            "The simulator's server cannot be used",
+            where=self._url + path,
+            expected="a server of GE-Sim 2.0's protocol, and no other client of it meanwhile",
+            got=cut(reason, 500),
+            next_step="start it, check sampler.url and sampler.timeout_s, and run again: finished predictions are kept",
+        )
 
 
 def actions_of(tracks: EpisodeTracks) -> np.ndarray:
@@ -135,7 +223,7 @@ def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_
 
     Args:
         K: (v, 3, 3) in pixels of ``size``.
-        tool_offset_m: from the end link, whose distance says how large the disc is, to the tool, along its z.
+        tool_offset_m: to the tool, along its z, from the end link, whose distance decides the size of the disc.
     """
     T_camera_tool = np.linalg.inv(tracks.T_base_camera)[:, :, None] @ tracks.T_base_tool[:, None].astype(np.float64)
     ends = np.array([[0, 0, 0, 1], [_AXIS_M, 0, 0, 1], [0, _AXIS_M, 0, 1], [0, 0, _AXIS_M, 1]]).T
@@ -148,7 +236,8 @@ def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_
     closed = ((1 - tracks.gripper[:, 0]) * (120 - 35) + 35) / 120
     band = np.full((*depth.shape[:2], *size, 3), _BACKGROUND, np.uint8)
     for (t, v), picture in zip(np.ndindex(*depth.shape[:2]), rearrange(band, "t v h w c -> (t v) h w c"), strict=True):
-        drawn = [arm for arm in range(2) if depth[t, v, arm, 0] > 0 and _inside(pixels[t, v, arm, :, 0], size)]
+        inside = [bool(((pixel >= 0) & (pixel < size[::-1])).all()) for pixel in pixels[t, v, :, :, 0]]
+        drawn = [arm for arm in range(2) if depth[t, v, arm, 0] > 0 and inside[arm]]
         for arm in drawn:
             place = np.clip(closed[t, arm], 0, 1) * (len(_DISC[arm]) - 1)
             colour = [int(np.interp(place, range(len(_DISC[arm])), channel)) for channel in _DISC[arm].T]
@@ -161,10 +250,6 @@ def tool_band(tracks: EpisodeTracks, K: np.ndarray, size: tuple[int, int], tool_
     return band
 
 
-def _inside(pixel: np.ndarray, size: tuple[int, int]) -> bool:
-    return bool(0 <= pixel[0] < size[1] and 0 <= pixel[1] < size[0])
-
-
 def _point(pixel: np.ndarray) -> tuple[int, int]:
     """Whole pixels; those far outside, where an axis points at the camera, are brought near."""
     x, y = np.clip(pixel, -1e4, 1e4)
@@ -172,8 +257,40 @@ def _point(pixel: np.ndarray) -> tuple[int, int]:
 
 
 def _resized(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """uint8 (n, H, W, 3) at another size."""
     resized = np.empty((len(pictures), *size, 3), np.uint8)
     for picture, target in zip(pictures, resized, strict=True):
         resize_frame(np.ascontiguousarray(picture), size, out=target)
     return resized
+
+
+def _floats(values: np.ndarray) -> bytes:
+    return np.ascontiguousarray(values, "<f4").tobytes()
+
+
+def _jpeg(views: np.ndarray) -> bytes:
+    """One JPEG of views uint8 (v, H, W, 3), side by side."""
+    picture = np.concatenate(list(views), axis=1)[..., ::-1]
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+def _views(content: bytes, size: tuple[int, int], views: int) -> np.ndarray:
+    """Views uint8 (v, H, W, 3) of an untrusted JPEG."""
+    expected, picture = (size[0], views * size[1]), decode_image(content, "a frame")
+    if (found := picture.shape[:2]) != expected:
+        raise ValueError(f"a frame of {found[0]} x {found[1]} pixels, not of {expected[0]} x {expected[1]}")
+    return np.stack(np.split(picture, views, axis=1))
+
+
+def _packed(sections: Iterable[bytes]) -> bytes:
+    return b"".join(len(section).to_bytes(4, "big") + section for section in sections)
+
+
+def _sections(content: bytes) -> list[bytes]:
+    sections, position = [], 0
+    while position < len(content):
+        start = position + 4
+        position = start + int.from_bytes(content[position:start], "big")
+        if position > len(content) or start > len(content):
+            raise ValueError(f"section {len(sections)} breaks off: {position - len(content)} bytes are missing")
+        sections.append(content[start:position])
+    return sections

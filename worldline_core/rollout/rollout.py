@@ -9,73 +9,36 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.actions.action_tracks import changed_tracks
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.video_tokenizer import frames_to_video, video_to_frames
+from worldline_core.model.video_tokenizer import frames_to_video
 from worldline_core.progress import Progress
-from worldline_core.rollout.captured import Captured
-from worldline_core.rollout.ge_sim import GeSim
-from worldline_core.rollout.ge_sim_client import RefusedPredictionError
+from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
+from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
 from worldline_core.rollout.predictions import Prediction, batches, choose_episodes, plan_predictions
-from worldline_core.rollout.rollout_config import RolloutConfig
+from worldline_core.rollout.rollout_config import (
+    BlockCausalConfig,
+    CopyFirstFrameConfig,
+    FullClipConfig,
+    GeSimConfig,
+    RolloutConfig,
+    TextToVideoConfig,
+)
 from worldline_core.rollout.rollout_set import RolloutSetWriter
 from worldline_core.rollout.session import Frames, encode_images
-from worldline_core.rollout.speed import BatchTime, SpeedLog, device_name, long_rollout, timed
-from worldline_core.rollout.text_to_video import TextToVideo
+from worldline_core.rollout.speed import SPEED_FILE, device_name, long_rollout, timed
 from worldline_core.rollout.worldline import WorldLine
-
-_COPIED_AT_ONCE = 64
-
-
-class FirstFrameCopy:
-    """The baseline: every predicted frame is the observed one, at the size of the recordings."""
-
-    steps = causal = None
-    views: tuple[str, ...] = VIEWS
-    frames_per_unit = TEMPORAL_FACTOR
-    needs_cameras = False
-    block_seconds = ()
-
-    def __init__(self, episodes: EpisodeSet) -> None:
-        height, width = episodes.frames(0, episodes.rows[0].views[0], [0]).shape[1:3]
-        self.image_size = (height, width)
-
-    def unit(self, frames: int) -> int:
-        """Frames are copied one by one."""
-        return 1
-
-    def stream(
-        self,
-        images: Float[Tensor, "b v 3 h w"],
-        tracks: Sequence[EpisodeTracks],
-        frames: int,
-        seeds: Sequence[int],
-        *,
-        views: Sequence[str],
-        stride: int,
-        without_actions: bool = False,
-    ) -> Iterator[Frames]:
-        """As :meth:`WorldLine.stream`; the controls and seeds play no part."""
-        del tracks, seeds, stride, without_actions
-        clips = [{view: video_to_frames(first[v, :, None]) for v, view in enumerate(views)} for first in images]
-        for begin in range(0, frames, _COPIED_AT_ONCE):
-            count = min(_COPIED_AT_ONCE, frames - begin)
-            yield [{view: np.repeat(still, count, axis=0) for view, still in clip.items()} for clip in clips]
-
+from worldline_core.store.atomic import write_json_atomic
 
 World = WorldLine | TextToVideo | FirstFrameCopy | GeSim
-WITHOUT_MODEL = ("copy_first_frame", "ge_sim")
-"""Samplers that read no checkpoint."""
 
 
 def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:
@@ -84,8 +47,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     Writes a RolloutSet, video by video as it is predicted: memory does not grow with the length. Chosen episodes that
     cannot be predicted lie in ``quarantine.parquet``, each with its reason. Predictions already there are kept; a batch is
     made again as a whole if one of its videos is missing, so the bytes do not depend on where an earlier call stopped.
-    Times go to ``run/speed.json``: seconds per frame, and ``block_seconds`` of the block-causal sampler, per trajectory;
-    ``long_rollout`` holds those of ``timed_blocks``.
+    The times of a call that predicts anything go to ``run/speed.json``, those of ``timed_blocks`` as ``long_rollout``.
 
     Returns:
         counts, frames, and the checkpoint's kind; where there are any, the episodes left out by reason (``left_out``), how
@@ -97,7 +59,9 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         CheckpointError: the checkpoint is of the wrong kind for the sampler, or was trained on other action maps.
         DataError: no episode matches, or none can be predicted.
     """
-    needed = {"episodes", "tracks", "tokenizer"} | (set() if config.sampler in WITHOUT_MODEL else {"checkpoint"})
+    sampler = config.sampler
+    without_model = isinstance(sampler, CopyFirstFrameConfig | GeSimConfig)
+    needed = {"episodes", "tracks", "tokenizer"} | (set() if without_model else {"checkpoint"})
     if not needed <= inputs.keys():
         raise ConfigError("The rollout lacks inputs", expected=sorted(needed), got=sorted(inputs))
     episodes = EpisodeSet.open(Path(inputs["episodes"]))
@@ -105,15 +69,15 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     chosen = choose_episodes(config, episodes)
     rates = [float(episodes.rows[position].fps) for position in chosen]
     world: World
-    if config.sampler == "copy_first_frame":
+    if isinstance(sampler, CopyFirstFrameConfig):
         world = FirstFrameCopy(episodes)
-    elif config.server is not None:
-        world = GeSim(config.server, episodes)
+    elif isinstance(sampler, GeSimConfig):
+        world = GeSim(sampler, episodes, tracks, config.stride)
         config = config.model_copy(update={"views": world.views, "batch_size": 1})
-    elif config.sampler == "text_to_video":
-        world = TextToVideo(config, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
+    elif isinstance(sampler, TextToVideoConfig):
+        world = TextToVideo(config, sampler, Path(inputs["checkpoint"]), Path(inputs["tokenizer"]), episodes)
     else:
-        world = _load(config, inputs, rates)
+        world = _load(config, sampler, inputs, rates)
     if isinstance(world, GeSim) or (isinstance(world, WorldLine) and world.info.config.native_size is not None):
         tracks.episodes = episodes
     fps = world.contract.fps if isinstance(world, WorldLine) else rates[0]
@@ -123,7 +87,7 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
     if left_out:
         write_quarantine(output, left_out)
     writer = RolloutSetWriter(output, config.method, fps / config.stride, crf=config.crf)
-    speed, first = SpeedLog(output / "run"), True
+    times: list[tuple[int, int, float]] = []
     refused: dict[str, QuarantineRow] = {}
     with Progress(f"rollout {config.method}", len(planned), "clip") as progress:
         for batch in batches(planned, config.batch_size):
@@ -135,13 +99,11 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
                 pieces = _predicted(config, world, episodes, tracks, batch)
                 try:
                     seconds = _write(batch, pieces, writer, world.image_size, config.device)
+                    times.append((len(batch), sum(item.frames for item in batch), seconds))
                 except RefusedPredictionError as error:
-                    refused |= {item.episode_id: _refused(episodes, item, error) for item in batch}
-                    progress.advance(len(batch))
-                    continue
-                frames = sum(item.frames for item in batch)
-                speed.add(BatchTime(len(batch), frames, seconds, tuple(world.block_seconds), first))
-                first = False
+                    (item,) = batch  # a server predicts one by one
+                    source = episodes.rows[item.position].source
+                    refused[item.episode_id] = QuarantineRow(item.episode_id, source, error.reason, str(error))
             progress.advance(len(batch))
     if isinstance(world, GeSim):
         world.close()
@@ -155,19 +117,12 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
             got=f"{len(refused)} refused; the first: {next(iter(refused.values())).detail}",
         )  # fmt: skip
     writer.close()
-    facts: dict[str, Any] = {
-        "steps": world.steps,
-        "batch_size": config.batch_size,
-        "device": config.device,
-        "device_name": device_name(config.device),
-        "dtype": "bfloat16" if config.bfloat16 else "float32",
-    }
-    if config.timed_blocks and isinstance(world, WorldLine):
-        facts["long_rollout"] = _timed_blocks(config, world, episodes, tracks, planned[0])
-    speed.close(facts)
+    if times:
+        _write_speed(output, config, world, times, _timed_blocks(config, world, episodes, tracks, planned[0]))
     in_splits = len(episodes.select(split=config.splits))
     reasons = {"in other splits": len(episodes) - in_splits, "not among those asked for": in_splits - len(chosen)}
     reasons |= Counter(row.reason for row in left_out)
+    causal = world.causal if isinstance(world, WorldLine) else None
     return {
         "method": config.method,
         "found": len(episodes),
@@ -178,13 +133,9 @@ def rollout(config: RolloutConfig, inputs: Mapping[str, Path], output: Path) -> 
         "frames": sum(item.frames for item in planned),
         "checkpoint_kind": world.info.kind if isinstance(world, WorldLine | TextToVideo) else None,
         "steps": world.steps,
-        "recent_blocks": None if world.causal is None else world.causal.recent_blocks,
+        "recent_blocks": None if causal is None else causal.recent_blocks,
         **_account(world, planned),
     }
-
-
-def _refused(episodes: EpisodeSet, item: Prediction, error: RefusedPredictionError) -> QuarantineRow:
-    return QuarantineRow(item.episode_id, episodes.rows[item.position].source, error.reason, str(error))
 
 
 def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:
@@ -195,7 +146,12 @@ def _account(world: World, planned: Sequence[Prediction]) -> dict[str, Any]:
     return {name: value for name, value in account.items() if value}
 
 
-def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[float]) -> WorldLine:
+def _load(
+    config: RolloutConfig,
+    sampler: FullClipConfig | BlockCausalConfig,
+    inputs: Mapping[str, Path],
+    rates: Sequence[float],
+) -> WorldLine:
     """The model for recordings of these rates.
 
     Raises:
@@ -204,19 +160,12 @@ def _load(config: RolloutConfig, inputs: Mapping[str, Path], rates: Sequence[flo
     world = WorldLine.from_pretrained(
         Path(inputs["checkpoint"]),
         tokenizer=Path(inputs["tokenizer"]),
-        decoder=config.decoder,
-        expect_kind="stage2" if config.sampler == "full_clip" else "causal",
+        expect_kind="stage2" if isinstance(sampler, FullClipConfig) else "causal",
         device=config.device,
         bfloat16=config.bfloat16,
         weights=config.weights,
-        steps=config.steps,
-        shift=config.shift,
-        clip_frames=config.clip_frames,
-        sink_blocks=config.sink_blocks,
-        recent_blocks=config.recent_blocks,
+        **sampler.model_dump(exclude={"kind", "timed_blocks"}),
     )
-    if config.captured:
-        world.run = Captured(config.device)
     if world.contract.fps not in rates:
         world.contract.require(where=inputs["episodes"], fps=rates[0])
     return world
@@ -235,11 +184,15 @@ def _predicted(
     config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks, batch: Sequence[Prediction]
 ) -> Iterator[Frames]:
     """Frames of a batch, piece by piece."""
+    images = _observed(world, episodes, batch)
+    if not isinstance(world, WorldLine):
+        yield from world.stream(images, batch)
+        return
     controls = [tracks.tracks(item.controls_of) for item in batch]
     if config.actions == "mirrored" or config.actions == "delayed":
         controls = [changed_tracks(control, config.actions) for control in controls]
     yield from world.stream(
-        _observed(world, episodes, batch),
+        images,
         controls,
         max(item.frames for item in batch),
         [item.seed for item in batch],
@@ -267,9 +220,36 @@ def _write(
 
 
 def _timed_blocks(
-    config: RolloutConfig, world: WorldLine, episodes: EpisodeSet, tracks: ActionTracks, item: Prediction
-) -> dict[str, list[float]]:
+    config: RolloutConfig, world: World, episodes: EpisodeSet, tracks: ActionTracks, item: Prediction
+) -> dict[str, list[float]] | None:
+    """Seconds of the blocks of one long rollout, where the sampler asks for it."""
+    sampler = config.sampler
+    if not isinstance(world, WorldLine) or not isinstance(sampler, BlockCausalConfig) or not sampler.timed_blocks:
+        return None
     first = encode_images(world.tokenizer, _observed(world, episodes, [item]).to(config.device))
     index = range(0, world.frames_per_unit + 1, TEMPORAL_FACTOR)
     maps = world.action_maps([tracks.tracks(item.controls_of)], index, start=0, views=item.views)
-    return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, config.timed_blocks)
+    return long_rollout(partial(world.simulator, [item.seed], item.views), first, maps, sampler.timed_blocks)
+
+
+def _write_speed(
+    output: Path,
+    config: RolloutConfig,
+    world: World,
+    times: Sequence[tuple[int, int, float]],
+    blocks: dict[str, list[float]] | None,
+) -> None:
+    """Write ``run/speed.json`` from (clips, frames, seconds) of the batches; the first one warms up, unless it is alone."""
+    clips, frames, seconds = (sum(column) for column in zip(*(times[1:] or times), strict=True))
+    speed = {
+        "steps": world.steps,
+        "batch_size": config.batch_size,
+        "device": config.device,
+        "device_name": device_name(config.device),
+        "dtype": "bfloat16" if config.bfloat16 else "float32",
+        "trajectories": clips,
+        "frames": frames,
+        "seconds": seconds,
+        "seconds_per_frame": seconds / frames,
+    }
+    write_json_atomic(output / "run" / SPEED_FILE, speed | ({} if blocks is None else {"long_rollout": blocks}))

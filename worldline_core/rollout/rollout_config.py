@@ -1,132 +1,179 @@
-"""Which episodes are predicted, and how; or whose videos are imported as predictions. No torch in here."""
+"""Configurations of the rollout step and of the import of other simulators' videos; imports no torch."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, cast
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
+from worldline_core.model.contracts import FULL_STEPS
 from worldline_core.model.world_model_config import TextConfig
 
 Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
-"""What drives a prediction: the episode's own controls, none, those of another episode, or its own changed in a known way
+"""The episode's own controls, none, those of another episode, or its own changed in a known way
 (`actions.changed_controls`)."""
+
+
+class _ModelSampler(StrictModel):
+    """A sampler of a model of ours.
+
+    Attributes:
+        decoder: folder of a small decoder that train_tokenizer made for the model's tokenizer; it decodes instead of the
+            tokenizer's own decoder, with a fraction of the operations.
+    """
+
+    decoder: Path | None = None
+
+
+class FullClipConfig(_ModelSampler):
+    """A Stage II model predicts a clip at once.
+
+    Attributes:
+        steps: Euler steps.
+        shift: moves the noise levels of the steps towards noise, which helps few steps.
+        clip_frames: frames of the longest clip that is predicted at once (1 + 4 k). Longer predictions are chained: each clip
+            begins at the last predicted frame of the one before. None: all at once.
+    """
+
+    kind: Literal["full_clip"] = "full_clip"
+    steps: int = Field(default=FULL_STEPS, ge=1)
+    shift: float = Field(default=1.0, gt=0)
+    clip_frames: int | None = Field(default=None, ge=5)
+
+    @field_validator("clip_frames")
+    @classmethod
+    def _whole_latent_frames(cls, frames: int | None) -> int | None:
+        if frames is not None and (frames - 1) % TEMPORAL_FACTOR:
+            raise ValueError(f"1 + a multiple of {TEMPORAL_FACTOR} frames, not {frames}")
+        return frames
+
+
+class BlockCausalConfig(_ModelSampler):
+    """A causal model predicts block by block.
+
+    Attributes:
+        steps: Euler steps per block; None: as the model was trained.
+        sink_blocks, recent_blocks: window of the cache; None: as the model was trained.
+        timed_blocks: blocks of one additional long rollout that measures the cost of each; it changes no prediction.
+    """
+
+    kind: Literal["block_causal"] = "block_causal"
+    steps: int | None = Field(default=None, ge=1)
+    sink_blocks: int | None = Field(default=None, ge=1)
+    recent_blocks: int | None = Field(default=None, ge=0)
+    timed_blocks: int = Field(default=0, ge=0)
+
+
+class TextToVideoConfig(_ModelSampler):
+    """A base or Stage I model predicts each view from its first image and the instruction.
+
+    Attributes:
+        steps, shift: as of :class:`FullClipConfig`.
+        text: how instructions become ids; None: as the checkpoint says that it was trained.
+    """
+
+    kind: Literal["text_to_video"] = "text_to_video"
+    steps: int = Field(default=FULL_STEPS, ge=1)
+    shift: float = Field(default=1.0, gt=0)
+    text: TextConfig | None = None
+
+
+class CopyFirstFrameConfig(StrictModel):
+    """The baseline without a model: every frame is the observed one."""
+
+    kind: Literal["copy_first_frame"] = "copy_first_frame"
 
 
 class GeSimConfig(StrictModel):
     """A simulator behind HTTP in the protocol of GE-Sim 2.0.
 
     Attributes:
-        url: where it listens, such as http://127.0.0.1:9000.
+        url: of the server, such as http://127.0.0.1:9000.
         image_size: (H, W) of the pictures that it takes and gives.
         timeout_s: for each whole answer.
         tool_offset_m: from the end link of an arm to the tool, along its z.
     """
 
+    kind: Literal["ge_sim"] = "ge_sim"
     url: str = Field(pattern=r"^https?://[^/\s@]+/?$")
     image_size: ImageSize = (384, 512)
     timeout_s: float = Field(default=300.0, gt=0)
     tool_offset_m: float = 0.15
 
 
+def _usual_kind(value: object) -> object:
+    return {"kind": "block_causal", **cast("Mapping[str, object]", value)} if isinstance(value, Mapping) else value
+
+
+Sampler = Annotated[
+    FullClipConfig | BlockCausalConfig | TextToVideoConfig | CopyFirstFrameConfig | GeSimConfig,
+    Field(discriminator="kind"),
+    BeforeValidator(_usual_kind),
+]
+"""How videos are predicted; ``block_causal`` where no ``kind`` is given."""
+
+
 class RolloutConfig(StrictModel):
-    """Which episodes are predicted, and how."""
+    """Which episodes are predicted, and by which sampler.
+
+    Attributes:
+        method: name of the predictions in scores and reports.
+        actions: controls that drive the predictions.
+        banks, embodiments: only episodes of these candidate banks, of these robots; None: all.
+        views: ``all_present``: the views of each episode that have a camera and that the model was trained on; the model's
+            first one is always among them. Or names of views: episodes that lack one of them are left out.
+        num_frames: longest prediction; shorter episodes are predicted as far as whole blocks (or latent frames) go.
+            ``whole``: every recording to its end; the last block (or clip) keeps the last controls, and its frames after the
+            end are cut off.
+        stride: predict every ``stride``-th frame; the model must have been trained at this stride.
+        bfloat16: compute in mixed precision.
+        weights: type of the model's weights in memory, and of those of a Wan autoencoder, which then computes in bfloat16
+            too: half the memory, without any copy in float32.
+    """
 
     method: str = Field(default="worldline", min_length=1)
-    """Name the predictions carry in scores and reports."""
-    sampler: Literal["full_clip", "block_causal", "text_to_video", "copy_first_frame", "ge_sim"] = "block_causal"
-    steps: int | None = Field(default=None, ge=1)
-    """Euler steps; by default 35 for a whole clip, and per block those the causal model was trained with."""
-    # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
-    shift: float = Field(default=1.0, gt=0, exclude_if=lambda value: value == 1.0)
-    """Full clip: moves the noise levels of the steps towards noise; few steps are worth more there."""
+    sampler: Sampler = BlockCausalConfig()
     actions: Controls = "true"
     seeds: tuple[int, ...] = Field(default=(42,), min_length=1)
     splits: tuple[str, ...] = ("test",)
     banks: tuple[str, ...] | None = None
-    """Only episodes of these candidate banks."""
     embodiments: tuple[str, ...] | None = None
     max_episodes_per_embodiment: int | None = Field(default=None, ge=1)
-    views: Literal["all_present"] | tuple[str, ...] = Field(
-        default="all_present", exclude_if=lambda value: value == "all_present"
-    )
-    """``all_present``: of every episode the views that it has (with their cameras) and the model was trained on, the
-    model's first one always. Or the names of views: episodes without one of them are left out."""
+    views: Literal["all_present"] | tuple[str, ...] = "all_present"
     num_frames: Annotated[int, Field(ge=5)] | Literal["whole"] = 33
-    """Longest prediction; shorter episodes are predicted as far as whole blocks (or groups) go. ``whole``: every recording
-    to its end; the last block (or clip) keeps the last controls, and what it predicts after the end is cut off."""
-    clip_frames: int | None = Field(default=None, ge=5, exclude_if=lambda value: value is None)
-    """Full clip: frames of the longest clip that is predicted at once (1 + 4 k). Longer predictions are chained: each clip
-    begins at the last predicted frame of the one before."""
-    stride: int = Field(default=1, ge=1, exclude_if=lambda value: value == 1)
-    """Every how many-th frame of the recordings is predicted; the model must have been trained at this stride."""
+    stride: int = Field(default=1, ge=1)
     batch_size: int = Field(default=8, ge=1)
-    sink_blocks: int | None = Field(default=None, ge=1)
-    recent_blocks: int | None = Field(default=None, ge=0)
-    """Window of the cache; by default the one that the causal model was trained with."""
     crf: int = Field(default=8, ge=0, le=51)
-    text: TextConfig | None = Field(default=None, exclude_if=lambda value: value is None)
-    """Text to video: how instructions become ids; by default as the checkpoint says that it was trained."""
-    server: GeSimConfig | None = Field(default=None, exclude_if=lambda value: value is None)
-    """GE-Sim: where it is."""
     bfloat16: bool = True
-    # Left out of dumps at its default: rollouts made before it existed keep their key in the store.
-    weights: Literal["float32", "bfloat16"] = Field(default="float32", exclude_if=lambda value: value == "float32")
-    """How the model's weights are held, and those of a Wan autoencoder, which then computes in bfloat16 too: half the
-    memory, and no copy in float32 is ever made."""
-    decoder: Path | None = Field(default=None, exclude_if=lambda value: value is None)
-    """Folder of a small decoder that train_tokenizer made for the model's tokenizer: it decodes in place of the tokenizer's
-    own, which takes many times its operations."""
+    weights: Literal["float32", "bfloat16"] = "float32"
     device: str = "cpu"
-    captured: bool = Field(default=False, exclude_if=lambda value: not value)
-    """On a GPU: record the passes of a block (or of a step of a whole clip) once, and replay them as CUDA graphs."""
-    timed_blocks: int = Field(default=0, ge=0)
-    """Blocks of one long block-causal rollout made to measure what each costs; it changes no prediction."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        kind = self.sampler.kind
         if len(set(self.seeds)) != len(self.seeds):
             raise ValueError(f"seeds repeat: {self.seeds}")
         if self.weights == "bfloat16" and not self.bfloat16:
             raise ValueError("weights: bfloat16 are computed with in bfloat16; set bfloat16, or hold them in float32")
-        if self.captured and (self.sampler not in ("full_clip", "block_causal") or not self.device.startswith("cuda")):
+        if kind in ("text_to_video", "ge_sim") and self.actions != "true":
+            raise ValueError(f"actions: {kind} cannot be driven by {self.actions} ones; leave them out")
+        if kind == "ge_sim" and (self.views != "all_present" or len(self.seeds) > 1):
             raise ValueError(
-                f"captured needs the sampler full_clip or block_causal on the device cuda, not {self.sampler} on {self.device}: "
-                "leave it out there, nothing else changes"
-            )
-        if self.decoder is not None and self.sampler in ("copy_first_frame", "ge_sim"):
-            raise ValueError(f"decoder: the sampler {self.sampler} has no latents to decode; leave it out there")
-        if self.timed_blocks and self.sampler != "block_causal":
-            raise ValueError(f"timed_blocks needs the sampler block_causal, not {self.sampler}")
-        if self.shift != 1.0 and self.sampler not in ("full_clip", "text_to_video"):
-            raise ValueError(f"shift needs the sampler full_clip or text_to_video, not {self.sampler}")
-        if self.sampler == "text_to_video" and self.actions != "true":
-            raise ValueError(f"actions: text_to_video takes none, so {self.actions} ones have no meaning")
-        if self.sampler != "text_to_video" and self.text is not None:
-            raise ValueError(f"text needs the sampler text_to_video, not {self.sampler}")
-        if (self.sampler == "ge_sim") != (self.server is not None):
-            raise ValueError(f"server: the sampler ge_sim needs one, and no other; the sampler is {self.sampler}")
-        if self.server is not None and (self.actions, self.views, len(self.seeds)) != ("true", "all_present", 1):
-            raise ValueError(
-                "the sampler ge_sim predicts three views under the recorded actions, and its protocol knows no seeds: leave "
-                "views and actions out, and name one seed"
-            )
-        if self.clip_frames is not None and (self.sampler != "full_clip" or (self.clip_frames - 1) % TEMPORAL_FACTOR):
-            raise ValueError(
-                f"clip_frames needs the sampler full_clip and 1 + a multiple of {TEMPORAL_FACTOR} frames, not "
-                f"{self.sampler} and {self.clip_frames}"
+                "ge_sim predicts three views and its protocol has no seeds: leave views out, name one seed"
             )
         return self
 
     def weights_read(self) -> Mapping[str, Path | None]:
-        read = {} if self.text is None else self.text.files_read()
-        return read if self.decoder is None else {**read, "decoder": self.decoder}
+        """Folders whose content counts in the cache key."""
+        text = self.sampler.text if isinstance(self.sampler, TextToVideoConfig) else None
+        decoder = self.sampler.decoder if isinstance(self.sampler, _ModelSampler) else None
+        return ({} if text is None else text.files_read()) | ({} if decoder is None else {"decoder": decoder})
 
 
 NAME_FIELD = re.compile(r"\{(\w+)\}|(\*)")

@@ -13,16 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.block_causal_attention import CachedBlock, KVCache
-from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
+from worldline_core.model.contracts import CAUSAL_SHIFT, FULL_STEPS, CausalSpec
 from worldline_core.model.world_model import TextContext, WorldModel
 from worldline_core.model.world_model_config import VIEWS
-from worldline_core.rollout.captured import Run, run_now
 
 VelocityField = Callable[[Tensor, float], Tensor]
 """Velocity at (state, noise level)."""
-FULL_STEPS = 35
-"""Euler steps of the whole-clip sampler, at even noise levels."""
 
 
 def shifted_sigmas(steps: int, shift: float = 1.0) -> tuple[float, ...]:
@@ -72,9 +68,11 @@ class Noise:
     def __len__(self) -> int:
         return len(self._generators)
 
-    def select(self, clips: Sequence[int]) -> Noise:
-        """A source that will draw what this one would draw for these clips from here on."""
-        other = Noise([])
+    def fork(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> Noise:
+        """A separate source for these clips: in the same state as this one, or seeded anew."""
+        other = Noise([] if seeds is None else seeds)
+        if seeds is not None:
+            return other
         for clip in clips:
             twin = torch.Generator()
             twin.set_state(self._generators[clip].get_state())
@@ -96,7 +94,6 @@ def rollout_full_clip(
     text: TextContext | None = None,
     fps: float | None = None,
     bfloat16: bool = False,
-    run: Run = run_now,
 ) -> Float[Tensor, "b v c t h w"]:
     """Integrate from noise to a clip whose first latent frame is ``first_latents``; no classifier-free guidance.
 
@@ -105,7 +102,6 @@ def rollout_full_clip(
         noise: one source per clip.
         shift: moves the noise levels of the steps towards noise.
         fps: frames per second of the clips; None: as the model's config says.
-        run: how every step is run (a `Captured`, on a GPU).
 
     Raises:
         ConfigError: fewer than one step.
@@ -117,48 +113,58 @@ def rollout_full_clip(
     first = repeat(first_latents.float(), "b v c h w -> b v c 1 h w")
     latents = noise.draw((views_count, channels, frames, height, width), first.device)
     latents = torch.cat((first, latents[:, :, :, 1:]), dim=3)
-    rates = None if fps is None else torch.full((batch,), fps, device=first.device)
+    rates = _rates(fps, first)
 
     def velocity(state: Tensor, sigma: float) -> Tensor:
+        # The first frame's velocity is zero, so it stays what was observed.
         levels = torch.full((batch,), sigma, device=state.device)
-        fixed = {"model": model, "text": text, "views": tuple(views), "bfloat16": bfloat16}
-        return run(_clip_velocity, None, state, levels, action_maps, rates, **fixed)[0]
+        return model(state, levels, action_maps=action_maps, text=text, views=tuple(views), fps=rates).velocity
 
-    return integrate(velocity, latents, shifted_sigmas(steps, shift))
-
-
-def _clip_velocity(
-    _cache: None, state: Tensor, levels: Tensor, action_maps: Tensor | None, rates: Tensor | None, *,
-    model: WorldModel, text: TextContext | None, views: Sequence[str], bfloat16: bool,
-) -> Sequence[Tensor]:  # fmt: skip
-    # The first frame's velocity is zero, so it stays what was observed.
-    with torch.autocast(state.device.type, torch.bfloat16, enabled=bfloat16):
-        return [model(state, levels, action_maps=action_maps, text=text, views=views, fps=rates).velocity]
+    with torch.autocast(first.device.type, torch.bfloat16, enabled=bfloat16):
+        return integrate(velocity, latents, shifted_sigmas(steps, shift))
 
 
-def _denoised_block(
-    cache: KVCache, noise: Tensor, action_maps: Tensor | None, *,
-    model: WorldModel, sigmas: Sequence[float], views: Sequence[str], bfloat16: bool,
-) -> Sequence[Tensor]:  # fmt: skip
-    velocity = partial(model.forward_block, cache=cache, action_maps=action_maps, views=views)
-    with torch.autocast(noise.device.type, torch.bfloat16, enabled=bfloat16):
-        return [integrate(velocity, noise, sigmas)]
+def _rates(fps: float | None, first: Tensor) -> Tensor | None:
+    return None if fps is None else torch.full((len(first),), fps, device=first.device)
 
 
-def _finished_block(
-    cache: KVCache,
-    clean: Tensor,
-    action_maps: Tensor | None,
-    *,
-    model: WorldModel,
-    views: Sequence[str],
-    bfloat16: bool,
-) -> Sequence[Tensor]:
-    """Keys and values, layer by layer."""
-    with torch.autocast(clean.device.type, torch.bfloat16, enabled=bfloat16):
-        # The caller's cache takes the block from what is returned.
-        block = model.write_block(clean, copy(cache), action_maps=action_maps, views=views)
-    return [part for layer in sorted(block.layers) for part in block.layers[layer]]
+class FullClipSampler:
+    """Samples one whole clip per step with a Stage II model; each clip is started anew."""
+
+    chained = True
+
+    def __init__(
+        self,
+        model: WorldModel,
+        *,
+        noise: Noise,
+        steps: int,
+        shift: float,
+        views: Sequence[str],
+        fps: float,
+        bfloat16: bool,
+    ) -> None:
+        self.views = tuple(views)
+        self._noise = noise
+        self._sample = partial(
+            rollout_full_clip, model, steps=steps, shift=shift, views=self.views, fps=fps, bfloat16=bfloat16
+        )
+        self._begin: tuple[Tensor, Tensor]
+
+    def start(self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 #h #w"]) -> None:
+        """Begin a clip at observed latents, with the controls of that frame."""
+        self._begin = first_latents, action_maps
+
+    def step(self, action_maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c t h w"]:
+        """Latent frames of the clip after its first one, under these controls."""
+        first, maps = self._begin
+        return self._sample(first, torch.cat((maps, action_maps), dim=3), noise=self._noise)[:, :, :, 1:]
+
+    def fork(self, clips: Sequence[int], seeds: Sequence[int] | None = None) -> FullClipSampler:
+        """A sampler for the next clips of some clips; ``seeds``: of the noise from here on."""
+        other = copy(self)
+        other._noise = self._noise.fork(clips, seeds)
+        return other
 
 
 class BlockCausalSimulator:
@@ -172,8 +178,9 @@ class BlockCausalSimulator:
         spec: block size, window and nodes, as the model was trained with.
         noise: one source per clip.
         fps: frames per second of the clips; None: as the model's config says.
-        run: how the passes of every block are run (a `Captured`, on a GPU).
     """
+
+    chained = False
 
     def __init__(
         self,
@@ -184,7 +191,6 @@ class BlockCausalSimulator:
         views: Sequence[str] = VIEWS,
         fps: float | None = None,
         bfloat16: bool = False,
-        run: Run = run_now,
     ) -> None:
         self.model = model
         self.spec = spec
@@ -192,7 +198,6 @@ class BlockCausalSimulator:
         self.fps = fps
         self.bfloat16 = bfloat16
         self.noise = noise
-        self.run = run
         self.cache = spec.new_cache()
         self._unwritten: tuple[Tensor, Tensor | None] | None = None
 
@@ -200,8 +205,7 @@ class BlockCausalSimulator:
         self, first_latents: Float[Tensor, "b v c h w"], action_maps: Float[Tensor, "b v a 1 #h #w"] | None = None
     ) -> None:
         """Begin a rollout at observed latents, with the controls of that frame; forgets any rollout before it."""
-        rates = None if self.fps is None else torch.full((len(first_latents),), self.fps, device=first_latents.device)
-        self.cache = self.spec.new_cache(rates)
+        self.cache = self.spec.new_cache(_rates(self.fps, first_latents))
         self._unwritten = (rearrange(first_latents.float(), "b v c h w -> b v c 1 h w"), action_maps)
 
     @torch.no_grad()
@@ -211,8 +215,6 @@ class BlockCausalSimulator:
         Raises:
             DataError: the rollout was not started, or the controls are not those of one block.
         """
-        if self._unwritten is None and self.cache.reference is None:
-            raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
         if action_maps is not None and action_maps.shape[3] != self.spec.block_size:
             raise DataError(
                 "Controls of one block are needed",
@@ -222,11 +224,12 @@ class BlockCausalSimulator:
         self._write()
         reference = self.cache.reference
         if reference is None:
-            raise DataError("The cache lost its first frame", next_step="call start() again")
+            raise DataError("The rollout has not been started", next_step="call start() with the observed latents")
         views, channels, _, height, width = reference.shape[1:]
-        latents = self.noise.draw((views, channels, self.spec.block_size, height, width), reference.device)
-        fixed = {"model": self.model, "sigmas": self.spec.sigmas, "views": self.views, "bfloat16": self.bfloat16}
-        latents = self.run(_denoised_block, self.cache, latents, action_maps, **fixed)[0]
+        noise = self.noise.draw((views, channels, self.spec.block_size, height, width), reference.device)
+        velocity = partial(self.model.forward_block, cache=self.cache, action_maps=action_maps, views=self.views)
+        with torch.autocast(noise.device.type, torch.bfloat16, enabled=self.bfloat16):
+            latents = integrate(velocity, noise, self.spec.sigmas)
         self._unwritten = (latents, action_maps)
         return latents
 
@@ -241,10 +244,8 @@ class BlockCausalSimulator:
         clips = range(len(self.noise)) if clips is None else clips
         if len(set(clips)) < len(clips):
             self._write()
-        noise = self.noise.select(clips) if seeds is None else Noise(seeds)
-        other = BlockCausalSimulator(
-            self.model, self.spec, noise=noise, views=self.views, fps=self.fps, bfloat16=self.bfloat16, run=self.run
-        )
+        other = copy(self)
+        other.noise = self.noise.fork(clips, seeds)
         other.cache = self.cache.select(clips)
         if self._unwritten is not None:
             latents, maps = self._unwritten
@@ -257,8 +258,6 @@ class BlockCausalSimulator:
         if self._unwritten is None:
             return
         latents, action_maps = self._unwritten
-        fixed = {"model": self.model, "views": self.views, "bfloat16": self.bfloat16}
-        written = self.run(_finished_block, self.cache, latents, action_maps, **fixed)
-        layers = dict(enumerate(zip(written[::2], written[1::2], strict=True)))
-        self.cache.append(CachedBlock(latents.shape[3], layers), latents)
+        with torch.autocast(latents.device.type, torch.bfloat16, enabled=self.bfloat16):
+            self.model.write_block(latents, self.cache, action_maps=action_maps, views=self.views)
         self._unwritten = None

@@ -14,8 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
-from functools import partial
-from typing import Protocol, Self
 
 import numpy as np
 import torch
@@ -24,100 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.model.video_tokenizer import VideoDecoder, VideoTokenizer, frames_to_video, video_to_frames
-from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.captured import Run
-from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout_full_clip
-from worldline_core.rollout.speed import timed
+from worldline_core.rollout.samplers import BlockCausalSimulator, FullClipSampler
 
 Frames = list[dict[str, np.ndarray]]
 """Of every clip: ``uint8 (n, H, W, 3)`` RGB by view."""
-
-
-class LatentSampler(Protocol):
-    """Samples latents unit by unit. ``chained``: every unit is a clip of its own that begins at the last picture of the
-    one before."""
-
-    views: tuple[str, ...]
-    chained: bool
-
-    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
-        """Begin a clip at observed latents."""
-        ...
-
-    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
-        """Latents of the next ``n = t - 1`` latent frames, under controls from the last known frame on."""
-        ...
-
-    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> Self:
-        """A sampler that continues these clips from their present state; ``seeds``: of the noise from here on."""
-        ...
-
-
-class BlockSampler:
-    """Samples one block per step with a causal model; ``seconds``: wall-clock time of each block so far."""
-
-    chained = False
-
-    def __init__(self, simulator: BlockCausalSimulator, device: str) -> None:
-        self.views = simulator.views
-        self.seconds: list[float] = []
-        self._simulator = simulator
-        self._device = device
-        self._first: Tensor | None = None
-
-    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
-        self._first = first
-
-    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
-        if self._first is not None:
-            self._simulator.start(self._first, maps[:, :, :, :1])
-            self._first = None
-        latents, elapsed = timed(partial(self._simulator.step, maps[:, :, :, 1:]), self._device)
-        self.seconds.append(elapsed.wall)
-        return latents
-
-    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> BlockSampler:
-        other = BlockSampler(self._simulator.fork(clips, seeds), self._device)
-        other._first = None if self._first is None else self._first[list(clips)]
-        return other
-
-
-class FullClipSampler:
-    """Samples one clip per step with a Stage II model."""
-
-    chained = True
-
-    def __init__(
-        self,
-        model: WorldModel,
-        noise: Noise,
-        *,
-        steps: int,
-        shift: float,
-        views: tuple[str, ...],
-        fps: float,
-        bfloat16: bool,
-        run: Run,
-    ) -> None:
-        self.views = views
-        self._sample = partial(
-            rollout_full_clip, model, noise=noise, steps=steps, shift=shift, views=views, fps=fps, bfloat16=bfloat16,
-            run=run,
-        )  # fmt: skip
-        self._first: Tensor
-
-    def begin(self, first: Float[Tensor, "b v c h w"]) -> None:
-        self._first = first
-
-    def step(self, maps: Float[Tensor, "b v a t #h #w"]) -> Float[Tensor, "b v c n h_l w_l"]:
-        return self._sample(self._first, maps)[:, :, :, 1:]
-
-    def select(self, clips: Sequence[int], seeds: Sequence[int] | None) -> FullClipSampler:
-        other = copy(self)
-        noise: Noise = self._sample.keywords["noise"]
-        other._sample = partial(self._sample, noise=noise.select(clips) if seeds is None else Noise(seeds))
-        other._first = self._first[list(clips)]
-        return other
 
 
 class Session:
@@ -132,7 +40,7 @@ class Session:
 
     def __init__(
         self,
-        sampler: LatentSampler,
+        sampler: BlockCausalSimulator | FullClipSampler,
         tokenizer: VideoTokenizer,
         images: Float[Tensor, "b v 3 h w"],
         *,
@@ -144,6 +52,7 @@ class Session:
         self._device = device
         self._bfloat16 = bfloat16
         self._decoders: list[VideoDecoder]
+        self._first: Tensor | None  # observed latents of a clip that no step has begun
         self._ended: Frames | None = None
         self.observed = self._observe(images)
 
@@ -162,7 +71,7 @@ class Session:
         """
         if self._ended is not None:
             self._observe(torch.stack([self._last_pictures(clip) for clip in self._ended]))
-        frames = self._decode(self._sampler.step(maps))
+        frames = self._decode(self._sample(maps))
         self._ended = frames if self._sampler.chained else None
         return frames
 
@@ -184,8 +93,7 @@ class Session:
         waiting: Future[Frames] | None = None
         with ThreadPoolExecutor(1) as decoding:
             for given in maps:
-                with torch.no_grad():
-                    latents = self._sampler.step(given)
+                latents = self._sample(given)
                 if beside is not None:
                     beside.wait_stream(torch.cuda.current_stream(self._device))
                 following = decoding.submit(self._decode_beside, latents, beside)
@@ -194,6 +102,12 @@ class Session:
                 waiting = following
             if waiting is not None:
                 yield waiting.result()
+
+    def _sample(self, maps: Tensor) -> Tensor:
+        if self._first is not None:
+            self._sampler.start(self._first, maps[:, :, :, :1])
+            self._first = None
+        return self._sampler.step(maps[:, :, :, 1:])
 
     @torch.no_grad()
     def _decode_beside(self, latents: Tensor, stream: torch.cuda.Stream | None) -> Frames:
@@ -212,7 +126,8 @@ class Session:
             seeds: of the noise from here on, one for each of ``clips``; by default the noise continues unchanged.
         """
         other = copy(self)
-        other._sampler = self._sampler.select(clips, seeds)
+        other._sampler = self._sampler.fork(clips, seeds)
+        other._first = None if self._first is None else self._first[list(clips)]
         other._decoders = [self._decoders[clip].copy() for clip in clips]
         other._ended = None if self._ended is None else [self._ended[clip] for clip in clips]
         other.observed = [self.observed[clip] for clip in clips]
@@ -222,10 +137,9 @@ class Session:
     def _observe(self, images: Tensor) -> Frames:
         """Begin a clip at these images."""
         images = images.to(self._device)
-        first = encode_images(self._tokenizer, images)
-        self._sampler.begin(first)
+        self._first = encode_images(self._tokenizer, images)
         self._decoders = [self._tokenizer.decoder(clip) for clip in images]
-        return self._decode(rearrange(first, "b v c h w -> b v c 1 h w"))
+        return self._decode(rearrange(self._first, "b v c h w -> b v c 1 h w"))
 
     def _last_pictures(self, clip: dict[str, np.ndarray]) -> Float[Tensor, "v 3 h w"]:
         return torch.stack([frames_to_video(clip[view][-1:])[:, 0] for view in self._sampler.views])

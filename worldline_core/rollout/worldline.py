@@ -23,11 +23,10 @@ from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
 from worldline_core.model.world_model import WorldModel
-from worldline_core.rollout.captured import Run, run_now
 from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
 from worldline_core.rollout.robot import Response
-from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, Noise, sigmas_causal
-from worldline_core.rollout.session import BlockSampler, Frames, FullClipSampler, Session
+from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
+from worldline_core.rollout.session import Frames, Session
 from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Simulation, Starts, Stepping
 
 
@@ -46,7 +45,6 @@ class WorldLine:
         frames_per_unit: a prediction has 1 + k times this many frames (k blocks, or k latent frames).
         image_size: (H, W) of the predicted frames.
         needs_cameras: controls are drawn into the views.
-        block_seconds: wall seconds of each block of the last prediction; empty where the clip is sampled whole.
     """
 
     needs_cameras = True
@@ -84,8 +82,6 @@ class WorldLine:
         self.frames_per_unit = tokenizer.temporal_compression * block
         rows, columns = self.contract.grid_size
         self.image_size = (rows * tokenizer.spatial_compression, columns * tokenizer.spatial_compression)
-        self.block_seconds: list[float] = []
-        self.run: Run = run_now  # or a `Captured`, which replays the passes of the model
 
     @classmethod
     def from_pretrained(
@@ -288,14 +284,12 @@ class WorldLine:
     ) -> Session:
         """A running prediction that begins at these images, to be driven unit by unit; arguments as of :meth:`stream`."""
         chosen = self.views if views is None else tuple(views)
-        self.block_seconds = []
         if self.causal is not None:
-            sampler = BlockSampler(self.simulator(seeds, chosen, stride), self.device)
-            self.block_seconds = sampler.seconds
+            sampler = self.simulator(seeds, chosen, stride)
         else:
             sampler = FullClipSampler(
-                self.model, Noise(seeds), steps=self.steps, shift=self.shift, views=chosen,
-                fps=self.contract.fps / stride, bfloat16=self.bfloat16, run=self.run,
+                self.model, noise=Noise(seeds), steps=self.steps, shift=self.shift, views=chosen,
+                fps=self.contract.fps / stride, bfloat16=self.bfloat16,
             )  # fmt: skip
         return Session(sampler, self.tokenizer, images, device=self.device, bfloat16=self.bfloat16)
 
@@ -348,5 +342,5 @@ class WorldLine:
         chosen = self.views if views is None else tuple(views)
         return BlockCausalSimulator(
             self.model, self.causal, noise=Noise(seeds), views=chosen, fps=self.contract.fps / stride,
-            bfloat16=self.bfloat16, run=self.run,
+            bfloat16=self.bfloat16,
         )  # fmt: skip

@@ -292,7 +292,8 @@ def predicted_by(rollouts: Path) -> PredictedBy | None:
     config = manifest.get("config", {})
     if "sampler" not in config:
         return None
-    used = {name: config[name] for name in PredictedBy.model_fields if name in config}
+    found = {**config, **config["sampler"], "sampler": config["sampler"]["kind"]}
+    used = {name: found[name] for name in PredictedBy.model_fields if name in found}
     return PredictedBy(checkpoint=manifest.get("inputs", {}).get("checkpoint", {}).get("digest"), **used)
 
 
