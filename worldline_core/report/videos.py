@@ -125,7 +125,7 @@ def card(context: ReportContext, episodes: EpisodeSet, item: ChosenEpisode, numb
     wanted = [(view, group) for view in views for group in GROUP_CAPTIONS]
     # The report runs last and alone; encoder and resizing let go of the interpreter, so threads use the other cores.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        videos = list(pool.map(lambda place: video(context, episodes, item, *place, number), wanted))
+        videos = list(pool.map(lambda place: video(context, episodes, item, place[0], place[1], number), wanted))
     panels = []
     for view in views:
         made = [found for (of, _), found in zip(wanted, videos, strict=True) if of == view and found is not None]
