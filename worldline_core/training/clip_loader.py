@@ -42,7 +42,7 @@ _ATTEMPTS = 20
 
 @dataclass(frozen=True)
 class ReadBatch:
-    """Clips as read: ``data`` is (b, v, ...) as the source gives it.
+    """Clips as read: ``data`` is (b, v, ...) as the source gives it, valid until the next batch is read.
 
     ``batch`` names the clips that are in it, replacements included; ``skipped`` those that were replaced, with the reason.
     """
@@ -95,9 +95,8 @@ def read_batch(
     """
     slots = batch.slots(views)
     shape = (len(batch.clips), len(slots), *source.shape(batch.clips[0].num_frames))
-    data = torch.empty(shape, dtype=torch.from_numpy(np.empty(0, source.dtype)).dtype)
-    if get_worker_info() is not None:
-        data.share_memory_()
+    data = _memory(int(np.prod(shape)) * source.dtype.itemsize)
+    data = data.view(torch.from_numpy(np.empty(0, source.dtype)).dtype).view(shape)
     clips: list[Clip] = []
     skipped: list[tuple[Clip, str]] = []
     for place, (clip, out) in enumerate(zip(batch.clips, data.numpy(), strict=True)):
@@ -150,6 +149,25 @@ def read_ahead(
     return iter(loader)
 
 
+_shared: dict[int, Tensor] = {}
+_turn = count()
+
+
+def _memory(size: int) -> Tensor:
+    """Bytes for a batch: in a loader process shared ones, used again when training is past the batch that held them.
+
+    The page faults of fresh memory cost about as much as decoding into it. A process has ``prefetch`` batches ahead at most,
+    and training holds one.
+    """
+    worker = get_worker_info()
+    if worker is None:
+        return torch.empty(size, dtype=torch.uint8)
+    number = next(_turn) % (worker.dataset.reading.prefetch + 2)
+    if number not in _shared or len(_shared[number]) < size:
+        _shared[number] = torch.empty(size, dtype=torch.uint8).share_memory_()
+    return _shared[number][:size]
+
+
 class SkippedClips:
     """The clips that a run skipped, in a file beside its training state: a continued run goes on counting.
 
@@ -193,7 +211,7 @@ class Batch:
     """One micro-batch. Outcome labels are not here on purpose: they never reach the model.
 
     ``fps``: frames per second of each clip as it is shown (a stride lowers the rate); None where no rates are known.
-    ``frames``: where clips are read as frames, those that the latents are of.
+    ``frames``: where clips are read as frames, those that the latents are of, valid until the next batch is read.
     ``weights``: of the squared error, where some places count more than others (what the task moves).
     """
 

@@ -194,7 +194,7 @@ class LatentStore(ClipSource):
             raise self.not_finite(clip.episode_id)
 
     def latents(self, read: Tensor, device: str) -> Float[Tensor, "b v c t h w"]:
-        return read.to(device)
+        return read.to(device, copy=True)  # what clips are read into is used again
 
     def parts(self, clip: Clip) -> list[tuple[str, int, int]]:
         """Tensors that a clip's latent frames are in, in order: (name, first latent frame, stop)."""
