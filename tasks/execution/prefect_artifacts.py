@@ -77,7 +77,8 @@ def show_in_prefect(page: Path, done: Mapping[str, ArtifactReference], pictures:
         pictures: files to show (default: the report's). They travel inside of the artifacts: a page that a browser has over
             http may not show files.
     """
-    pictures = _report_pictures(done["report"].folder) if pictures is None else pictures
+    if pictures is None:
+        pictures = _report_pictures(done["report"].folder) if "report" in done else ()
     scores = {name: Path(str(artifact.path)) for name, artifact in done.items() if name.startswith("evaluate_")}
     rows = [
         {"metric": name, "mean": value.mean, "95 % from": value.low, "to": value.high, "trajectories": value.count}

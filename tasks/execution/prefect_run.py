@@ -13,6 +13,7 @@ import json
 import multiprocessing
 import os
 from collections.abc import Mapping
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,7 +24,8 @@ from typing import Any, Self, cast
 from prefect import Task
 from prefect.cache_policies import CachePolicy
 from prefect.client.schemas.objects import RunInput, State, TaskRunResult
-from prefect.context import TaskRunContext
+from prefect.context import FlowRunContext, TaskRunContext
+from prefect.exceptions import UpstreamTaskError
 from prefect.futures import PrefectConcurrentFuture
 from prefect.runtime import task_run
 from prefect.serializers import JSONSerializer
@@ -100,7 +102,9 @@ class PrefectRun(Outline):
     ) -> None:
         with self._stack:
             if error is not None:
-                self._cancel(len(self._futures))
+                self._cancel()
+                for _ in self._futures:
+                    self._results.get()
                 raise error
             self._wait()
 
@@ -127,6 +131,10 @@ class PrefectRun(Outline):
         recorded = found is not None and _is_recorded(
             f"{call.task.name}-{key}", ArtifactReference(step=found.step, path=found.path, digest=found.digest)
         )
+        if (flow_run := FlowRunContext.get()) is not None:
+            # Prefect takes parameters for results of tasks by the ids of plain objects, which equal strings share; what a
+            # call waits for is stated below.
+            flow_run.run_results.clear()
         state = cast(
             "State[Any]",
             _prefect_task(call, refresh=not recorded)(
@@ -164,11 +172,15 @@ class PrefectRun(Outline):
 
     def _wait(self) -> None:
         """Wait for the tasks of the pool. Raises the first error that one of them ends with, once no other runs."""
-        for left in range(len(self._futures), 0, -1):
+        errors: list[tuple[str, BaseException]] = []
+        for _ in range(len(self._futures)):
             name, error = self._results.get()
-            if error is None:
-                continue
-            self._cancel(left - 1)
+            if error is not None:
+                errors.append((name, error))
+                self._cancel()
+        # What waited for a task that failed may end before it.
+        own = [(name, error) for name, error in errors if not isinstance(error, UpstreamTaskError | CancelledError)]
+        for name, error in own or errors:
             if isinstance(error, BrokenProcessPool):
                 raise WorkerDiedError(
                     "A process of this run ended without an answer",
@@ -178,12 +190,10 @@ class PrefectRun(Outline):
                 ) from error
             raise error
 
-    def _cancel(self, left: int) -> None:
-        """Cancel what has not started, and let what runs finish."""
+    def _cancel(self) -> None:
+        """Cancel what has not started; what runs is allowed to finish."""
         for future in self._futures.values():
             future.wrapped_future.cancel()
-        for _ in range(left):
-            self._results.get()
 
     def _parameters(self, call: TaskCall) -> dict[str, Any]:
         return {
