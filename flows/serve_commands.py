@@ -9,7 +9,7 @@ from pathlib import Path
 def add_serve_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add them to the command line's parser."""
     texts = {
-        "serve": "offer the simulator over a websocket and HTTP (extra: serve)",
+        "serve": "offer the simulator over a websocket (extra: serve)",
         "play": "drive the simulator by hand: serve, and say where its page is (extra: serve)",
     }
     for name, text in texts.items():

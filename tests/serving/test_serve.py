@@ -1,4 +1,4 @@
-"""`worldline serve`: sessions over websocket and HTTP, their independence, and what is refused."""
+"""`worldline serve`: sessions, their independence, and refused requests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 from tests.policies.test_openpi import policy_server  # pyright: ignore[reportMissingImports]
 from worldline_core import WorldLine
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.policies.array_messages import pack, unpack
+from worldline_core.policies.array_messages import unpack
 from worldline_core.policies.openpi import is_healthy
 from worldline_core.rollout.observation import Camera
 from worldline_core.serving import app
@@ -203,39 +203,6 @@ def test_limits_refuse_and_free_again(serving: Callable) -> None:
             time.sleep(1.2)
             with pytest.raises(UnavailableError, match="closed the connection"):  # idle
                 again.step(np.repeat(again.state[:, None], 4, axis=1))
-        web = url.replace("ws", "http")
-        opened = unpack(httpx.post(f"{web}/v1", content=pack({"op": "start", "episode": EPISODE})).content, "server")
-        assert opened["pictures"]["head"].shape == (1, 64, 96, 3)
-        time.sleep(1.2)
-        reply = httpx.post(f"{web}/v1", content=pack({"op": "reset", "session": opened["session"]}))
-        assert reply.status_code == 400
-        assert "no such session" in unpack(reply.content, "server")["error"]["what"]
-        assert httpx.post(f"{web}/v1", content=b"0" * (2 << 20)).status_code == 413
-        assert httpx.post(f"{web}/v1", content=b"\xc1").status_code == 400
-
-
-def test_the_worker_refuses_what_it_cannot_take(serving: Callable) -> None:
-    with serving(max_waiting=1) as url, SimulatorClient(url) as client:
-        simulations = [client.start(EPISODE, seeds=[1] * 12)]
-        others = [SimulatorClient(url) for _ in range(4)]
-        simulations += [other.start(EPISODE, seeds=[1] * 12) for other in others]
-        refused: list[str] = []
-
-        def step(simulation: RemoteSimulation) -> None:
-            try:
-                simulation.step(np.repeat(simulation.state[:, None], 4, axis=1))
-            except UnavailableError as error:
-                refused.append(str(error))
-
-        threads = [threading.Thread(target=step, args=(simulation,)) for simulation in simulations]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60)
-        assert refused
-        assert all("The server is busy" in text and "a little later" in text for text in refused)
-        for other in others:
-            other.close()
 
 
 def test_who_may_connect(serving: Callable, monkeypatch: pytest.MonkeyPatch) -> None:

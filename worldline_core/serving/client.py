@@ -81,7 +81,7 @@ class SimulatorClient(MessageSocket):
         if error is not None:
             if not isinstance(error, dict) or not {"kind", "what"} <= error.keys():
                 raise DataError("The server's error is not understood", where=self.url, got=error)
-            kind = UnavailableError if error["kind"] in ("BusyError", "UnavailableError") else DataError
+            kind = UnavailableError if error["kind"] == "UnavailableError" else DataError
             details = {name: error.get(name) for name in ("expected", "got", "next_step")}
             raise kind(error["what"], where=error.get("where", self.url), **details)
         return reply

@@ -49,7 +49,7 @@ class RecordedStarts:
     def __init__(self, folder: Path, world: WorldLine) -> None:
         self._world = world
         self._episodes = EpisodeSet.open(folder)
-        self._kinematics = KinematicsByName({})
+        self.kinematics = KinematicsByName({})
         self._positions = {
             row.episode_id: position
             for position, row in enumerate(self._episodes.rows)
@@ -72,10 +72,6 @@ class RecordedStarts:
             for row in rows
         ]
 
-    def kinematics(self, embodiment: str) -> ArmKinematics:
-        """Of an embodiment by its name, built once; raises as `ArmKinematics`."""
-        return self._kinematics.get(embodiment)
-
     def read(self, episode_id: str) -> RecordedStart:
         """The first moment of a recording.
 
@@ -88,7 +84,7 @@ class RecordedStarts:
             )  # fmt: skip
         position = self._positions[episode_id]
         episode = self._episodes.episode(position)
-        kinematics = self.kinematics(episode.embodiment)
+        kinematics = self.kinematics.get(episode.embodiment)
         mounted = {arm.camera_view for arm in kinematics.embodiment.arms if arm.wrist_camera is not None}
         views = [view for view in self._world.views if view in episode.cameras]
         images = {view: self._episodes.frames(position, view, [0])[0] for view in views}
@@ -108,9 +104,6 @@ class RecordedStarts:
         )  # fmt: skip
 
 
-SAVED_AS = ("episodes", "mcap", "rrd")
-
-
 def save_played(
     folder: Path,
     name: str,
@@ -128,14 +121,11 @@ def save_played(
     Args:
         frames: by view ``uint8 (n, H, W, 3)``, the observed frame first.
         states, commands: ``(n, j)``.
-        formats: some of `SAVED_AS`; the EpisodeSet is always written.
+        formats: "mcap" and "rrd" are written beside the EpisodeSet ("episodes"), which always is.
         notes: conventions of the episode: who drove, the model, the seed.
 
-    Raises: DataError for an unknown format, or when the name is taken.
+    Raises: DataError when the name is taken.
     """
-    unknown = sorted(set(formats) - set(SAVED_AS))
-    if unknown:
-        raise DataError("Unknown format", expected=", ".join(SAVED_AS), got=", ".join(unknown))
     recorded, embodiment = start.episode, start.kinematics.embodiment
     tracks = project_controls(start.cameras, start.image_size, start.kinematics, controls=commands, fps=fps)
     height, width = next(iter(frames.values())).shape[1:3]

@@ -1,4 +1,4 @@
-"""What `worldline serve` is told: the model, where it listens, its limits, and the policies that may drive."""
+"""Settings of `worldline serve`: the model, the address, the limits, and the policies that may drive."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ class ServeConfig(StrictModel):
         origins: pages of other servers that may connect (http://host:port).
         max_sessions, max_clips: at a time, those of the page included; clips of all sessions together.
         max_message_bytes: of one request or reply.
-        max_held_bytes: of all requests together that are being received or answered; one of up to 64 KiB always may.
-        max_waiting: requests that wait for the worker; beyond it they are refused as busy.
-        idle_s: sessions that nobody uses for so long are closed.
+        idle_s: seconds after which an idle connection is closed, with its sessions.
         max_blocks: blocks that one session of the page keeps for rewinding and saving.
     """
 
@@ -68,20 +66,13 @@ class ServeConfig(StrictModel):
     max_sessions: int = Field(64, ge=1)
     max_clips: int = Field(256, ge=1)
     max_message_bytes: int = Field(64 << 20, ge=1 << 16)
-    max_held_bytes: int = Field(256 << 20, ge=1 << 16)
-    max_waiting: int = Field(64, ge=1)
     idle_s: float = Field(300.0, gt=0)
     max_blocks: int = Field(300, ge=1)
     policies: dict[str, PolicyConfig] = Field(default_factory=dict)
 
-    @property
-    def on_loopback(self) -> bool:
-        """Whether only this machine can reach the server."""
-        return is_loopback(self.host)
-
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own."""
+    """True for a host name or address of this machine alone."""
     if host == "localhost":
         return True
     try:

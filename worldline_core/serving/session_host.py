@@ -1,8 +1,7 @@
 """Many running simulations behind one worker: requests in, replies out, with limits on everything.
 
 One thread computes, one request after another in the order of their arrival, so a session gives the bytes that it would give
-alone. Requests that find too many others waiting are refused as busy. Sessions belong to whoever started them (a websocket
-connection, or those who know the name of a session started over HTTP), and are closed when they leave, or stay idle.
+alone. Sessions belong to the connection that started them, and end with it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import secrets
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -28,10 +27,6 @@ from worldline_core.serving.serve_config import PROTOCOL, ServeConfig
 from worldline_core.untrusted_text import shown
 
 LARGEST_SEED = 2**63 - 1
-
-
-class BusyError(UnavailableError):
-    """A limit of the server is reached for now."""
 
 
 class _Request(BaseModel):
@@ -87,8 +82,6 @@ class _Running:
     owner: object
     start: Simulation
     simulation: Simulation
-    used: float
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
 class SessionHost:
@@ -105,7 +98,6 @@ class SessionHost:
         self._running: dict[str, _Running] = {}
         self._players: set[object] = set()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simulator")
-        self._waiting = 0
 
     def warm_up(self) -> None:
         """Begin one simulation, so that the first client does not wait for what is imported and built once."""
@@ -125,28 +117,12 @@ class SessionHost:
             "policies": list(self.config.policies),
         }
 
-    def __len__(self) -> int:
-        """Sessions that are open."""
-        return len(self._running)
-
     async def compute[T](self, work: Callable[[], T]) -> T:
-        """What ``work`` returns, done by the one worker.
-
-        Raises: BusyError where too much is waiting.
-        """
-        if self._waiting >= self.config.max_waiting:
-            raise BusyError(
-                "The server is busy", expected=f"at most {self.config.max_waiting} waiting requests",
-                next_step="send the request again a little later",
-            )  # fmt: skip
-        self._waiting += 1
-        try:
-            return await asyncio.get_running_loop().run_in_executor(self._worker, work)
-        finally:
-            self._waiting -= 1
+        """The result of ``work``, done by the one worker after everything that came before."""
+        return await asyncio.get_running_loop().run_in_executor(self._worker, work)
 
     async def handle(self, owner: object, message: object) -> dict[str, Any]:
-        """The reply to one request: what was asked for, or ``error`` with what is wrong with it."""
+        """The reply to one request, with the key ``error`` when it was refused; an owner sends one at a time."""
         try:
             return await self._handle(owner, _parsed(message))
         except WorldLineError as error:
@@ -157,15 +133,9 @@ class SessionHost:
             self._check_room(len(request.seeds))
             simulation = await self.compute(lambda: self._start(request))
             return self._opened(owner, simulation, simulation.copy())
-        running = self._find(owner, request.session)
-        async with running.lock:
-            running.used = time.monotonic()
-            try:
-                return await self._act(owner, running, request)
-            finally:
-                running.used = time.monotonic()
-
-    async def _act(self, owner: object, running: _Running, request: Request) -> dict[str, Any]:
+        running = self._running.get(request.session)
+        if running is None or running.owner is not owner:
+            raise DataError("There is no such session", got=request.session, next_step="start one")
         simulation = running.simulation
         if isinstance(request, StepRequest):
             _check_numbers({"controls": request.controls})
@@ -178,10 +148,10 @@ class SessionHost:
             self._check_room(len(request.clips))
             branches = await self.compute(lambda: simulation.select(request.clips, request.seeds))
             return self._opened(owner, branches, running.start.select(request.clips))
-        if isinstance(request, SessionRequest) and request.op == "reset":
+        if request.op == "reset":
             running.simulation = running.start.copy()
             return {**_state_of(running.simulation), "pictures": _pictures_of(running.simulation)}
-        self.close(request.session if isinstance(request, SessionRequest) else "")
+        del self._running[request.session]
         return {"closed": True}
 
     def _start(self, request: StartRequest) -> Simulation:
@@ -214,12 +184,12 @@ class SessionHost:
         rows = np.asarray(request.state, np.float64)
         rows = np.repeat(rows[None], len(request.seeds), axis=0) if rows.ndim == 1 else rows
         return self.world.start(
-            [images] * len(request.seeds), [posed] * len(request.seeds), embodiment=self.starts.kinematics(name),
+            [images] * len(request.seeds), [posed] * len(request.seeds), embodiment=self.starts.kinematics.get(name),
             state=rows, seed=request.seeds,
         )  # fmt: skip
 
     def _check_room(self, clips: int) -> None:
-        """Raises: BusyError when so many more clips pass a limit; DataError when their replies alone would."""
+        """Raises: UnavailableError when so many more clips exceed a limit; DataError when one session's own do."""
         config = self.config
         frames = self.world.frames_per_unit if self.world.causal is not None else self.world.unit(33)
         size = clips * frames * len(self.world.views) * 3 * int(np.prod(self.world.image_size))
@@ -231,7 +201,7 @@ class SessionHost:
         sessions = len(self._running) + len(self._players)
         used = len(self._players) + sum(len(running.simulation) for running in self._running.values())
         if sessions >= config.max_sessions or used + clips > config.max_clips:
-            raise BusyError(
+            raise UnavailableError(
                 "The server has no room for another session",
                 expected=f"at most {config.max_sessions} sessions with {config.max_clips} clips",
                 got=f"{sessions} sessions with {used} clips, and {clips} more",
@@ -239,22 +209,22 @@ class SessionHost:
             )
 
     def admit(self, player: object) -> None:
-        """Count somebody at the page as a session of one clip, until :meth:`dismiss`.
+        """Count a player at the page as a session of one clip, until :meth:`dismiss`.
 
-        Raises: BusyError where there is no room.
+        Raises: UnavailableError where there is no room.
         """
         if player not in self._players:
             self._check_room(1)
             self._players.add(player)
 
     def dismiss(self, player: object) -> None:
-        """Give the room of somebody at the page to others."""
+        """Free the room of a player."""
         self._players.discard(player)
 
     def _opened(self, owner: object, simulation: Simulation, start: Simulation) -> dict[str, Any]:
         self._check_room(len(simulation))  # others came while this one was made
         name = secrets.token_urlsafe(12)
-        self._running[name] = _Running(owner, start, simulation, time.monotonic())
+        self._running[name] = _Running(owner, start, simulation)
         embodiment = simulation.embodiment
         return {
             **_state_of(simulation),
@@ -265,32 +235,12 @@ class SessionHost:
             "state_names": list(embodiment.state_names),
         }
 
-    def _find(self, owner: object, name: str) -> _Running:
-        running = self._running.get(name)
-        if running is None or running.owner is not owner:
-            raise DataError("There is no such session", got=name, next_step="start one; idle sessions are closed")
-        return running
-
-    def close(self, name: str) -> None:
-        """Close a session, if it is there."""
-        self._running.pop(name, None)
-
     def leave(self, owner: object) -> None:
         """Close all sessions of an owner."""
-        for name in [name for name, running in self._running.items() if running.owner is owner]:
-            self.close(name)
-
-    async def close_idle(self) -> None:
-        """Close sessions that stay idle, for as long as the server runs."""
-        while True:
-            await asyncio.sleep(min(5.0, self.config.idle_s / 4))
-            now = time.monotonic()
-            for name, running in list(self._running.items()):
-                if not running.lock.locked() and now - running.used > self.config.idle_s:
-                    self.close(name)
+        self._running = {name: running for name, running in self._running.items() if running.owner is not owner}
 
     def shut_down(self) -> None:
-        """Let go of all sessions and of the worker."""
+        """Release all sessions and the worker."""
         self._running.clear()
         self._worker.shutdown(wait=True, cancel_futures=True)
 
