@@ -43,7 +43,7 @@ from benchmarks.harness import RECORDINGS, command_line, print_table, timed
 from tools.thumbnails import view_thumbnails
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, find_near_duplicates
+from worldline_core.data.curation.near_duplicates import find_near_duplicates
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, write_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -332,7 +332,7 @@ def measure_copies(root: Path) -> None:
 
     def share(changed: list[Fingerprint], *, states: bool) -> float:
         seen = [*originals, *changed]
-        found = find_near_duplicates(seen if states else [without_states(s) for s in seen], NearDuplicateConfig())
+        found = find_near_duplicates(seen if states else [without_states(s) for s in seen])
         return sum(f.position == f.original + len(originals) for f in found) / len(changed)
 
     shares = {n: (share(c, states=True), share(c, states=False)) for n, c in copies.items()}
@@ -344,9 +344,7 @@ def measure_copies(root: Path) -> None:
 def measure_different(root: Path) -> tuple[str, int, int, int, int]:
     """Name, episodes, pairs, and how many are taken for duplicates with states and from images alone."""
     seen = prints_of(root)
-    found = [
-        len(find_near_duplicates(prints, NearDuplicateConfig())) for prints in (seen, list(map(without_states, seen)))
-    ]
+    found = [len(find_near_duplicates(prints)) for prints in (seen, list(map(without_states, seen)))]
     return root.name, len(seen), len(seen) * (len(seen) - 1) // 2, found[0], found[1]
 
 
@@ -396,7 +394,7 @@ def measure_cost(counts: Sequence[int]) -> Iterator[tuple[int, str, float, str, 
     for states in (True, False):
         for count in counts:
             prints, copy_of = synthetic(count, np.random.default_rng(0), states=states)
-            found, _, seconds = timed(lambda prints=prints: find_near_duplicates(prints, NearDuplicateConfig()))
+            found, _, seconds = timed(lambda prints=prints: find_near_duplicates(prints))
             right = sum(copy_of.get(f.position) == f.original for f in found)
             name = "with states" if states else "images alone"
             yield count, name, seconds, f"{right} of {len(copy_of)}", len(found) - right

@@ -15,14 +15,9 @@ import pytest
 from tools.thumbnails import view_thumbnails
 from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
-from worldline_core.data.curation.curate_config import CurateConfig, SourceSampling
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.curation.recorded_episode import PRIMARY_VIEW_REASON, described, with_primary_view
-from worldline_core.data.curation.rules import curation_findings
-from worldline_core.data.curation.source_table import (
-    read_source_table,
-    source_weights,
-    write_source_weights,
-)
+from worldline_core.data.curation.source_table import read_source_table, write_source_weights
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.episodes.episode_index import EpisodeRow, read_index
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -86,7 +81,7 @@ def test_a_copy_that_was_encoded_resized_and_cut_is_taken_out(tmp_path: Path) ->
     assert numbers["duplicate_of"] == "e2"
     assert numbers["motion_overlap"] >= 0.5
     assert numbers["frame_distance_bits"] <= 12
-    kept_all = config(raw, other, near_duplicates={"enabled": False})
+    kept_all = config(raw, other, near_duplicates=False)
     assert curate(kept_all, {}, tmp_path / "all")["kept"] == 8
 
 
@@ -143,12 +138,6 @@ def described_parts(samples: list[tuple]) -> list[dict[str, Any]]:
         }
         for episode, frames in samples
     ]  # fmt: skip
-
-
-def test_parts_without_a_fingerprint_are_refused(tmp_path: Path) -> None:
-    parts = described_parts([room(0, "a")])
-    with pytest.raises(DataError, match="Episode has no fingerprint"):
-        curation_findings(config(tmp_path), [{**parts[0], "fingerprint": None}])
 
 
 def test_each_source_has_its_size_rate_and_licence(tmp_path: Path) -> None:
@@ -231,40 +220,33 @@ def row(source: str, frames: int, split: str = "train") -> EpisodeRow:
     )  # fmt: skip
 
 
-def test_weights_give_each_source_its_share() -> None:
+def weights(folder: Path, rows: list[EpisodeRow], alpha: float) -> dict[str, float]:
+    write_source_weights(folder, rows, alpha)
+    table = json.loads((folder / "source_weights.json").read_text())
+    return {source: entry["weight"] for source, entry in table.items()}
+
+
+def test_weights_give_each_source_its_share(tmp_path: Path) -> None:
     rows = [row("large", 900), row("large", 800), row("small", 100), row("small", 999, "test")]
     for alpha, large in ((1.0, 17.0), (0.0, 1.0), (0.5, 17.0**0.5)):
-        weights = source_weights(rows, SourceSampling(alpha=alpha))
-        assert 2 * weights["large"] / weights["small"] == pytest.approx(large)
-        assert (2 * weights["large"] + weights["small"]) / 3 == pytest.approx(1)
-    weights = source_weights(rows, SourceSampling(shares={"large": 1, "small": 3}))
-    assert 2 * weights["large"] / weights["small"] == pytest.approx(1 / 3)
-    with pytest.raises(ConfigError, match="Shares do not fit the sources that train"):
-        source_weights(rows, SourceSampling(shares={"large": 1}))
-    assert source_weights([row("small", 9, "test")], SourceSampling()) == {}
+        found = weights(tmp_path, rows, alpha)
+        assert 2 * found["large"] / found["small"] == pytest.approx(large)
+        assert (2 * found["large"] + found["small"]) / 3 == pytest.approx(1)
+        table = json.loads((tmp_path / "source_weights.json").read_text())
+        assert sum(entry["share"] for entry in table.values()) == pytest.approx(1)
+        assert {source: entry["episodes"] for source, entry in table.items()} == {"large": 2, "small": 1}
+    assert weights(tmp_path, [row("small", 9, "test")], 1.0) == {}
 
 
-def test_the_table_of_weights_is_what_the_sampler_takes(tmp_path: Path) -> None:
-    rows = [row("large", 900), row("large", 800), row("small", 100)]
-    write_source_weights(tmp_path, rows, SourceSampling(alpha=0.5))
-    table = json.loads((tmp_path / "source_weights.json").read_text())
-    found = {source: entry["weight"] for source, entry in table.items()}
-    assert found == pytest.approx(source_weights(rows, SourceSampling(alpha=0.5)))
-    assert sum(entry["share"] for entry in table.values()) == pytest.approx(1)
-    assert {source: entry["episodes"] for source, entry in table.items()} == {"large": 2, "small": 1}
-
-
-def test_the_clip_sampler_follows_these_weights() -> None:
+def test_the_clip_sampler_follows_these_weights(tmp_path: Path) -> None:
     """Drawn clips against the shares that the weights were made for."""
     from worldline_core.training.clip_config import ClipSampling
     from worldline_core.training.clip_sampler import ClipRow, ClipSampler
 
     rows = [row("large", 100 + k) for k in range(30)] + [row("small", 60 + k) for k in range(3)]
-    sampling = SourceSampling(shares={"large": 0.4, "small": 0.6})
-
     stored = [ClipRow(r.episode_id, r.num_frames, ("head",), r.source, "e", r.split, "", "head") for r in rows]
-    config = ClipSampling(lengths=(33,), source_weights=source_weights(rows, sampling))
+    config = ClipSampling(lengths=(33,), source_weights=weights(tmp_path, rows, 0.0))
     sampler = ClipSampler(stored, config, splits=["train"], start_step=1, batch_size=50, seed=0)
     drawn = [clip.episode_id for index in range(80) for clip in sampler.clips(index).clips]
     share = sum(name.startswith("small") for name in drawn) / len(drawn)
-    assert share == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / len(drawn)))
+    assert share == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(drawn)))

@@ -9,14 +9,11 @@ import pytest
 
 from worldline_core.data.episodes.instructions import (
     RAW_INSTRUCTION,
-    InstructionConfig,
     mentions_outcome,
     normalised_text,
     one_annotation,
     with_instruction,
 )
-
-CONFIG = InstructionConfig()
 
 
 @pytest.mark.parametrize(
@@ -42,15 +39,8 @@ CONFIG = InstructionConfig()
     ],
 )
 def test_one_spelling(raw: str, expected: str) -> None:
-    assert normalised_text(raw, CONFIG) == expected
-    assert normalised_text(expected, CONFIG) == expected
-
-
-def test_case_and_punctuation_are_configured() -> None:
-    config = InstructionConfig(case="keep", strip_trailing="", placeholders=("tbd",))
-    assert normalised_text("Lift  the Cup.", config) == "Lift the Cup."
-    assert normalised_text("TBD", config) == ""
-    assert normalised_text("n/a", config) == "n/a"
+    assert normalised_text(raw) == expected
+    assert normalised_text(expected) == expected
 
 
 def test_of_several_annotations_the_majority_counts() -> None:
@@ -59,16 +49,14 @@ def test_of_several_annotations_the_majority_counts() -> None:
     assert one_annotation(["Raise it", "lift it"]) == "Raise it"
     assert one_annotation(["n/a", " "]) == ""
     assert one_annotation([]) == ""
-    assert one_annotation(["n/a"], InstructionConfig(placeholders=())) == "n/a"
 
 
 def test_the_raw_text_is_kept_where_it_differs(sample: Callable[..., tuple]) -> None:
     episode = replace(sample(0)[0], instruction="Lift the block.", conventions={"layout": "x"})
-    changed = with_instruction(episode, CONFIG)
+    changed = with_instruction(episode)
     assert changed.instruction == "lift the block"
     assert changed.conventions == {"layout": "x", RAW_INSTRUCTION: "Lift the block."}
-    assert with_instruction(changed, CONFIG) is changed
-    assert with_instruction(episode, InstructionConfig(normalise=False)) is episode
+    assert with_instruction(changed) is changed
 
 
 def test_texts_that_tell_the_outcome_are_noticed() -> None:

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from worldline_core.data.curation.near_duplicates import NearDuplicateConfig, find_near_duplicates
+from worldline_core.data.curation.near_duplicates import MIN_MOTION_OVERLAP, find_near_duplicates
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint
 
 VIEWS = ("head", "left_wrist")
@@ -52,11 +52,10 @@ def test_copies_are_found_and_nothing_else(states: bool) -> None:
     rng = np.random.default_rng(0)
     prints = [random_print(rng, states=states) for _ in range(300)]
     prints += [copied(prints[i], rng) for i in range(0, 300, 10)]
-    found = find_near_duplicates(prints, NearDuplicateConfig())
+    found = find_near_duplicates(prints)
     assert [(f.position, f.original) for f in found] == [(300 + k, 10 * k) for k in range(30)]
     assert all((f.motion_overlap is not None) == states for f in found)
     assert all(0 < f.frame_distance < 2 for f in found)
-    assert find_near_duplicates(prints, NearDuplicateConfig(enabled=False)) == []
 
 
 def test_the_search_agrees_with_comparing_every_pair() -> None:
@@ -65,17 +64,16 @@ def test_the_search_agrees_with_comparing_every_pair() -> None:
     prints = [random_print(rng) for _ in range(60)]
     for i in range(60):
         prints.append(copied(prints[i], rng, changed=i / 60))
-    config = NearDuplicateConfig(motion_overlap=0.6)
     wanted = set()
     for a, b in combinations(range(len(prints)), 2):
         first, second = prints[a].motion, prints[b].motion
         assert first is not None
         assert second is not None
-        if (first == second).mean() >= 0.6:
+        if (first == second).mean() >= MIN_MOTION_OVERLAP:
             wanted.add((a, b))
-    found = {(f.original, f.position) for f in find_near_duplicates(prints, config)}
+    found = {(f.original, f.position) for f in find_near_duplicates(prints)}
     assert found <= wanted
-    # A band of three equal MinHashes of ten: 1 - (1 - 0.6 ** 3) ** 10 = 0.91 at the threshold, more above it.
+    # A band of three equal MinHashes of ten: 1 - (1 - 0.5 ** 3) ** 10 = 0.74 at the threshold, more above it.
     assert len(found) >= 0.9 * len(wanted)
 
 
@@ -84,7 +82,7 @@ def test_groups_keep_their_first_and_chains_are_followed() -> None:
     prints = [random_print(rng) for _ in range(6)]
     far = copied(prints[1], rng, changed=0.3)
     prints += [far, copied(far, rng, changed=0.3), copied(prints[4], rng)]
-    found = {f.position: f for f in find_near_duplicates(prints, NearDuplicateConfig())}
+    found = {f.position: f for f in find_near_duplicates(prints)}
     assert {position: f.original for position, f in found.items()} == {6: 1, 7: 1, 8: 4}
     assert found[7].compared_with in (1, 6)
 
@@ -93,24 +91,24 @@ def test_different_motion_before_the_same_wall_is_no_duplicate() -> None:
     rng = np.random.default_rng(3)
     first = random_print(rng)
     second = replace(copied(first, rng, bits=0), motion=random_print(rng).motion)
-    assert find_near_duplicates([first, second], NearDuplicateConfig()) == []
+    assert find_near_duplicates([first, second]) == []
 
 
 def test_equal_motion_in_another_room_is_no_duplicate() -> None:
     rng = np.random.default_rng(4)
     first, other = random_print(rng), random_print(rng)
-    assert find_near_duplicates([first, replace(other, motion=first.motion)], NearDuplicateConfig()) == []
+    assert find_near_duplicates([first, replace(other, motion=first.motion)]) == []
 
 
 def test_without_states_length_counts_and_layouts_are_bridged_by_images() -> None:
     rng = np.random.default_rng(5)
     video = random_print(rng, states=False)
     longer = replace(copied(video, rng), seconds=video.seconds + 3)
-    assert find_near_duplicates([video, longer], NearDuplicateConfig()) == []
-    assert len(find_near_duplicates([video, longer], NearDuplicateConfig(max_length_difference_s=5))) == 1
+    assert find_near_duplicates([video, longer]) == []
+    assert len(find_near_duplicates([video, replace(longer, seconds=video.seconds + 0.5)])) == 1
     joints = random_print(rng)
     poses = replace(copied(joints, rng), layout="ee_pose/8", motion=random_print(rng).motion)
-    (found,) = find_near_duplicates([joints, poses], NearDuplicateConfig())
+    (found,) = find_near_duplicates([joints, poses])
     assert found.motion_overlap is None
 
 
@@ -118,7 +116,7 @@ def test_episodes_without_a_common_view_are_not_compared() -> None:
     rng = np.random.default_rng(6)
     first = random_print(rng)
     renamed = replace(first, views={f"other_{view}": seen for view, seen in first.views.items()})
-    assert find_near_duplicates([first, renamed], NearDuplicateConfig()) == []
+    assert find_near_duplicates([first, renamed]) == []
 
 
 def test_time_grows_with_the_number_of_episodes() -> None:
@@ -126,7 +124,7 @@ def test_time_grows_with_the_number_of_episodes() -> None:
         rng = np.random.default_rng(7)
         prints = [random_print(rng) for _ in range(count)]
         clock = time.process_time()
-        assert find_near_duplicates(prints, NearDuplicateConfig()) == []
+        assert find_near_duplicates(prints) == []
         return time.process_time() - clock
 
     seconds(200)

@@ -50,8 +50,6 @@ def test_patterns_come_first_and_declared_splits_stay(sample: Make) -> None:
         assert with_split(replace(episode, split=kept), splits).split == kept
     evaluation = replace(episode, split="test", conventions={"layout": "robotwin"})
     assert with_split(evaluation, splits).split == "test"
-    others = SceneSplits(by="scene", test=0, validation=0, sources=("another",))
-    assert with_split(replace(episode, split="test"), others).split == "test"
     assert with_split(replace(episode, scene="kit"), {"k*": "test", "*": "train"}).split == "test"
 
 

@@ -123,7 +123,6 @@ def rows(*statuses: Literal["kept", "quarantined"]) -> list[InputRow]:
             reason=None if status == "kept" else "too_short",
             stored_bytes=10,
             seconds=0.5,
-            cpu_seconds=0.4,
         )
         for n, status in enumerate(statuses)
     ]
@@ -147,10 +146,10 @@ def test_the_account_is_complete_or_an_error(tmp_path: Path) -> None:
 
 def test_shards_are_merged_and_the_row_with_the_work_counts(tmp_path: Path) -> None:
     first, second = rows("kept", "quarantined")
-    unknown = replace(first, seconds=None, cpu_seconds=None)
+    unknown = replace(first, seconds=None)
     write_shard_account(tmp_path, 0, [unknown, second])
     write_shard_account(tmp_path, 1, [first])
-    write_account(tmp_path, [unknown, replace(second, seconds=None, cpu_seconds=None)])
+    write_account(tmp_path, [unknown, replace(second, seconds=None)])
     assert read_account(tmp_path) == [first, second]
     written = list(tmp_path.rglob("*.parquet"))
     assert len(written) == 3

@@ -31,7 +31,7 @@ class InputRow:
     Attributes:
         digest: of the recorded content, where it was read; empty for what did not get so far.
         stored_bytes: size of this input's result on disk.
-        seconds, cpu_seconds: wall-clock and processor time.
+        seconds: wall-clock time.
     """
 
     episode_id: str
@@ -41,7 +41,6 @@ class InputRow:
     digest: str = ""
     stored_bytes: int = 0
     seconds: float | None = None
-    cpu_seconds: float | None = None
 
 
 _SCHEMA = row_schema(InputRow)
@@ -63,7 +62,7 @@ def write_account(output: Path, rows: Iterable[InputRow]) -> None:
     merged = []
     for row in rows:
         known = timed.get(row.episode_id, row)
-        merged.append(replace(row, seconds=known.seconds, cpu_seconds=known.cpu_seconds))
+        merged.append(replace(row, seconds=known.seconds))
     _write(output / MERGED_FILE, merged)
 
 

@@ -127,7 +127,7 @@ def do_shard(shard: Shard[Any]) -> None:
     unreachable: list[Exception] = []
     todo = work.remaining(shard.number, shard.episodes)
     for episode in todo:
-        clock, processor = time.perf_counter(), time.process_time()
+        clock = time.perf_counter()
         try:
             result = _do_episode(work, episode, shard.crashed.get(episode))
         except Exception as error:
@@ -135,8 +135,7 @@ def do_shard(shard: Shard[Any]) -> None:
                 raise
             unreachable.append(error)
             continue
-        seconds, cpu_seconds = time.perf_counter() - clock, time.process_time() - processor
-        results.append(replace(result, seconds=seconds, cpu_seconds=cpu_seconds))
+        results.append(replace(result, seconds=time.perf_counter() - clock))
     if todo and not unreachable and not shard.alone:
         work.finish_shard(shard.number, results)
     if results:

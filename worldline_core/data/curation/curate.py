@@ -69,7 +69,7 @@ def curate(
         work.writer.close()
     rows, rejected = read_index(output), read_quarantine(output)
     write_source_table(output, config, [[e.identity for e in episodes] for episodes in listed], rows, rejected)
-    write_source_weights(output, rows, config.sampling)
+    write_source_weights(output, rows, config.sampling_alpha)
     check_account(output, len(identities), {row.episode_id for row in rows}, {row.episode_id for row in rejected})
     if {row.split for row in rows} == {"test"}:
         logger.warning("All episodes are in split test; training needs others (curate.sources[].split, curate.splits)")

@@ -7,9 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
-from worldline_core.data.curation.near_duplicates import NearDuplicateConfig
 from worldline_core.data.curation.scenes import LeakageConfig, Splits
-from worldline_core.data.episodes.instructions import InstructionConfig
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.sources.open import SourceConfig
@@ -17,15 +15,6 @@ from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
 
 AVAILABLE = "available"
-
-
-class SourceSampling(StrictModel):
-    """Shares of the sources in training."""
-
-    alpha: float = Field(default=1.0, ge=0, le=1, description="share ~ hours ** alpha: 1 by hours, 0 all equal")
-    shares: dict[str, float] | None = Field(
-        default=None, description="source -> share, given instead; every source that trains must be named"
-    )
 
 
 class CurateConfig(StrictModel):
@@ -56,10 +45,12 @@ class CurateConfig(StrictModel):
         description="scene name pattern -> split, first match wins, else the source's; or {by: scene, test: 0.1,"
         " validation: 0.05, seed: 0}",
     )
-    near_duplicates: NearDuplicateConfig = NearDuplicateConfig()
+    near_duplicates: bool = Field(default=True, description="quarantine copies that were encoded, resized or cut again")
     leakage: LeakageConfig = LeakageConfig()
-    instructions: InstructionConfig = InstructionConfig()
-    sampling: SourceSampling = SourceSampling()
+    normalise_instructions: bool = Field(default=True, description="bring task texts to one spelling")
+    sampling_alpha: float = Field(
+        default=1.0, ge=0, le=1, description="share of a source in training ~ hours ** alpha: 1 by hours, 0 all equal"
+    )
     require_calibration: bool = Field(default=False, description="quarantine episodes with an uncalibrated view")
     min_frames: int = Field(default=2, ge=1)
     joint_tolerance_rad: float = Field(default=0.05, ge=0)

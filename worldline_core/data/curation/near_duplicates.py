@@ -10,9 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint
 
 _BAND = 3
@@ -20,27 +18,17 @@ _HALF_BITS = np.uint64(0xFFFFFFFF)
 _MIN_MOVING_BITS = 4
 
 
-class NearDuplicateConfig(StrictModel):
-    """When two episodes count as one recording.
-
-    With states, the motion decides and the images only confirm: two demonstrations of one task in one scene look alike
-    and move differently. Without states the images alone decide, by stricter numbers.
-    """
-
-    enabled: bool = True
-    motion_overlap: float = Field(
-        default=0.5, gt=0, le=1, description="least share of common state cells (estimated Jaccard index)"
-    )
-    frame_distance: float = Field(
-        default=12.0, ge=0, le=64, description="with equal motion: most differing bits of 64 of a moment's hash, mean"
-    )
-    strict_frame_distance: float = Field(default=4.0, ge=0, le=64, description="the same, without states")
-    strict_moving_distance: float = Field(
-        default=0.15, ge=0, le=1, description="without states: most of the moved area (1 - Jaccard) that may differ"
-    )
-    max_length_difference_s: float = Field(
-        default=1.0, ge=0, description="without states: largest difference in length"
-    )
+# With states, the motion decides and the images only confirm: two demonstrations of one task in one scene look alike and
+# move differently. Without states the images alone decide, by stricter numbers.
+MIN_MOTION_OVERLAP = 0.5
+"""Least share of common state cells (estimated Jaccard index)."""
+_MAX_FRAME_DISTANCE = 12.0
+"""With equal motion: most differing bits of 64 of a moment's hash, mean."""
+_MAX_FRAME_DISTANCE_WITHOUT_STATES = 4.0
+_MAX_MOVING_DISTANCE = 0.15
+"""Without states: most of the moved area (1 - Jaccard) that may differ."""
+_MAX_LENGTH_DIFFERENCE_S = 1.0
+"""Without states: largest difference in length."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +50,15 @@ class NearDuplicate:
     moving_distance: float
 
 
-def find_near_duplicates(prints: Sequence[Fingerprint], config: NearDuplicateConfig) -> list[NearDuplicate]:
+def find_near_duplicates(prints: Sequence[Fingerprint]) -> list[NearDuplicate]:
     """Episodes that repeat an earlier one, ordered by position.
 
     Args:
         prints: in listed order: of each group of equal recordings the first is the original.
     """
-    if not config.enabled or len(prints) < 2:
+    if len(prints) < 2:
         return []
-    search = _Search(prints, config)
+    search = _Search(prints)
     for members in search.motion_groups():
         search.join(members, by_motion=True)
     for members in search.image_groups():
@@ -84,8 +72,7 @@ class _Search:
     Axes: e episodes, v view names, m moments.
     """
 
-    def __init__(self, prints: Sequence[Fingerprint], config: NearDuplicateConfig) -> None:
-        self.config = config
+    def __init__(self, prints: Sequence[Fingerprint]) -> None:
         views = sorted({view for seen in prints for view in seen.views})
         layouts = {layout: number for number, layout in enumerate(sorted({seen.layout for seen in prints}))}
         count = len(prints)
@@ -132,12 +119,12 @@ class _Search:
         for place, first in enumerate(members[:-1]):
             others = members[place + 1 :]
             if not by_motion:
-                within = self.seconds[others] - self.seconds[first] <= self.config.max_length_difference_s
+                within = self.seconds[others] - self.seconds[first] <= _MAX_LENGTH_DIFFERENCE_S
                 others = others[: np.count_nonzero(within)]
             others = others[self.group[others] != self.group[first]]
             if by_motion:
                 overlap = (self.motion[others] == self.motion[first]).mean(axis=1)
-                others, overlap = others[overlap >= self.config.motion_overlap], None
+                others = others[overlap >= MIN_MOTION_OVERLAP]
             else:
                 unlike = (self.layout[others] != self.layout[first]) | (self.layout[first] < 0)
                 others = others[unlike]
@@ -148,9 +135,9 @@ class _Search:
         shared = self.present[others] & self.present[first]
         frames, moving = self._image_distances(first, others, shared)
         if by_motion:
-            equal = frames <= self.config.frame_distance
+            equal = frames <= _MAX_FRAME_DISTANCE
         else:
-            equal = (frames <= self.config.strict_frame_distance) & (moving <= self.config.strict_moving_distance)
+            equal = (frames <= _MAX_FRAME_DISTANCE_WITHOUT_STATES) & (moving <= _MAX_MOVING_DISTANCE)
         equal &= shared.any(axis=1)
         for other, frame, moved in zip(others[equal], frames[equal], moving[equal], strict=True):
             overlap = float((self.motion[other] == self.motion[first]).mean()) if by_motion else None

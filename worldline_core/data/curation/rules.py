@@ -56,10 +56,10 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
     Returns:
         Episodes to take out, in listed order, and the pairs of scenes that look like one across the split.
 
-    Raises: DataError when an episode has no fingerprint, a scene is both learnt from and tested on, or scenes leak and
+    Raises: DataError when a scene is both learnt from and tested on, or scenes leak and
         the configuration refuses that.
     """
-    prints = [_fingerprint(part) for part in parts]
+    prints = [Fingerprint.from_json(part["fingerprint"]) for part in parts]
     rows: dict[int, QuarantineRow] = {}
     first: dict[str, int] = {}
     for position, seen in enumerate(prints):
@@ -69,7 +69,8 @@ def curation_findings(config: CurateConfig, parts: Sequence[Described]) -> tuple
                 parts[position], parts[original], "duplicate", "Same frames, states and actions as episode {}"
             )
     left = [position for position in range(len(parts)) if position not in rows]
-    for found in find_near_duplicates([prints[position] for position in left], config.near_duplicates):
+    searched = [prints[position] for position in left] if config.near_duplicates else []
+    for found in find_near_duplicates(searched):
         rows[left[found.position]] = _repetition(
             parts[left[found.position]],
             parts[left[found.original]],
@@ -111,22 +112,6 @@ def check_scenes_disjoint(parts: Sequence[Described]) -> None:
                     got=", ".join(shared[:10]) + (" ..." if len(shared) > 10 else ""),
                     next_step="give each scene one split",
                 )
-
-
-def _fingerprint(part: Described) -> Fingerprint:
-    try:
-        stored = part["fingerprint"]
-    except KeyError:
-        stored = None
-    if not isinstance(stored, Mapping):
-        raise DataError(
-            "Episode has no fingerprint",
-            where=f"episode {part['episode_id']}",
-            expected="the fingerprint that curation leaves with each episode",
-            got="none",
-            next_step="remove the unfinished folder and curate again",
-        )
-    return Fingerprint.from_json(stored)
 
 
 def _row(part: Described, reason: str, detail: str, evidence: Mapping[str, Any]) -> QuarantineRow:

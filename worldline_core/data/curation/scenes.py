@@ -21,6 +21,8 @@ from worldline_core.data.episodes.source import EVALUATION_LAYOUTS
 
 LEARNING = ("train", "validation")
 TESTING = ("test", "ood_test")
+_KEPT_SPLITS = ("ood_test", "bank")
+"""Splits that stay where a source declares them."""
 
 
 class SceneSplits(StrictModel):
@@ -33,12 +35,6 @@ class SceneSplits(StrictModel):
     test: float = Field(default=0.1, ge=0, lt=1, description="share of the scenes that test")
     validation: float = Field(default=0.05, ge=0, lt=1, description="share of the scenes that validate")
     seed: int = 0
-    sources: tuple[str, ...] | None = Field(
-        default=None, description="names of the sources that state no split of their own; null: all"
-    )
-    keep: tuple[Split, ...] = Field(
-        default=("ood_test", "bank"), description="splits that stay where a source declares them"
-    )
     patterns: dict[str, Split] = Field(default={}, description="scene name pattern -> split, before the draw")
 
     @model_validator(mode="after")
@@ -78,8 +74,7 @@ def with_split(episode: Episode, splits: Mapping[str, Split] | SceneSplits) -> E
         return replace(episode, split=named)
     if not isinstance(splits, SceneSplits):
         return episode
-    declared = episode.split in splits.keep or episode.conventions.get("layout") in EVALUATION_LAYOUTS
-    if declared or (splits.sources is not None and episode.source not in splits.sources):
+    if episode.split in _KEPT_SPLITS or episode.conventions.get("layout") in EVALUATION_LAYOUTS:
         return episode
     return replace(episode, split=drawn_split(episode.scene, splits))
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from worldline_core.data.curation.curate_config import CurateConfig, SourceSampling
+from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow
-from worldline_core.errors import ConfigError, DataError
+from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
 
 SOURCES_FILE = "sources.json"
@@ -100,43 +100,23 @@ def read_source_table(root: Path) -> list[SourceFacts]:
         raise DataError("Table of sources is damaged", where=path, got=str(error)) from error
 
 
-def source_weights(rows: Sequence[EpisodeRow], sampling: SourceSampling) -> dict[str, float]:
-    """Weight of one episode of each source that trains; the mean over episodes is 1.
+def write_source_weights(output: Path, rows: Sequence[EpisodeRow], alpha: float) -> None:
+    """Write source_weights.json: hours, episodes, share (~ hours ** alpha) and weight of each source that trains.
 
-    A sampler that draws episodes by these weights draws source s with probability share_s / sum of shares.
-
-    Raises: ConfigError when given shares leave a source out, name an unknown one, or are not positive.
+    A weight is that of one episode; the mean over episodes is 1. A sampler that draws episodes by these weights draws a
+    source with the probability of its share.
     """
     hours, counts = _hours_and_counts(rows)
-    if not counts:
-        return {}
-    if sampling.shares is None:
-        shares = {source: hours[source] ** sampling.alpha for source in hours}
-    else:
-        shares = sampling.shares
-        if set(shares) != set(counts) or min(shares.values()) < 0 or sum(shares.values()) <= 0:
-            raise ConfigError(
-                "Shares do not fit the sources that train",
-                where="curate.sampling.shares",
-                expected=", ".join(f"{source}: a share of at least 0" for source in sorted(counts)),
-                got=", ".join(f"{source}: {share}" for source, share in sorted(shares.items())),
-            )
-    total, episodes = sum(shares.values()), sum(counts.values())
-    return {source: shares[source] / total * episodes / counts[source] for source in sorted(counts)}
-
-
-def write_source_weights(output: Path, rows: Sequence[EpisodeRow], sampling: SourceSampling) -> None:
-    """Write source_weights.json: hours, episodes, weight and share of each source that trains."""
-    weights, (hours, counts) = source_weights(rows, sampling), _hours_and_counts(rows)
-    total = sum(counts.values())
+    total, episodes = sum(value**alpha for value in hours.values()), sum(counts.values())
+    shares = {source: hours[source] ** alpha / total for source in sorted(counts)}
     table = {
         source: {
             "episodes": counts[source],
             "hours": round(hours[source], 6),
-            "share": round(weight * counts[source] / total, 9),
-            "weight": round(weight, 9),
+            "share": round(share, 9),
+            "weight": round(share * episodes / counts[source], 9),
         }
-        for source, weight in weights.items()
+        for source, share in shares.items()
     }
     write_json_atomic(output / WEIGHTS_FILE, table)
 

@@ -27,7 +27,6 @@ from worldline_core.errors import DataError
 if TYPE_CHECKING:
     from worldline_core.data.video.thumbnails import ViewThumbnails
 
-VERSION = 1
 MOMENTS = 16
 MINHASHES = 30
 # A few cells are the home pose alone, which all episodes of a robot share.
@@ -69,7 +68,6 @@ class Fingerprint:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "version": VERSION,
             "digest": self.digest,
             "seconds": self.seconds,
             "layout": self.layout,
@@ -84,14 +82,6 @@ class Fingerprint:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Fingerprint:
-        """Raises: DataError when another version wrote it."""
-        if stored.get("version") != VERSION:
-            raise DataError(
-                "Fingerprint has another version",
-                expected=VERSION,
-                got=stored.get("version"),
-                next_step="remove the unfinished folder and curate again",
-            )
         motion = stored["motion"]
         return cls(
             stored["digest"],

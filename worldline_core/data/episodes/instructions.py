@@ -7,11 +7,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
-from pydantic import Field
-
-from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import Episode
 
 RAW_INSTRUCTION = "raw_instruction"
@@ -22,6 +18,7 @@ _OUTCOME_WORDS = re.compile(
 _QUOTES = dict.fromkeys(map(ord, "\u2018\u2019\u201a\u201b\u2032"), "'") | dict.fromkeys(
     map(ord, "\u201c\u201d\u201e\u201f\u2033"), '"'
 )
+_TRAILING = ".!,;: "
 _PAIRS = {'"': '"', "'": "'", "(": ")", "[": "]", "<": ">"}
 _PLACEHOLDERS = (
     "n/a", "na", "none", "null", "nan", "unknown", "todo", "tbd", "test", "task", "instruction", "no instruction",
@@ -29,21 +26,7 @@ _PLACEHOLDERS = (
 )  # fmt: skip
 
 
-class InstructionConfig(StrictModel):
-    """How task texts are brought to one spelling."""
-
-    normalise: bool = Field(default=True, description="false keeps every text as its source gives it")
-    case: Literal["lower", "keep"] = Field(
-        default="lower", description="lower: whole text; words in capitals of two to four letters stay (USB)"
-    )
-    strip_trailing: str = Field(default=".!,;:", description="punctuation that is taken off the end")
-    placeholders: tuple[str, ...] = Field(
-        default=_PLACEHOLDERS,
-        description="texts that say nothing (compared in lower case); the instruction is then empty",
-    )
-
-
-def normalised_text(text: str, config: InstructionConfig) -> str:
+def normalised_text(text: str) -> str:
     """One spelling: Unicode NFKC, plain quotes, single spaces, no enclosing quotes or brackets, no end punctuation, one case.
 
     A text of placeholders or of punctuation alone gives "".
@@ -54,14 +37,12 @@ def normalised_text(text: str, config: InstructionConfig) -> str:
     text = re.sub(r" +", " ", text).strip()
     while len(text) > 1 and _PAIRS.get(text[0]) == text[-1] and text[0] not in text[1:-1]:
         text = text[1:-1].strip()
-    if text.lower() in config.placeholders:
+    if text.lower() in _PLACEHOLDERS:
         return ""
-    stripped = text.rstrip(config.strip_trailing + " ")
-    if stripped.lower() in config.placeholders or not any(c.isalnum() for c in stripped):
+    stripped = text.rstrip(_TRAILING)
+    if stripped.lower() in _PLACEHOLDERS or not any(c.isalnum() for c in stripped):
         return ""
-    if config.case == "lower":
-        stripped = _lowered(stripped)
-    return stripped
+    return _lowered(stripped)
 
 
 def _lowered(text: str) -> str:
@@ -74,22 +55,19 @@ def _lowered(text: str) -> str:
     )
 
 
-def one_annotation(annotations: Sequence[str], config: InstructionConfig | None = None) -> str:
+def one_annotation(annotations: Sequence[str]) -> str:
     """Of several annotations of one episode the one that most annotators gave, as it was written; of equally frequent
     ones the first. Annotations count as equal when their normalised texts are; "" where none says anything."""
-    config = config or InstructionConfig()
-    texts = [(text, raw) for raw in annotations if (text := normalised_text(raw, config))]
+    texts = [(text, raw) for raw in annotations if (text := normalised_text(raw))]
     if not texts:
         return ""
     counts = Counter(text for text, _ in texts)
     return max(texts, key=lambda pair: counts[pair[0]])[1]  # max keeps the first of equals
 
 
-def with_instruction(episode: Episode, config: InstructionConfig) -> Episode:
+def with_instruction(episode: Episode) -> Episode:
     """The episode with its instruction normalised; the raw text stays in its conventions where it differs."""
-    if not config.normalise:
-        return episode
-    text = normalised_text(episode.instruction, config)
+    text = normalised_text(episode.instruction)
     if text == episode.instruction:
         return episode
     conventions = {RAW_INSTRUCTION: episode.instruction} | dict(episode.conventions)
