@@ -49,8 +49,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow, read_index, w
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.data.episodes.fingerprint import MINHASHES, MOMENTS, Fingerprint, ViewPrint, fingerprint
 from worldline_core.data.episodes.view_recording import RecordedView
-from worldline_core.data.sources.lerobot import LeRobotSource
-from worldline_core.data.sources.lerobot_columns import LeRobotSourceConfig
+from worldline_core.data.sources.lerobot import LeRobotSource, LeRobotSourceConfig
 from worldline_core.data.video.clip import VideoClip
 from worldline_core.data.video.encoder import encode_video
 from worldline_core.data.video.frame_decoder import decode_video

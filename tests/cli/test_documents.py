@@ -17,7 +17,7 @@ from tasks.execution.artifact_task import find_task, task_names
 from tasks.execution.command_line import add_task_arguments
 from worldline_core.config import _known_keys
 from worldline_core.data.sources.calibration_file import CalibrationFile
-from worldline_core.data.sources.lerobot_columns import LeRobotSourceConfig
+from worldline_core.data.sources.lerobot import LeRobotSourceConfig
 from worldline_core.data.sources.video_folder import VideoFolderSourceConfig
 from worldline_core.geometry.embodiment import Embodiment
 from worldline_core.pipeline.pipeline_config import PipelineConfig

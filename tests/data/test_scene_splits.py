@@ -10,15 +10,9 @@ import pytest
 from pydantic import ValidationError
 
 from worldline_core.config import validate
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.scenes import (
-    LeakageConfig,
-    SceneSplits,
-    SceneView,
-    drawn_split,
-    find_scene_leaks,
-    with_split,
-)
+from worldline_core.data.curation.curate_config import CurateConfig, LeakageConfig, SceneSplits
+from worldline_core.data.curation.recorded_episode import drawn_split, with_split
+from worldline_core.data.curation.rules import SceneView, find_scene_leaks
 from worldline_core.errors import ConfigError
 
 Make = Callable[..., tuple]

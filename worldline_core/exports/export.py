@@ -23,9 +23,9 @@ from worldline_core.data.episodes.view_recording import RecordedView
 from worldline_core.data.guards.source_paths import safe_stem
 from worldline_core.data.lerobot.dataset import LeRobotV3Dataset
 from worldline_core.data.mcap.exported import Encoding, write_episode_mcap, write_rollout_mcap
+from worldline_core.data.video.clip import check_video_header
 from worldline_core.data.video.encoder import PixelFormat, encode_video
 from worldline_core.data.video.frames import MadeFrames, VideoFrames
-from worldline_core.data.video.header import check_video_header
 from worldline_core.errors import ArtifactError, ConfigError, DataError, WorldLineError
 from worldline_core.exports.rerun_recording import RecordingContent, write_rerun_recording
 from worldline_core.geometry.embodiment import load_embodiment

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from worldline_core.config import ImageSize, StrictModel
-from worldline_core.data.curation.scenes import LeakageConfig, Splits
+from worldline_core.data.episodes.episode import Split
 from worldline_core.data.episodes.view_recording import VideoMode
 from worldline_core.data.guards.reader_process import ReaderLimits
 from worldline_core.data.sources.open import SourceConfig
@@ -15,6 +16,47 @@ from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.geometry.cameras import Fit
 
 AVAILABLE = "available"
+
+
+class SceneSplits(StrictModel):
+    """Scenes are drawn into test, validation and train by a hash of (seed, scene).
+
+    Recordings for evaluation only keep the split that their source declares.
+    """
+
+    by: Literal["scene"]
+    test: float = Field(default=0.1, ge=0, lt=1, description="share of the scenes that test")
+    validation: float = Field(default=0.05, ge=0, lt=1, description="share of the scenes that validate")
+    seed: int = 0
+    patterns: dict[str, Split] = Field(default={}, description="scene name pattern -> split, before the draw")
+
+    @model_validator(mode="after")
+    def _leaves_training(self) -> SceneSplits:
+        if self.test + self.validation >= 1:
+            raise ValueError(f"test + validation leave nothing to train on: {self.test} + {self.validation}")
+        return self
+
+
+def _kind(value: Any) -> str:
+    return "scene" if isinstance(value, SceneSplits) or (isinstance(value, Mapping) and "by" in value) else "patterns"
+
+
+Splits = Annotated[
+    Annotated[dict[str, Split], Tag("patterns")] | Annotated[SceneSplits, Tag("scene")], Discriminator(_kind)
+]
+"""Scene name pattern -> split, or {by: scene, ...}. A pattern table cannot hold a scene that is named "by"."""
+
+
+class LeakageConfig(StrictModel):
+    """What to do when a scene that is learnt from looks like a scene that is tested on."""
+
+    action: Literal["report", "quarantine", "refuse", "off"] = Field(
+        default="report",
+        description="report: write it down; quarantine: take the learning scene out (scene_leak); refuse: stop",
+    )
+    max_distance: int = Field(
+        default=52, ge=0, le=256, description="most differing bits of 256 between first images of one scene"
+    )
 
 
 class CurateConfig(StrictModel):

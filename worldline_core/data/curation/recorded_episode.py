@@ -5,14 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import partial
+from hashlib import sha256
 from itertools import islice
 
 import numpy as np
 
-from worldline_core.data.curation.curate_config import CurateConfig
-from worldline_core.data.curation.scenes import with_split
-from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode
+from worldline_core.data.curation.curate_config import CurateConfig, SceneSplits
+from worldline_core.data.episodes.episode import TRAINING_SPLITS, Episode, Split
 from worldline_core.data.episodes.instructions import with_instruction
 from worldline_core.data.episodes.source import EVALUATION_LAYOUTS, EVALUATION_ONLY, LoadedEpisode, Masks, says_droid
 from worldline_core.data.episodes.view_recording import RecordedView
@@ -23,6 +24,8 @@ from worldline_core.data.video.thumbnails import ViewThumbnails
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.cameras import ImageTransform
 
+_KEPT_SPLITS = ("ood_test", "bank")
+"""Splits that stay where a source declares them."""
 PRIMARY_VIEW_REASON = "primary_view_reason"
 TRIMMED = "trimmed"
 """Noted in the conventions of an episode that `trim` shortened: how many frames states and videos had."""
@@ -152,6 +155,27 @@ def described(
     result = with_split(told, config.splits)
     check_split(result)
     return result
+
+
+def with_split(episode: Episode, splits: Mapping[str, Split] | SceneSplits) -> Episode:
+    """The episode in the split that the configuration gives its scene; without a rule its source's."""
+    patterns = splits.patterns if isinstance(splits, SceneSplits) else splits
+    named = next((split for pattern, split in patterns.items() if fnmatchcase(episode.scene, pattern)), None)
+    if named is not None:
+        return replace(episode, split=named)
+    if not isinstance(splits, SceneSplits):
+        return episode
+    if episode.split in _KEPT_SPLITS or episode.conventions.get("layout") in EVALUATION_LAYOUTS:
+        return episode
+    return replace(episode, split=drawn_split(episode.scene, splits))
+
+
+def drawn_split(scene: str, splits: SceneSplits) -> Split:
+    """The split of a scene: a uniform number in [0, 1) from SHA-256 of "seed:scene", against the shares."""
+    number = int.from_bytes(sha256(f"{splits.seed}:{scene}".encode()).digest()[:8]) / 2**64
+    if number < splits.test:
+        return "test"
+    return "validation" if number < splits.test + splits.validation else "train"
 
 
 def with_primary_view(

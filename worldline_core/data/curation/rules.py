@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from worldline_core.data.curation.curate_config import CurateConfig
+import numpy as np
+
+from worldline_core.data.curation.curate_config import CurateConfig, LeakageConfig
 from worldline_core.data.curation.near_duplicates import find_near_duplicates
-from worldline_core.data.curation.scenes import LEARNING, TESTING, SceneLeak, SceneView, find_scene_leaks
 from worldline_core.data.episodes.episode_index import QuarantineRow
 from worldline_core.data.episodes.fingerprint import Fingerprint
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic
 
+LEARNING = ("train", "validation")
+TESTING = ("test", "ood_test")
 CURATION_FILE = "curation.json"
 
 
@@ -150,3 +153,50 @@ def _refusal(leaks: Sequence[SceneLeak]) -> DataError:
         got=", ".join(named[:10]) + (" ..." if len(named) > 10 else ""),
         next_step="give both names one split in curate.splits, or set curate.leakage.action to quarantine or report",
     )
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """What the search sees of an episode. `first` is (4,) uint64, 256 bits of the primary view's first image."""
+
+    episode_id: str
+    scene: str
+    split: str
+    first: np.ndarray
+
+
+@dataclass(frozen=True)
+class SceneLeak:
+    """A pair of scenes that look like one; the episodes are those that look most alike."""
+
+    learning_scene: str
+    testing_scene: str
+    learning_episode: str
+    testing_episode: str
+    distance: int
+
+
+def find_scene_leaks(seen: Sequence[SceneView], config: LeakageConfig) -> list[SceneLeak]:
+    """Pairs of differently named scenes across the split whose first images differ in at most `max_distance` bits.
+
+    Every tested episode is compared with every learnt one: 200,000 with 10,000 take some 20 seconds.
+    """
+    learning = [view for view in seen if view.split in LEARNING]
+    if config.action == "off" or not learning:
+        return []
+    learnt = np.stack([view.first for view in learning], axis=1)
+    best: dict[tuple[str, str], SceneLeak] = {}
+    for tested in (view for view in seen if view.split in TESTING):
+        distances = np.bitwise_count(learnt ^ tested.first[:, None]).sum(axis=0, dtype=np.uint16)
+        for index in np.flatnonzero(distances <= config.max_distance).tolist():
+            other = learning[index]
+            if other.scene == tested.scene:
+                continue
+            leak = SceneLeak(other.scene, tested.scene, other.episode_id, tested.episode_id, int(distances[index]))
+            known = best.setdefault((other.scene, tested.scene), leak)
+            best[other.scene, tested.scene] = min(known, leak, key=_by_distance)
+    return sorted(best.values(), key=lambda leak: (leak.testing_scene, leak.learning_scene))
+
+
+def _by_distance(leak: SceneLeak) -> tuple[int, str, str]:
+    return leak.distance, leak.learning_episode, leak.testing_episode

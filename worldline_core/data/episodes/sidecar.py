@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from worldline_core.data.episodes.episode import ARRAYS, CameraTrack
-from worldline_core.data.episodes.episode_parts import Part
 from worldline_core.data.guards.plain_files import expect_layout, read_json, read_table
 from worldline_core.data.guards.rejection import MAX_FRAMES, RejectedInputError, check_image_size, too_large
 from worldline_core.data.guards.source_paths import is_file
 from worldline_core.data.video.frames import PACKED, MadeFrames, unpacked_images
 from worldline_core.errors import DataError
 from worldline_core.store.atomic import write_json_atomic, write_table_atomic
+
+if TYPE_CHECKING:
+    from worldline_core.data.episodes.episode_set_writer import Part
 
 FOLDER = Path("meta") / "worldline"
 

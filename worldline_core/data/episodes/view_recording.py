@@ -25,8 +25,7 @@ from av.video.stream import VideoStream
 from worldline_core.data.guards.plain_files import expect_layout
 from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.lerobot.metadata import ImageSampler
-from worldline_core.data.lerobot.v3_writer import EpisodeVideo
+from worldline_core.data.lerobot.v3_writer import EpisodeVideo, ImageSampler
 from worldline_core.data.video.clip import (
     FRAME_TOLERANCE,
     Picture,

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pydantic import BaseModel
+import pyarrow.json
+from pydantic import BaseModel, ConfigDict, Field
 
-from worldline_core.data.guards.plain_files import column_names, read_json_lines, read_table, validated
-from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file
-from worldline_core.data.lerobot.metadata import INDEX, EpisodeTable, read_info, whole_number
+from worldline_core.data.guards.plain_files import column_names, read_json, read_json_lines, read_table, validated
+from worldline_core.data.guards.rejection import MAX_TEXT_BYTES, RejectedInputError, check_length
+from worldline_core.data.guards.source_paths import AnyPath, fill_template, find_files, inside, note_file, regular_file
 from worldline_core.data.video.clip import VideoClip, video_size
 from worldline_core.data.video.frame_decoder import decode_frames
 from worldline_core.errors import DataError
@@ -31,6 +31,171 @@ VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 IMAGE_PREFIX = "observation.images."
+
+
+class DatasetInfo(BaseModel):
+    """`meta/info.json`: the keys that are read here; there may be others."""
+
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    codebase_version: str
+    fps: float = Field(gt=0, le=10_000)
+    features: dict[str, dict[str, Any]]
+    data_path: str | None = None
+    video_path: str | None = None
+    chunks_size: int = Field(default=1000, ge=1)
+    robot_type: Any = None
+    repo_id: Any = None
+
+
+def read_info(root: AnyPath, version: str, keys: Sequence[str] = ()) -> DatasetInfo:
+    """What `info.json` says, of the wanted version and with these keys.
+
+    Raises: DataError when it is unreadable, of another version, lacks a key, or holds something senseless.
+    """
+    where = f"{root}, meta/info.json"
+    content = read_json(root / "meta" / "info.json")
+    info = validated(DatasetInfo, content, where, "meta/info.json")
+    if info.codebase_version != version:
+        raise DataError("Dataset has another version", where=str(root), expected=version, got=info.codebase_version)
+    missing = sorted(set(keys) - info.model_fields_set)
+    if missing:
+        raise DataError("meta/info.json lacks a key", where=where, expected=", ".join(missing), got=", ".join(content))
+    return info
+
+
+INDEX = "episode_index"
+MAX_INDEX = 10**12
+_BLOCK_BYTES = 16 << 20
+
+
+class EpisodeTable:
+    """Rows by `episode_index`, made into a dict when asked for.
+
+    Args:
+        table: with a column `episode_index`; order and gaps do not matter.
+        where: named in messages. files: that the table was read from; every row is noted as read from them.
+
+    Raises: DataError when `episode_index` is not a column of whole numbers.
+    """
+
+    def __init__(self, table: pa.Table, where: object, files: Sequence[AnyPath] = ()) -> None:
+        self._where = str(where)
+        self._files = tuple(files)
+        if INDEX not in table.column_names:
+            raise DataError(
+                "Episode list lacks a column",
+                where=self._where,
+                expected=INDEX,
+                got=", ".join(table.column_names) or "none",
+            )
+        column = table[INDEX]
+        if not pa.types.is_integer(column.type) or column.null_count:
+            raise DataError(
+                "Episode list has rows without a number",
+                where=self._where,
+                expected=f"{INDEX}: a whole number in each row",
+                got=f"{column.type} with {column.null_count} empty rows",
+            )
+        numbers = column.to_numpy()
+        if len(numbers) and (numbers.min() < 0 or numbers.max() > MAX_INDEX):
+            raise DataError(
+                "Episode list numbers episodes out of range",
+                where=self._where,
+                expected=f"0..{MAX_INDEX}",
+                got=f"{numbers.min()}..{numbers.max()}",
+            )
+        order = np.argsort(numbers, kind="stable")
+        self.indices: np.ndarray = numbers[order].astype(np.int64)
+        in_order = bool((order[1:] > order[:-1]).all())
+        # One chunk per column: looking up a row among a hundred chunks takes a millisecond.
+        self._table = (table if in_order else table.take(pa.array(order))).combine_chunks()
+
+    @classmethod
+    def from_parquet(cls, files: Sequence[AnyPath], where: object) -> EpisodeTable:
+        """From LeRobot v3's meta/episodes; the statistics (`stats/*`) are left out.
+
+        Raises: DataError when a file is unreadable or the files differ in their columns.
+        """
+        tables = []
+        for file in files:
+            wanted = [name for name in column_names(file) if not name.startswith("stats/")]
+            tables.append(read_table(file, wanted))
+        try:
+            return cls(pa.concat_tables(tables, promote_options="default"), where, files)
+        except pa.ArrowException as error:
+            raise DataError("Files of the episode list differ", where=str(where), got=str(error)) from error
+
+    @classmethod
+    def from_json_lines(cls, path: AnyPath) -> EpisodeTable:
+        """From LeRobot v2.1's meta/episodes.jsonl; of each line `episode_index` and `length`.
+
+        Raises: RejectedInputError: missing_file, special_file, too_large, unreadable.
+        """
+        file = regular_file(path, "Episode list", max_bytes=MAX_TEXT_BYTES)
+        schema = pa.schema([(INDEX, pa.int64()), ("length", pa.int64())])
+        try:
+            table = pyarrow.json.read_json(
+                str(file),
+                read_options=pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
+                parse_options=pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
+            )
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise RejectedInputError("unreadable", "File is not JSON lines", where=str(path), got=str(error)) from error
+        return cls(table, path, [path])
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def row(self, episode_index: int) -> dict[str, Any]:
+        """One episode's row.
+
+        Raises: DataError when it is not listed; RejectedInputError (duplicate_id) when it is listed twice, since which row
+            is meant cannot be told.
+        """
+        for file in self._files:
+            note_file(file)
+        first, last = (int(np.searchsorted(self.indices, episode_index, side)) for side in ("left", "right"))
+        if first == last:
+            raise DataError(
+                "No such episode",
+                where=self._where,
+                expected=f"one of {len(self)} episodes, {self._range()}",
+                got=str(episode_index),
+            )
+        if last - first > 1:
+            raise RejectedInputError(
+                "duplicate_id",
+                "Episode is listed more than once",
+                where=self._where,
+                expected="one row per episode",
+                got=f"{last - first} rows of {INDEX} {episode_index}",
+            )
+        return self._table.slice(first, 1).to_pylist()[0]
+
+    def _range(self) -> str:
+        return f"{self.indices[0]}..{self.indices[-1]}" if len(self) else "none"
+
+
+def whole_number(row: dict[str, Any], key: str, where: object) -> int:
+    """A count or a position out of a row of metadata.
+
+    Raises: RejectedInputError: missing_column, or unreadable for what is no whole number from 0 on.
+    """
+    if key not in row:
+        raise RejectedInputError(
+            "missing_column", "Episode list lacks a column", where=str(where), expected=key, got=", ".join(row)
+        )
+    value = row[key]
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_INDEX:
+        raise RejectedInputError(
+            "unreadable",
+            "Episode list holds no usable number",
+            where=f"{where}, {key}",
+            expected="a whole number from 0 on",
+            got=repr(value),
+        )
+    return value
 
 
 class LeRobotDataset(ABC):

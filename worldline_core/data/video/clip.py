@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import av.error
@@ -19,8 +20,7 @@ from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import MAX_PIXELS, RejectedInputError, check_image_size, too_large
-from worldline_core.data.guards.source_paths import AnyPath, local_file
-from worldline_core.data.video.header import check_video_header, undecodable
+from worldline_core.data.guards.source_paths import AnyPath, local_file, regular_file
 
 _LUMA_FIRST = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21", "gray", "yuv440p", "yuvj440p")
@@ -103,6 +103,47 @@ class Picture:
     def damaged(self) -> bool:
         """Whether the decoder had to make up parts of it."""
         return bool(self._frame.is_corrupt)
+
+
+_QUICKTIME = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp")
+_MATROSKA = b"\x1aE\xdf\xa3"
+
+
+def check_video_header(path: AnyPath) -> Path:
+    """The file to open.
+
+    Raises: RejectedInputError: missing_file, special_file, truncated_video (empty), unreadable (no mp4, QuickTime, Matroska,
+        WebM or AVI file).
+    """
+    file = regular_file(path, "Video file")
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(12)
+    except OSError as error:
+        raise undecodable(path, error) from error
+    if not head:
+        raise undecodable(path, "0 bytes")
+    if not (head[4:8] in _QUICKTIME or head.startswith(_MATROSKA) or (head[:4] == b"RIFF" and head[8:] == b"AVI ")):
+        raise RejectedInputError(
+            "unreadable",
+            "File is no video container",
+            where=path,
+            expected="mp4, QuickTime, Matroska, WebM or AVI",
+            got=f"a file that begins with {head.hex()}",
+        )
+    return file
+
+
+def undecodable(path: AnyPath, got: object) -> RejectedInputError:
+    """The rejection of a video that breaks off."""
+    return RejectedInputError(
+        "truncated_video",
+        "Video cannot be decoded",
+        where=path,
+        expected="a complete video file",
+        got=got,
+        next_step="copy the file again; it may be truncated",
+    )
 
 
 @contextmanager

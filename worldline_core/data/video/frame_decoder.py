@@ -24,8 +24,15 @@ from av.video.stream import VideoStream
 
 from worldline_core.data.guards.rejection import RejectedInputError, check_image_size
 from worldline_core.data.guards.source_paths import AnyPath, local_file
-from worldline_core.data.video.clip import FRAME_TOLERANCE, VideoClip, open_video, seek_before, wrong_count
-from worldline_core.data.video.header import check_video_header, undecodable
+from worldline_core.data.video.clip import (
+    FRAME_TOLERANCE,
+    VideoClip,
+    check_video_header,
+    open_video,
+    seek_before,
+    undecodable,
+    wrong_count,
+)
 from worldline_core.errors import DataError, UnavailableError
 
 if TYPE_CHECKING:
