@@ -24,11 +24,9 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from worldline_core.config import load_config
-from worldline_core.model.contracts import CausalSpec
-from worldline_core.model.tokenizers import WanTokenizer, tokenizer_outline
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.tokenizers import VideoTokenizer, WanTokenizer, tokenizer_outline
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import CausalSpec, WorldModelConfig
 from worldline_core.pipeline.memory_estimate import ClipShape, Training, to_bfloat16
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.pipeline.size_sheet import PEAK_FLOPS, Machine, SizeSheet

@@ -37,7 +37,7 @@ from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
 from worldline_core.evaluation.policy.agreement import STATISTICS, policy_agreement
 from worldline_core.evaluation.recordings import Trajectory
-from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.model.tokenizers import resize_frame
 
 FRAMES = 32
 RESAMPLES = 2000

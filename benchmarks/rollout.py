@@ -19,12 +19,9 @@ from einops import rearrange
 
 from benchmarks.harness import command_line
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
-from worldline_core.model.patch_tokenizer import PatchTokenizer
-from worldline_core.model.tokenizers import load_tokenizer
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.tokenizers import PatchTokenizer, VideoTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, WorldModelConfig
 from worldline_core.rollout.samplers import BlockCausalSimulator, Noise, rollout_full_clip
 
 GRID = (8, 12)

@@ -16,7 +16,7 @@ import numpy as np
 from worldline_core import Camera, WorldLine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.encoder import encode_video
-from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.model.tokenizers import resize_frame
 from worldline_core.shipped import shipped_folder
 
 

@@ -22,8 +22,8 @@ import pytest
 from tools.runtime_shapes import check_shapes_of
 
 if TYPE_CHECKING:
-    from worldline_core.model.contracts import ActionContract, CausalSpec
     from worldline_core.model.world_model import WorldModel
+    from worldline_core.model.world_model_config import ActionContract, CausalSpec
 
 os.fsync = lambda descriptor: None  # no test cuts the power, and thousands of files would wait for the disk
 gc.disable()  # until all is imported: nothing of it is garbage
@@ -224,7 +224,7 @@ def make_contract() -> Callable[..., ActionContract]:
     """Action contracts of small models."""
 
     def make(**changes: object) -> ActionContract:
-        from worldline_core.model.contracts import ActionContract
+        from worldline_core.model.world_model_config import ActionContract
 
         values: dict[str, object] = {
             "controls": "action",
@@ -244,7 +244,7 @@ def make_spec() -> Callable[..., CausalSpec]:
     """Causal blocks of small models: two latent frames, a window of one and three blocks, the paper's nodes."""
 
     def make(**changes: object) -> CausalSpec:
-        from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
+        from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 
         values = {"block_size": 2, "sink_blocks": 1, "recent_blocks": 3, "sigmas": CAUSAL_SIGMAS}
         return CausalSpec.model_validate(values | changes)

@@ -18,12 +18,11 @@ from worldline_core.distillation.causal_objective import maps_of
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import teacher_trajectories
+from worldline_core.distillation.teacher_trajectories import TrajectoryBatch, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.errors import ConfigError
-from worldline_core.model.contracts import CAUSAL_SIGMAS
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.stage import VALIDATION_SEED
 from worldline_core.training.trainer import (

@@ -27,12 +27,11 @@ from tqdm import tqdm
 from worldline_core.actions.action_maps import latent_frame_indices, render_action_maps
 from worldline_core.actions.action_tracks import compute_tracks
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
-from worldline_core.actions.episode_tracks import collate_tracks
+from worldline_core.actions.episode_tracks import collate_tracks, native_vectors
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.distillation.auxiliary_losses import clip_robot_masks
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import KinematicsByName
-from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.world_model_config import VIEWS
 from worldline_core.recorder.record import Job, RecordConfig, open_recorder, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering

@@ -32,8 +32,8 @@ from worldline_core.evaluation.segmenters.coloured_things import named_things, o
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.evaluation.video.episode_measurement import MOVED_IOU
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import integrate, shifted_sigmas
 
 Facts = dict[str, object]

@@ -21,7 +21,7 @@ from tools.small_world_data import GRID, SHORT, VIEWS, Fact, Recorded
 from worldline_core.actions.action_maps import control_frames, stack_controls
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.errors import DataError
-from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.training.clip_sampler import Clip
 from worldline_core.training.relational import SimilarityMatrices, common_shape, similarity_matrices
 from worldline_core.training.train_tokenizer import to_video

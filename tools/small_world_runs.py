@@ -14,8 +14,7 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.errors import ConfigError
-from worldline_core.model.contracts import CAUSAL_SIGMAS
-from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, VIEWS, WorldModelConfig
 from worldline_core.training.training_config import OptimizerConfig, SavingConfig, SigmaSampling, TrainerConfig
 
 

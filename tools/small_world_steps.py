@@ -23,12 +23,18 @@ from tools.small_world_memory import Episodes, KnownSimilarities, Memory, maps_o
 from tools.small_world_runs import BaseSettings, MatchingSettings, Stage2Settings, Timed, TokenizerSettings, key_of
 from worldline_core.distillation.distill_config import CYCLE
 from worldline_core.errors import ConfigError
-from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint
-from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContract, TrainedClips
+from worldline_core.model.layers import new_action_branch
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TextConfig, WorldModelConfig
+from worldline_core.model.world_model_config import (
+    NATIVE_VECTORS,
+    TEMPORAL,
+    ActionContract,
+    TextConfig,
+    TrainedClips,
+    WorldModelConfig,
+)
 from worldline_core.store.artifact_files import read_json, read_json_lines
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.clip_loader import Batch

@@ -15,7 +15,7 @@ from tools.small_world_measures import Facts
 from tools.small_world_memory import recorded_files
 from tools.small_world_runs import TokenizerSettings
 from tools.small_world_steps import VIEW_SHARES, Step, trained
-from worldline_core.model.patch_tokenizer import PatchTokenizer, Refinement, fit_patch_tokenizer
+from worldline_core.model.tokenizers import PatchTokenizer, Refinement, fit_patch_tokenizer
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.train_tokenizer import (
     DecoderBatch,

@@ -50,7 +50,7 @@ from worldline_core.config import load_config
 from worldline_core.errors import ConfigError, StoppedError, WorldLineError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import read_checkpoint_info, save_checkpoint
-from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.model.world_model_config import TextConfig
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic

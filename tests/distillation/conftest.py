@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes import episode_index
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.contracts import CausalSpec
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.clip_source import clip_key
 
 VIEWS = ("head", "left_wrist", "right_wrist")

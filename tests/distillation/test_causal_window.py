@@ -11,8 +11,8 @@ import torch
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
+from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.distillation.trajectory_store import TrajectoryBatch
 from worldline_core.model.block_causal_attention import block_bounds
 from worldline_core.model.world_model import WorldModel
 

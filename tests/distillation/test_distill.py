@@ -14,19 +14,22 @@ from pydantic import ValidationError
 
 from tests.distillation.conftest import write_inputs  # pyright: ignore[reportMissingImports]
 from worldline_core.actions.episode_tracks import ActionTracks
-from worldline_core.distillation import trajectory_store
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import robot_masks, substep_sigmas
+from worldline_core.distillation.teacher_trajectories import (
+    TrajectoryStore,
+    robot_masks,
+    substep_sigmas,
+    write_trajectories,
+)
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.distillation.trajectory_store import TrajectoryStore, write_trajectories
 from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import TEMPORAL, TrainedClips
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import TEMPORAL, TrainedClips
 from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_file, folder_files
@@ -212,7 +215,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
         distill(settings, inputs, whole := tmp_path / "whole")
     kills = [
         (TeacherForcingObjective, "loss", 3),
-        (trajectory_store, "write_bytes_atomic", 2),
+        (teacher_trajectories, "write_bytes_atomic", 2),
         (TrajectoryObjective, "loss", 3),
         (DistributionMatchingObjective, "loss", 8),
     ]

@@ -23,7 +23,7 @@ from worldline_core.distillation.distill import distill
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerConfig
+from worldline_core.model.tokenizers import PatchTokenizer, PatchTokenizerConfig
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_source import FrameSource

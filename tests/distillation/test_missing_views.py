@@ -18,10 +18,9 @@ from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
 from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.model.checkpoint import read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import TrainedClips
-from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
+from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import TrainedClips, WorldModelConfig
 from worldline_core.training.clip_config import EncodeLatentsConfig
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.encode_latents import encode_latents

@@ -14,9 +14,7 @@ from worldline_core.distillation.distill import _perceptual
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.model.lpips import load_lpips
-from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerConfig
-from worldline_core.model.tokenizers import WanTokenizer
-from worldline_core.model.video_tokenizer import GroupDecoder
+from worldline_core.model.tokenizers import GroupDecoder, PatchTokenizer, PatchTokenizerConfig, WanTokenizer
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 
 ALEXNET = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}

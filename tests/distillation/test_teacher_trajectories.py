@@ -10,7 +10,7 @@ import torch
 from worldline_core.distillation.teacher_trajectories import euler_nodes, substep_sigmas, teacher_trajectories
 from worldline_core.distillation.trajectory_regression import node_of_each_block
 from worldline_core.errors import ConfigError
-from worldline_core.model.contracts import CAUSAL_SIGMAS as NODES
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 
 
 @pytest.mark.parametrize("substeps", [(1, 1, 1, 1), (2, 2, 3, 9)])

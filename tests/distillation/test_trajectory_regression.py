@@ -9,7 +9,7 @@ from worldline_core.distillation.causal_objective import block_sigmas, frame_sig
 from worldline_core.distillation.causal_teacher_forcing import teacher_forcing_loss
 from worldline_core.distillation.distill_config import AuxiliaryWeights, TrajectoryRegressionConfig
 from worldline_core.distillation.trajectory_regression import draw_nodes, trajectory_regression_loss
-from worldline_core.model.contracts import CAUSAL_SIGMAS as NODES
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS as NODES
 from worldline_core.training.training_config import LossWeighting, SigmaSampling
 
 

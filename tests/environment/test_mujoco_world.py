@@ -23,7 +23,7 @@ from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.model.tokenizers import resize_frame
 from worldline_core.recorder.banks import BankGrid
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies

@@ -16,9 +16,9 @@ from worldline_core.model.block_causal_attention import (
     TeacherForcingAttention,
     block_bounds,
 )
-from worldline_core.model.contracts import CausalSpec
-from worldline_core.model.rope import Rotation, rotate
+from worldline_core.model.layers import Rotation, rotate
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 
 BLOCK = 2
 FRAMES = 7

@@ -13,9 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import CheckpointError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import TEMPORAL, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import TEMPORAL, ActionContract, CausalSpec, WorldModelConfig
 
 CONTRACT = ActionContract.of_these_maps(
     controls="action",

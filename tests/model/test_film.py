@@ -11,9 +11,8 @@ import torch
 
 from worldline_core.errors import DataError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import NATIVE_VECTORS, ActionContract, CausalSpec, WorldModelConfig
 
 SIZE = 5
 Build = Callable[..., WorldModel]

@@ -11,10 +11,14 @@ import torch
 from torch import nn
 
 from worldline_core.errors import CheckpointError, ConfigError, DataError
-from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerConfig, fit_patch_tokenizer
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig
-from worldline_core.model.tokenizers import WanTokenizer
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.tokenizers import (
+    PatchTokenizer,
+    PatchTokenizerConfig,
+    VideoTokenizer,
+    WanTokenizer,
+    fit_patch_tokenizer,
+)
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training import train_tokenizer
 from worldline_core.training.clip_source import LoadedView

@@ -12,9 +12,18 @@ import pytest
 import torch
 
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.patch_tokenizer import PatchTokenizer, fit_patch_tokenizer
-from worldline_core.model.tokenizers import WAN22_MEAN, WAN22_STD, WanTokenizer, load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video, video_to_frames
+from worldline_core.model.tokenizers import (
+    WAN22_MEAN,
+    WAN22_STD,
+    PatchTokenizer,
+    VideoTokenizer,
+    WanTokenizer,
+    fit_patch_tokenizer,
+    frames_to_video,
+    load_tokenizer,
+    tokenizer_fingerprint,
+    video_to_frames,
+)
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.clip_source import LoadedView
 from worldline_core.training.train_tokenizer import decoder_batch, disturb, train_decoder

@@ -12,8 +12,13 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from worldline_core.errors import CheckpointError
-from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.weight_files import read_weights, write_weights
+from worldline_core.model.checkpoint import (
+    load_checkpoint,
+    read_checkpoint_info,
+    read_weights,
+    save_checkpoint,
+    write_weights,
+)
 from worldline_core.model.world_model import WorldModel
 
 INDEX = "model.safetensors.index.json"

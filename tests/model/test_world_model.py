@@ -10,7 +10,7 @@ import torch
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.block_causal_attention import KVCache
-from worldline_core.model.rope import video_positions, view_starts
+from worldline_core.model.layers import video_positions, view_starts
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import cosmos3_nano_config
 

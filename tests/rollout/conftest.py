@@ -13,12 +13,11 @@ import torch
 from worldline_core.actions.episode_tracks import EpisodeTracks, write_index, write_shard
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSetWriter
-from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.contracts import CAUSAL_SIGMAS, NATIVE_VECTORS, CausalSpec
-from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
+from worldline_core.model.layers import new_action_branch
+from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, NATIVE_VECTORS, CausalSpec, WorldModelConfig
 
 SIZE = (32, 48)
 SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)

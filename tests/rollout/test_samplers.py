@@ -10,8 +10,8 @@ import torch
 from pydantic import ValidationError
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelOutput
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.rollout.samplers import (
     FULL_STEPS,
     BlockCausalSimulator,

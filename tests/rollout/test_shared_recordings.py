@@ -26,9 +26,8 @@ from worldline_core.data.curation.curate_config import CurateConfig
 from worldline_core.data.episodes.episode import VIEWS, CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
 from worldline_core.model.checkpoint import save_checkpoint
-from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
-from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.tokenizers import fit_patch_tokenizer, frames_to_video
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.rollout.rollout_set import RolloutSet
 
 SIZE = (64, 96)

@@ -15,7 +15,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.rollout.robot import CommandedRobot, Response, fit_response
 from worldline_core.rollout.simulation import Simulation
 

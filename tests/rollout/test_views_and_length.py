@@ -21,8 +21,8 @@ from worldline_core.data.episodes.episode_index import read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import TrainedClips
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.tokenizers import frames_to_video
+from worldline_core.model.world_model_config import TrainedClips
 from worldline_core.rollout.predictions import plan_predictions
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig

@@ -16,7 +16,7 @@ from worldline_core.errors import CalibrationError, CheckpointError, ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet, RolloutSetWriter

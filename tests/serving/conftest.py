@@ -15,8 +15,8 @@ pytest.importorskip("uvicorn")
 
 from worldline_core import WorldLine
 from worldline_core.model.checkpoint import load_checkpoint
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.serving.app import make_server
 from worldline_core.serving.serve_config import ServeConfig
 

@@ -128,4 +128,4 @@ def test_everything_shows_its_progress_the_same_way(project_root: Path) -> None:
     own = [path for path in project_root.glob("worldline_core/**/*.py") if "tqdm" in path.read_text(encoding="utf-8")]
     assert [path.name for path in own] == ["progress.py"]
     using = [path for path in project_root.glob("worldline_core/**/*.py") if "core.progress import" in path.read_text()]
-    assert {path.stem for path in using} >= {"trainer", "rollout", "record", "banks", "trajectory_store", "mapping"}
+    assert {path.stem for path in using} >= {"trainer", "rollout", "record", "banks", "teacher_trajectories", "mapping"}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from beartype.roar import BeartypeCallHintViolation
 
-from worldline_core.model.rope import rotate
+from worldline_core.model.layers import rotate
 from worldline_core.training.flow_matching import first_frame, velocity_target
 
 LATENTS = torch.zeros(1, 1, 2, 3, 4, 5)

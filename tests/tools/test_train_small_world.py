@@ -31,7 +31,7 @@ from worldline_core.distillation.causal_objective import CausalObjective, maps_o
 from worldline_core.errors import ConfigError, DataError, StoppedError
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info
-from worldline_core.model.patch_tokenizer import PatchTokenizer
+from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.model.world_model import WorldModel
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.training.clip_loader import Batch

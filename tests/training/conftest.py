@@ -215,7 +215,7 @@ def killed_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], AbstractCon
 @pytest.fixture(scope="session")
 def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small tokenizer whose latents have the shape of the world's."""
-    from worldline_core.model.patch_tokenizer import PatchTokenizer, PatchTokenizerConfig
+    from worldline_core.model.tokenizers import PatchTokenizer, PatchTokenizerConfig
 
     generator = torch.Generator().manual_seed(5)
     model = PatchTokenizer(PatchTokenizerConfig(static_channels=3, motion_channels=1))

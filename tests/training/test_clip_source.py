@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ArtifactError, ConfigError, DataError, UnavailableError
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.training.clip_config import ClipSampling, EncodeLatentsConfig, FrameInput
 from worldline_core.training.clip_loader import ClipLoader
 from worldline_core.training.clip_sampler import Clip, ClipBatch, ClipSampler, latent_frame_count, longest_clip

@@ -18,10 +18,9 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
-from worldline_core.model.contracts import TrainedClips
-from worldline_core.model.patch_tokenizer import fit_patch_tokenizer
+from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import TrainedClips, WorldModelConfig
 from worldline_core.rollout.rollout import rollout
 from worldline_core.rollout.rollout_config import FullClipConfig, RolloutConfig
 from worldline_core.rollout.rollout_set import RolloutSet

@@ -11,8 +11,8 @@ from torch.testing._internal.distributed.fake_pg import FakeStore
 
 from worldline_core.distillation.causal_objective import self_forced_rollout
 from worldline_core.errors import ConfigError
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.processes import own_part, place_model
 from worldline_core.training.training_config import ShardingConfig
 from worldline_core.training.training_state import ExponentialAverage

@@ -13,8 +13,8 @@ import torch
 
 from worldline_core.errors import ArtifactError, CheckpointError, ConfigError, DataError
 from worldline_core.model.checkpoint import load_checkpoint, save_checkpoint
-from worldline_core.model.contracts import NATIVE_VECTORS, ActionContract, CausalSpec
 from worldline_core.model.world_model import WorldModel, WorldModelConfig
+from worldline_core.model.world_model_config import NATIVE_VECTORS, ActionContract, CausalSpec
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.training import stage as stage_module
 from worldline_core.training.clip_source import training_rows

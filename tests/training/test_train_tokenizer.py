@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from tasks.train_tokenizer import train_tokenizer as tokenizer_task
-from worldline_core.model.patch_tokenizer import PatchTokenizer
 from worldline_core.model.small_decoder import SmallDecoder
+from worldline_core.model.tokenizers import PatchTokenizer
 from worldline_core.rehearsal.outside_models import small_wan_autoencoder
 from worldline_core.training.train_tokenizer import train_tokenizer
 from worldline_core.training.training_config import TokenizerConfig

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from einops import repeat
 from jaxtyping import Bool, Float
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError, safe_open
@@ -346,3 +347,25 @@ def _read_description(path: Path) -> TracksDescription:
             got=str(error),
             next_step="run render_actions again",
         ) from error
+
+
+def native_vectors(
+    clips: Sequence[EpisodeTracks], views: Sequence[str], size: int
+) -> Float[Tensor, "b v {size} t 1 1"]:
+    """Control vectors of clips of equal length, padded with zeros to ``size`` and repeated for every view: action maps of
+    one cell, for models with FiLM.
+
+    Raises: DataError when a clip has no control vectors, or longer ones.
+    """
+    rows = []
+    for clip in clips:
+        if clip.native is None or clip.native.shape[1] > size:
+            raise DataError(
+                "The model is driven by control vectors that these tracks do not have",
+                where=f"episode {clip.episode_id}, embodiment {clip.embodiment}",
+                expected=f"up to {size} numbers a frame",
+                got=None if clip.native is None else clip.native.shape[1],
+                next_step="open the tracks with their episodes, or train with a larger native_size",
+            )
+        rows.append(np.pad(clip.native, ((0, 0), (0, size - clip.native.shape[1]))))
+    return repeat(torch.from_numpy(np.stack(rows)), "b t c -> b v c t 1 1", v=len(views))

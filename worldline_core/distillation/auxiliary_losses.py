@@ -29,7 +29,7 @@ from worldline_core.distillation.distill_config import AuxiliaryWeights
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.tensor_transforms import is_rigid, valid_intrinsics
 from worldline_core.model.lpips import LPIPS
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.tokenizers import VideoTokenizer
 
 
 class PerceptualLoss:

@@ -17,8 +17,8 @@ from torch import Tensor
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.errors import ConfigError
 from worldline_core.model.block_causal_attention import block_bounds
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import integrate
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import sample_sigmas

@@ -23,8 +23,8 @@ from worldline_core.distillation.causal_objective import (
     with_observed_frame,
 )
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.rollout.samplers import euler_step
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.clip_sampler import latent_frame_count

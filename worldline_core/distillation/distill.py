@@ -23,15 +23,15 @@ from worldline_core.distillation.causal_objective import CausalObjective
 from worldline_core.distillation.causal_teacher_forcing import TeacherForcingObjective
 from worldline_core.distillation.distill_config import DistillConfig
 from worldline_core.distillation.distribution_matching import DistributionMatchingObjective
-from worldline_core.distillation.teacher_trajectories import trajectory_shard
-from worldline_core.distillation.trajectory_regression import TrajectoryObjective
-from worldline_core.distillation.trajectory_store import (
+from worldline_core.distillation.teacher_trajectories import (
     INDEX,
     TrajectoryBatch,
     TrajectoryLoader,
     TrajectoryStore,
+    trajectory_shard,
     write_trajectories,
 )
+from worldline_core.distillation.trajectory_regression import TrajectoryObjective
 from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import (
     CHECKPOINT_DTYPE,
@@ -41,10 +41,10 @@ from worldline_core.model.checkpoint import (
     read_checkpoint_info,
     save_checkpoint,
 )
-from worldline_core.model.contracts import TrainedClips
 from worldline_core.model.lpips import load_lpips
 from worldline_core.model.tokenizers import WanTokenizer, load_tokenizer
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import TrainedClips
 from worldline_core.store.atomic import write_bytes_atomic
 from worldline_core.training.clip_config import ClipSampling, FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import StrictModel
-from worldline_core.model.contracts import CAUSAL_SIGMAS, CausalSpec
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec
 from worldline_core.training.clip_config import ClipInput, ClipSampling, LatentInput
 from worldline_core.training.training_config import LossWeighting, OptimizerConfig, SigmaSampling, TrainerConfig
 

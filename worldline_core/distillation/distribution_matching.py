@@ -29,9 +29,9 @@ from worldline_core.distillation.causal_objective import (
     with_observed_frame,
 )
 from worldline_core.distillation.distill_config import CYCLE, DistillConfig
-from worldline_core.distillation.trajectory_store import TrajectoryBatch
-from worldline_core.model.contracts import CausalSpec
+from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.clip_loader import Batch
 from worldline_core.training.flow_matching import add_noise, flow_matching_loss
 from worldline_core.training.trainer import step_generator

@@ -1,35 +1,52 @@
-"""Denoising trajectories of the frozen causal teacher (appendix, "Four-Step Trajectory Regression").
+"""Denoising trajectories of the frozen causal teacher (appendix, "Four-Step Trajectory Regression"): made once, read at random.
 
 For every block, explicit Euler integration from noise along the nodes of the sampler (the paper's: sigma = 1, 15/16,
 5/6, 5/8, 0), keeping the state at each of them. Between two nodes the ODE may take several sub-steps: with one sub-step
 everywhere the teacher is exactly its own few-step sampler, and only the terminal objective teaches anything; finer
 sub-steps make the nodes those of the teacher's many-step solution, which the student then reaches in few.
 
-Axes: b clips, k nodes, v views, c latent channels, t latent frames (nodes leave out the observed one), h w rows and
-columns.
+Clips and noise of a shard follow from the seed and its number, so a missing shard is remade with the same bytes. Layout:
+`shard-00000.safetensors` ... (`nodes`, half precision, axes n k v c u h w; `mask`, bytes, axes n v t h w; where clips are read
+as frames their `latents`, half precision, axes n v c t h w; the clips in the header) and `trajectories.json` (settings and the
+digest of every shard), written last.
+
+Axes: b clips (n in a shard), k nodes, v views, c latent channels, t latent frames, u = t - 1 without the observed one, h w rows
+and columns.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import ConfigDict, TypeAdapter
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from worldline_core.distillation.auxiliary_losses import clip_robot_masks
-from worldline_core.distillation.causal_objective import maps_of
+from worldline_core.distillation.causal_objective import maps_of, with_observed_frame
 from worldline_core.distillation.distill_config import DistillConfig
-from worldline_core.errors import ConfigError
+from worldline_core.errors import ArtifactError, ConfigError
 from worldline_core.model.block_causal_attention import block_bounds
-from worldline_core.model.contracts import CAUSAL_SHIFT, CausalSpec
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CAUSAL_SHIFT, CausalSpec
+from worldline_core.progress import Progress
 from worldline_core.rollout.samplers import VelocityField, integrate
+from worldline_core.store.artifact_files import digest_file, read_json
+from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_config import FrameInput
 from worldline_core.training.clip_loader import Batch, ClipLoader
-from worldline_core.training.clip_sampler import Clip
+from worldline_core.training.clip_sampler import Clip, ClipBatch
+from worldline_core.training.processes import BatchPlan, processes, wait_for_all
 from worldline_core.training.trainer import autocast, step_generator
 
 
@@ -155,3 +172,210 @@ def trajectory_shard(
     if isinstance(config.input, FrameInput):
         tensors["latents"] = batch.latents
     return batch.clips, tensors
+
+
+INDEX = "trajectories.json"
+
+MakeShard = Callable[[int], tuple[Sequence[Clip], Mapping[str, Tensor]]]
+"""Clips of a shard by its number, and their ``nodes`` (n k v c u h w), robot ``mask`` (n v t h w) and perhaps ``latents``
+(n v c t h w)."""
+
+
+def shard_path(folder: Path, number: int) -> Path:
+    """File of a shard."""
+    return folder / f"shard-{number:05d}.safetensors"
+
+
+def write_trajectories(folder: Path, shards: int, make: MakeShard, settings: dict[str, Any]) -> None:
+    """Make every shard that is not there yet, then the index. Processes of a run share the shards.
+
+    Args:
+        settings: everything that decides the content (teacher, seed, schedule), JSON values.
+
+    Raises:
+        ArtifactError: the folder holds trajectories made with other settings.
+    """
+    found = read_json(folder / "settings.json") or settings
+    if found != settings:
+        raise ArtifactError(
+            "The folder holds trajectories made with other settings",
+            where=folder,
+            expected=settings,
+            got=found,
+            next_step="remove the folder, or use another one",
+        )
+    rank, world_size = processes()
+    write_json_atomic(folder / "settings.json", settings)
+    mine = range(rank, shards, world_size)
+    with Progress("teacher trajectories", len(mine), "shard", shown=rank == 0) as progress:
+        for number in mine:
+            path = shard_path(folder, number)
+            if not path.is_file():
+                clips, tensors = make(number)
+                header = {"clips": json.dumps([asdict(clip) for clip in clips])}
+                content = {
+                    name: value.to("cpu", torch.uint8 if name == "mask" else torch.float16).contiguous()
+                    for name, value in tensors.items()
+                }
+                write_bytes_atomic(path, save(content, metadata=header))
+            progress.advance()
+    wait_for_all()
+    if rank > 0:
+        return
+    digests = [digest_file(shard_path(folder, number)) for number in range(shards)]
+    write_json_atomic(folder / INDEX, {"settings": settings, "shards": digests})
+
+
+class TrajectoryStore:
+    """Read access to finished trajectories."""
+
+    def __init__(self, folder: Path, clips: Sequence[tuple[int, int, Clip]]) -> None:
+        self.folder = folder
+        self._clips = list(clips)
+
+    @classmethod
+    def open(cls, folder: Path) -> TrajectoryStore:
+        """Open a finished folder.
+
+        Raises:
+            ArtifactError: it has no index, or a shard is missing or damaged.
+        """
+        if not (folder / INDEX).is_file():
+            raise ArtifactError("Not a folder of finished trajectories", where=folder, expected=INDEX)
+        shards = read_json(folder / INDEX).get("shards")
+        if not isinstance(shards, list) or not shards:
+            raise ArtifactError("The index lists no shards", where=folder / INDEX, got=type(shards).__name__)
+        found = [(number, _clips(shard_path(folder, number))) for number in range(len(shards))]
+        return cls(folder, [(number, row, clip) for number, clips in found for row, clip in enumerate(clips)])
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def clips(self, indices: Sequence[int]) -> tuple[Clip, ...]:
+        """The clips of some trajectories."""
+        return tuple(self._clips[index][2] for index in indices)
+
+    def nodes(self, indices: Sequence[int]) -> Float[Tensor, "b k v c u h w"]:
+        """The states of some trajectories, in single precision."""
+        return self._read("nodes", indices)
+
+    def masks(self, indices: Sequence[int]) -> Float[Tensor, "b v t h w"]:
+        """The robot masks of some trajectories."""
+        return self._read("mask", indices)
+
+    def latents(self, indices: Sequence[int]) -> Float[Tensor, "b v c t h w"]:
+        """The latents of some trajectories' clips, where they are kept, in single precision."""
+        return self._read("latents", indices)
+
+    def _read(self, name: str, indices: Sequence[int]) -> Tensor:
+        rows = []
+        for index in indices:
+            number, row, _ = self._clips[index]
+            path = shard_path(self.folder, number)
+            with safe_open(path, framework="pt") as shard:
+                if name not in shard.keys():  # noqa: SIM118  (no mapping)
+                    raise ArtifactError("A shard of trajectories lacks a tensor", where=path, expected=name)
+                rows.append(shard.get_slice(name)[row : row + 1])
+        values = torch.cat(rows).float()
+        if not bool(torch.isfinite(values).all()):
+            raise ArtifactError(f"A trajectory's {name} are not finite", where=self.folder, next_step="make them again")
+        return values
+
+
+_CLIPS = TypeAdapter(list[Clip], config=ConfigDict(strict=True))
+
+
+def _clips(path: Path) -> list[Clip]:
+    """The clips of a shard whose tensors are one row of half-precision nodes and one of byte masks for each.
+
+    Raises:
+        ArtifactError: it is missing, damaged, or of another form.
+    """
+    try:
+        with safe_open(path, framework="pt") as shard:
+            clips = _CLIPS.validate_json((shard.metadata() or {}).get("clips", ""))
+            forms = {name: shard.get_slice(name) for name in ("nodes", "mask")}
+            found = {name: (form.get_dtype(), form.get_shape()) for name, form in forms.items()}
+    except (OSError, SafetensorError, ValueError) as error:  # pydantic's ValidationError is a ValueError
+        raise ArtifactError("A shard of trajectories cannot be read", where=path, got=str(error)) from error
+    (nodes_type, nodes), (mask_type, mask) = found["nodes"], found["mask"]
+    fits = len(nodes) == 7 and len(mask) == 5 and nodes[0] == mask[0] == len(clips) and nodes[2] == mask[1]
+    if not fits or (nodes_type, mask_type) != ("F16", "U8"):
+        expected = f"F16 ({len(clips)}, k, v, c, u, h, w) and U8 ({len(clips)}, v, t, h, w)"
+        raise ArtifactError(
+            "Tensors of a shard of trajectories do not fit its clips", where=path, expected=expected, got=found
+        )
+    return clips
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryBatch(Batch):
+    """A batch with the teacher's trajectories of its clips.
+
+    Attributes:
+        history: what the teacher saw before each block, observed frame included.
+        mask: where the robot is.
+    """
+
+    nodes: Float[Tensor, "b k v c u h w"]
+    history: Float[Tensor, "b v c t h w"]
+    mask: Float[Tensor, "b v t h w"]
+
+
+class TrajectoryLoader:
+    """Draws trajectories at random; what a step sees depends on (seed, step) alone.
+
+    Args:
+        absent_views: optional views that a recording with some views lacks.
+        generated_history: whether the teacher saw its own clean blocks before each block (else the recorded ones).
+        kept_latents: whether the clips' latents are with the trajectories.
+    """
+
+    def __init__(
+        self,
+        store: TrajectoryStore,
+        loader: ClipLoader,
+        *,
+        batch_size: int,
+        seed: int,
+        plan: BatchPlan,
+        absent_views: Callable[[Sequence[str]], tuple[str, ...]],
+        generated_history: bool,
+        kept_latents: bool = False,
+    ) -> None:
+        self.store = store
+        self.loader = loader
+        self.batch_size = batch_size
+        self.seed = seed
+        self.plan = plan
+        self.generated_history = generated_history
+        self.kept_latents = kept_latents
+        # A batch has one shape, so its clips have one length and lack the same views: a group of such clips is drawn by its
+        # size, then clips within it.
+        kinds = [
+            (clip.num_frames, absent_views(loader.source.row(clip.episode_id).views))
+            for clip in store.clips(range(len(store)))
+        ]
+        self._kinds = sorted(set(kinds))
+        self._groups = [[row for row, kind in enumerate(kinds) if kind == wanted] for wanted in self._kinds]
+        self._shares = np.array([len(group) for group in self._groups]) / len(store)
+
+    def load(self, index: int) -> TrajectoryBatch:
+        """The batch of this process's micro-step `index`."""
+        index, part = self.plan.drawn(index)
+        random = np.random.Generator(np.random.Philox(key=[self.seed, index]))
+        number = int(random.choice(len(self._groups), p=self._shares))
+        group, (_, absent) = self._groups[number], self._kinds[number]
+        draws = random.integers(len(group), size=self.batch_size * self.plan.together)
+        rows = [group[int(draw)] for draw in draws[part * self.batch_size : (part + 1) * self.batch_size]]
+        clips = ClipBatch(self.store.clips(rows), None, absent)
+        if self.kept_latents:
+            batch = self.loader.conditioned(clips, self.store.latents(rows).to(self.loader.device))
+        else:
+            batch = self.loader.load(clips)
+        nodes = self.store.nodes(rows).to(self.loader.device)
+        history = batch.latents
+        if self.generated_history:
+            history = with_observed_frame(history[..., :1, :, :], nodes[:, -1])
+        mask = self.store.masks(rows).to(self.loader.device)
+        return TrajectoryBatch(**vars(batch), nodes=nodes, history=history, mask=mask)

@@ -19,9 +19,9 @@ from torch import Tensor
 from worldline_core.distillation.auxiliary_losses import PerceptualDistance, auxiliary_losses
 from worldline_core.distillation.causal_objective import CausalObjective, frame_sigmas, maps_of, with_observed_frame
 from worldline_core.distillation.distill_config import DistillConfig, TrajectoryRegressionConfig
-from worldline_core.distillation.trajectory_store import TrajectoryBatch
-from worldline_core.model.contracts import CausalSpec
+from worldline_core.distillation.teacher_trajectories import TrajectoryBatch
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import CausalSpec
 from worldline_core.training.flow_matching import broadcast_sigma
 
 

@@ -30,8 +30,7 @@ from worldline_core.evaluation.segmenters.segmenter import open_segmenter
 from worldline_core.geometry.embodiment import LIMIT_TOLERANCE_RAD, Embodiment
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.rollout.samplers import FULL_STEPS
-from worldline_core.rollout.session import Frames
-from worldline_core.rollout.simulation import Simulation
+from worldline_core.rollout.simulation import Frames, Simulation
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.shipped import shipped_folder
 

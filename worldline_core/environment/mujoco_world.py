@@ -25,7 +25,7 @@ from worldline_core.environment.episodes import checked_commands, robot_spaces
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.model.tokenizers import resize_frame
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.policies import RecordPoliciesConfig, camera_draws, draw_start
 from worldline_core.recorder.record import RecordConfig, open_recorder, plan_jobs

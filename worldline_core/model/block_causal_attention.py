@@ -16,8 +16,7 @@ from einops import rearrange
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.layers import grouped_attention
-from worldline_core.model.rope import Rotation, rotate
+from worldline_core.model.layers import Rotation, grouped_attention, rotate
 
 
 def block_bounds(latent_frames: int, block_size: int) -> list[tuple[int, int]]:

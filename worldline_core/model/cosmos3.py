@@ -12,10 +12,8 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from worldline_core.errors import CheckpointError, UnavailableError
-from worldline_core.model.action_branch import new_action_branch
-from worldline_core.model.checkpoint import check_fit, save_checkpoint
-from worldline_core.model.layers import is_text_parameter
-from worldline_core.model.weight_files import read_weights
+from worldline_core.model.checkpoint import check_fit, read_weights, save_checkpoint
+from worldline_core.model.layers import is_text_parameter, new_action_branch
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import ImportBackboneConfig, WorldModelConfig, cosmos3_nano_config
 from worldline_core.store.artifact_files import read_json

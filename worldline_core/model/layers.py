@@ -1,7 +1,10 @@
 """Layers of the mixture of transformers: an understanding half (text) beside a generation half (video).
 
-Also what stands at both ends: the sinusoidal time embedding, added to noisy tokens only, and the velocity that follows from
-what the head emits. Module names equal those of diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+Rotary positions with one height slot per view, attention, the action branch, and both ends of the network: the sinusoidal time
+embedding, added to noisy tokens only, and the velocity that follows from the output of the head. Module names equal those of
+diffusers' ``Cosmos3OmniTransformer``, so that its state dict loads directly.
+
+Axis order of a video sequence everywhere in this package: ``(t v h w)``.
 """
 
 from __future__ import annotations
@@ -26,8 +29,101 @@ from torch.utils.checkpoint import (
 )
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.rope import Rotation, rotate
 from worldline_core.model.world_model_config import WorldModelConfig
+
+Rotation = tuple[Tensor, Tensor]
+"""Cosines and sines of the rotation angles, each ``(..., n, head_dim)``, float32."""
+
+
+def view_starts(config: WorldModelConfig, views: Sequence[str]) -> list[float]:
+    """Height coordinate, in patch rows, at which each of ``views`` begins.
+
+    Raises:
+        ConfigError: a view has no slot in the config, or is named twice.
+    """
+    if not views or len(set(views)) != len(views) or any(view not in config.views for view in views):
+        raise ConfigError("Unknown or repeated view", expected=f"a choice of {list(config.views)}", got=list(views))
+    scale = 1.0
+    if config.view_offset_unit == "pixel":
+        scale = 1.0 / (config.spatial_compression * config.patch_size)
+    slots = dict(zip(config.views, config.view_offsets, strict=True))
+    return [slots[view] * scale for view in views]
+
+
+def video_positions(
+    config: WorldModelConfig,
+    frames: Tensor,
+    grid: tuple[int, int],
+    views: Sequence[str],
+    temporal_offset: float = 0.0,
+    fps: Float[Tensor, " b"] | None = None,
+) -> Float[Tensor, "3 *batch n"]:
+    """Coordinates of the video tokens, flattened in order ``(t v h w)``.
+
+    Args:
+        frames: index of each latent frame, ``(t,)``.
+        grid: patch rows and columns of one view.
+        views: names of the views, all sharing the temporal coordinates (docs/method.md section 3).
+        temporal_offset: added to the temporal axis (text length plus margin when there is text).
+        fps: frames per second of each clip, as it is shown (a stride lowers the rate): latent frame ``j`` stands at
+            ``j base_fps / fps``. None takes the config's; a model whose config has none counts latent frames.
+
+    Returns:
+        the coordinates of all clips, or with ``fps`` those of each clip, ``(3 b n)``.
+    """
+    rows, columns = grid
+    device = frames.device
+    time = frames.to(torch.float32)
+    if config.fps is not None:
+        rate = config.fps if fps is None else rearrange(fps.to(device, torch.float32), "b -> b 1")
+        time = time / rate * config.base_fps
+    time = time + temporal_offset
+    # Filled on the device: a GPU would wait for numbers that are copied to it.
+    starts = torch.stack([torch.full((), start, device=device) for start in view_starts(config, views)])
+    height = rearrange(starts, "v -> v 1") + torch.arange(rows, device=device, dtype=torch.float32)
+    width = torch.arange(columns, device=device, dtype=torch.float32)
+    shape = (*time.shape, len(views), rows, columns)
+    axes = (
+        rearrange(time, "... t -> ... t 1 1 1").expand(shape),
+        rearrange(height, "v h -> 1 v h 1").expand(shape),
+        rearrange(width, "w -> 1 1 1 w").expand(shape),
+    )
+    return rearrange(torch.stack(axes), "xyz ... t v h w -> xyz ... (t v h w)")
+
+
+def text_positions(lengths: Tensor, size: int) -> Float[Tensor, "3 b n"]:
+    """Coordinates of right-padded text tokens.
+
+    Cosmos3 counts text 0..n-1 on all axes and starts the video at ``n + margin``. In a batch the video start is shared
+    (``size + margin``), so shorter texts are moved on the temporal axis until they end where the longest ends: rotary
+    attention depends on differences only, so every sample sees the distances it would see alone.
+    """
+    index = torch.arange(size, device=lengths.device, dtype=torch.float32)
+    index = rearrange(index, "n -> 1 n").expand(len(lengths), size)
+    time = index + rearrange(size - lengths.to(torch.float32), "b -> b 1")
+    return torch.stack((time, index, index))
+
+
+def rotation(config: WorldModelConfig, positions: Float[Tensor, "3 *batch n"]) -> Rotation:
+    """Cosines and sines for ``positions``; frequency ``i`` belongs to axis ``i % 3`` within the sections, else to time."""
+    half = config.head_dim // 2
+    # Angles stay in float32 even under autocast: bfloat16 cannot tell consecutive integers apart beyond 256.
+    exponent = torch.arange(0, config.head_dim, 2, dtype=torch.float32, device=positions.device) / config.head_dim
+    frequencies = 1.0 / (config.rope_theta**exponent)
+    axis_of = torch.zeros(half, dtype=torch.long, device=positions.device)
+    for axis in (1, 2):
+        axis_of[axis : config.rope_sections[axis] * 3 : 3] = axis
+    chosen = positions.to(torch.float32)[axis_of]
+    angles = torch.movedim(chosen, 0, -1) * frequencies
+    angles = torch.cat((angles, angles), dim=-1)
+    return angles.cos(), angles.sin()
+
+
+def rotate(values: Float[Tensor, "*batch heads n d"], by: Rotation) -> Float[Tensor, "*batch heads n d"]:
+    """Rotate queries or keys; ``by`` broadcasts over batch and heads."""
+    cosine, sine = (part.to(values.dtype) for part in by)
+    first, second = values.chunk(2, dim=-1)
+    return values * cosine + torch.cat((-second, first), dim=-1) * sine
 
 
 class GenerationAttention(Protocol):
@@ -331,3 +427,67 @@ def preconditioned_velocity(emitted: Tensor, noisy: Tensor, sigma: Tensor, refer
     spread = (1 - sigma) ** 2 * std**2 + sigma**2
     mean = ((sigma - (1 - sigma) * std**2) * noisy - sigma * reference) / spread
     return mean - std * emitted * spread.rsqrt()
+
+
+class ActionEncoder(nn.Module):
+    """``Conv3D(9 -> 9, 1 x 3 x 3)`` added to its input, 2 x 2 patches, and a zero-initialised linear layer.
+
+    Because the last layer starts at zero, a model that gains this branch computes what it computed before. Maps of
+    several control frames (``map_channels``) pass the convolution one by one and meet in the linear layer.
+    """
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        self.frames, self.patch_size = config.action_frames, config.patch_size
+        self.conv = nn.Conv3d(config.action_channels, config.action_channels, (1, 3, 3), padding=(0, 1, 1))
+        self.proj = nn.Linear(config.map_channels * config.patch_size**2, config.hidden_size)
+        nn.init.zeros_(self.proj.weight)
+        nn.init.zeros_(self.proj.bias)
+
+    def forward(self, maps: Float[Tensor, "b v c t h w"]) -> Float[Tensor, "b n d"]:
+        """Residuals for the video tokens, in order ``(t v h w)``."""
+        flat = rearrange(maps, "b v (k c) t h w -> (b v k) c t h w", k=self.frames)
+        flat = flat + self.conv(flat)
+        patches = rearrange(
+            flat,
+            "(b v k) c t (h p) (w q) -> b (t v h w) (k p q c)",
+            v=maps.shape[1],
+            k=self.frames,
+            p=self.patch_size,
+            q=self.patch_size,
+        )
+        return self.proj(patches)
+
+
+FEATURES = 256
+"""Width of the features from which every layer takes its scale and shift."""
+
+
+class NativeActionFilm(nn.Module):
+    """``tokens (1 + scale) + shift`` before every layer, both linear in ``SiLU(linear(vector of the latent frame))``.
+
+    The last linear layers start at zero, so a model that gains this branch computes what it computed before.
+    """
+
+    def __init__(self, size: int, hidden_size: int, num_layers: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(size, FEATURES)
+        self.proj = nn.ModuleList([nn.Linear(FEATURES, 2 * hidden_size) for _ in range(num_layers)])
+        for parameter in self.proj.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(
+        self, tokens: Float[Tensor, "b n d"], vectors: Float[Tensor, "b v size t 1 1"], layer: int
+    ) -> Float[Tensor, "b n d"]:
+        """Tokens in order ``(t v h w)``, modulated for ``layer``; the vectors of all views are the same."""
+        features = F.silu(self.hidden(rearrange(vectors[:, 0], "b c t 1 1 -> b t c").to(self.hidden.weight.dtype)))
+        scale, shift = cast("Tensor", self.proj[layer](features)).to(tokens.dtype).chunk(2, dim=-1)
+        frames = rearrange(tokens, "b (t n) d -> b t n d", t=vectors.shape[3])
+        return rearrange(frames * (1 + scale[:, :, None]) + shift[:, :, None], "b t n d -> b (t n) d")
+
+
+def new_action_branch(config: WorldModelConfig) -> ActionEncoder | NativeActionFilm:
+    """The branch through which controls reach a model of this configuration; it starts without effect."""
+    if config.action_conditioning == "native_film":
+        return NativeActionFilm(config.action_channels, config.hidden_size, config.num_layers)
+    return ActionEncoder(config)

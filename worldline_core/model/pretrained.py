@@ -14,8 +14,13 @@ import torch
 
 from worldline_core.data.curation.source_table import read_source_table
 from worldline_core.errors import CheckpointError, ConfigError, UnavailableError
-from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint, save_checkpoint
-from worldline_core.model.weight_files import MAX_SHARD_BYTES
+from worldline_core.model.checkpoint import (
+    MAX_SHARD_BYTES,
+    CheckpointInfo,
+    CheckpointKind,
+    load_checkpoint,
+    save_checkpoint,
+)
 from worldline_core.model.world_model import WorldModel
 from worldline_core.store.artifact_files import read_manifest
 from worldline_core.store.atomic import write_bytes_atomic

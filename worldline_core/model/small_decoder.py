@@ -25,10 +25,8 @@ from torch import Tensor, nn
 
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError, ConfigError, DataError
-from worldline_core.model.checkpoint import described, fill, read_description
-from worldline_core.model.patch_tokenizer import Residual
-from worldline_core.model.video_tokenizer import VideoTokenizer, check_latents
-from worldline_core.model.weight_files import read_weights
+from worldline_core.model.checkpoint import described, fill, read_description, read_weights
+from worldline_core.model.tokenizers import Residual, VideoTokenizer, check_latents
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
 DESCRIPTION, WEIGHTS = "decoder.json", "decoder.safetensors"

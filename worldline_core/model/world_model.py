@@ -20,7 +20,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.action_branch import ActionEncoder, NativeActionFilm, new_action_branch
 from worldline_core.model.block_causal_attention import (
     CachedAttention,
     CachedBlock,
@@ -29,20 +28,25 @@ from worldline_core.model.block_causal_attention import (
     TeacherForcingAttention,
     block_bounds,
 )
-from worldline_core.model.contracts import CausalSpec
 from worldline_core.model.layers import (
+    ActionEncoder,
     GenerationAttention,
     MixtureLayer,
+    NativeActionFilm,
     RMSNorm,
+    Rotation,
     TextContext,
     TimeEmbedder,
     call_layer,
     check_shapes,
     is_text_parameter,
+    new_action_branch,
+    rotation,
+    text_positions,
     velocity_of,
+    video_positions,
 )
-from worldline_core.model.rope import Rotation, rotation, text_positions, video_positions
-from worldline_core.model.world_model_config import VIEWS, WorldModelConfig
+from worldline_core.model.world_model_config import VIEWS, CausalSpec, WorldModelConfig
 
 
 @dataclass(frozen=True)

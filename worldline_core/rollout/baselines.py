@@ -22,13 +22,12 @@ from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import load_checkpoint
 from worldline_core.model.small_decoder import SmallDecoder
 from worldline_core.model.text import ClipFacts, load_text_encoder
-from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import video_to_frames
+from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint, video_to_frames
 from worldline_core.model.world_model_config import TextConfig
 from worldline_core.rollout.predictions import Prediction
 from worldline_core.rollout.rollout_config import RolloutConfig, TextToVideoConfig
 from worldline_core.rollout.samplers import Noise, rollout_full_clip
-from worldline_core.rollout.session import Frames, encode_images
+from worldline_core.rollout.simulation import Frames, encode_images
 
 _COPIED_AT_ONCE = 64
 

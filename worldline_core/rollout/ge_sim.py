@@ -34,10 +34,10 @@ from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import DataError, UnavailableError
 from worldline_core.geometry.cameras import ImageTransform
 from worldline_core.http_exchange import IncompleteResponseError, UnreachableError, exchange
-from worldline_core.model.video_tokenizer import resize_frame
+from worldline_core.model.tokenizers import resize_frame
 from worldline_core.rollout.predictions import Prediction
 from worldline_core.rollout.rollout_config import GeSimConfig
-from worldline_core.rollout.session import Frames
+from worldline_core.rollout.simulation import Frames
 from worldline_core.untrusted_text import cut
 
 CHUNK = 25

@@ -19,7 +19,7 @@ from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_index import QuarantineRow, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.video_tokenizer import frames_to_video
+from worldline_core.model.tokenizers import frames_to_video
 from worldline_core.progress import Progress
 from worldline_core.rollout.baselines import FirstFrameCopy, TextToVideo
 from worldline_core.rollout.ge_sim import GeSim, RefusedPredictionError
@@ -33,7 +33,7 @@ from worldline_core.rollout.rollout_config import (
     TextToVideoConfig,
 )
 from worldline_core.rollout.rollout_set import RolloutSetWriter
-from worldline_core.rollout.session import Frames, encode_images
+from worldline_core.rollout.simulation import Frames, encode_images
 from worldline_core.rollout.speed import SPEED_FILE, device_name, long_rollout, timed
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.atomic import write_json_atomic

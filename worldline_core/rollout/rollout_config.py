@@ -12,8 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.config import ImageSize, StrictModel
 from worldline_core.data.episodes.episode import VIEWS
-from worldline_core.model.contracts import FULL_STEPS
-from worldline_core.model.world_model_config import TextConfig
+from worldline_core.model.world_model_config import FULL_STEPS, TextConfig
 
 Controls = Literal["true", "zero", "shuffled", "mirrored", "delayed"]
 """The episode's own controls, none, those of another episode, or its own changed in a known way

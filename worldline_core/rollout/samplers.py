@@ -13,9 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.errors import ConfigError, DataError
-from worldline_core.model.contracts import CAUSAL_SHIFT, FULL_STEPS, CausalSpec
 from worldline_core.model.world_model import TextContext, WorldModel
-from worldline_core.model.world_model_config import VIEWS
+from worldline_core.model.world_model_config import CAUSAL_SHIFT, FULL_STEPS, VIEWS, CausalSpec
 
 VelocityField = Callable[[Tensor, float], Tensor]
 """Velocity at (state, noise level)."""

@@ -13,21 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from worldline_core.actions.action_maps import render_action_maps, stack_controls
-from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks
+from worldline_core.actions.episode_tracks import EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import CheckpointError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.checkpoint import CheckpointInfo, CheckpointKind, load_checkpoint
 from worldline_core.model.pretrained import pretrained_folder
 from worldline_core.model.small_decoder import SmallDecoder
-from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, frames_to_video
+from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, load_tokenizer, tokenizer_fingerprint
 from worldline_core.model.world_model import WorldModel
 from worldline_core.rollout.observation import Camera, given_tracks, ordered_views
 from worldline_core.rollout.robot import Response
 from worldline_core.rollout.samplers import FULL_STEPS, BlockCausalSimulator, FullClipSampler, Noise, sigmas_causal
-from worldline_core.rollout.session import Frames, Session
-from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Simulation, Starts, Stepping
+from worldline_core.rollout.simulation import USUAL_CLIP_FRAMES, Frames, Session, Simulation, Starts, Stepping
 
 
 class WorldLine:

@@ -22,9 +22,8 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from worldline_core.actions.action_maps import control_frames, render_action_maps, stack_controls
 from worldline_core.actions.actions_config import WristProjection
-from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks
+from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks, collate_tracks, native_vectors
 from worldline_core.errors import ArtifactError, ConfigError, DataError, TrainingError, WorldLineError
-from worldline_core.model.action_branch import native_vectors
 from worldline_core.model.text import ClipFacts, TextEncoder
 from worldline_core.store.artifact_files import read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic

@@ -14,7 +14,7 @@ import numpy as np
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.errors import DataError
-from worldline_core.model.contracts import TrainedClips
+from worldline_core.model.world_model_config import TrainedClips
 from worldline_core.training.clip_config import JOINT, PRIMARY, ClipSampling
 from worldline_core.training.processes import ALONE, BatchPlan
 

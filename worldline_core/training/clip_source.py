@@ -29,8 +29,13 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.video.frame_decoder import FrameDecoder, open_decoder
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, resize_frame, resized_video
+from worldline_core.model.tokenizers import (
+    VideoTokenizer,
+    load_tokenizer,
+    resize_frame,
+    resized_video,
+    tokenizer_fingerprint,
+)
 from worldline_core.progress import with_progress
 from worldline_core.store.artifact_files import read_json, read_rows
 from worldline_core.training.clip_config import PRIMARY, ClipInput, ClipSampling, FrameInput

@@ -24,8 +24,7 @@ from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
 from worldline_core.data.video.frames import VideoFrames
 from worldline_core.errors import ArtifactError, ConfigError, DataError
-from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer, resized_video
+from worldline_core.model.tokenizers import VideoTokenizer, load_tokenizer, resized_video, tokenizer_fingerprint
 from worldline_core.scale.account import InputRow, check_account, write_account
 from worldline_core.scale.mapping import SerialMapper, ShardMapper, map_episodes, reading_input
 from worldline_core.store.atomic import atomic_path, write_json_atomic

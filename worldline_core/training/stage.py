@@ -15,8 +15,8 @@ import torch
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.model.checkpoint import CHECKPOINT_DTYPE, CheckpointInfo, save_checkpoint
-from worldline_core.model.contracts import ActionContract
 from worldline_core.model.world_model import WorldModel
+from worldline_core.model.world_model_config import ActionContract
 from worldline_core.training.clip_config import JOINT, ClipInput, ClipSampling, FrameInput, ReadingConfig
 from worldline_core.training.clip_loader import Batch, ClipLoader, SkippedClips
 from worldline_core.training.clip_sampler import ClipRow, ClipSampler

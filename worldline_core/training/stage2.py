@@ -12,11 +12,10 @@ from typing import Any
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import ConfigError
-from worldline_core.model.action_branch import new_action_branch
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
-from worldline_core.model.contracts import NATIVE_VECTORS, TEMPORAL, ActionContract
+from worldline_core.model.layers import new_action_branch
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import WorldModelConfig
+from worldline_core.model.world_model_config import NATIVE_VECTORS, TEMPORAL, ActionContract, WorldModelConfig
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities

@@ -20,10 +20,16 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.model.patch_tokenizer import DESCRIPTION, PatchTokenizer, Refinement, fit_patch_tokenizer
 from worldline_core.model.small_decoder import SmallDecoder, SmallDecoderConfig, windows
-from worldline_core.model.tokenizers import load_tokenizer, tokenizer_fingerprint
-from worldline_core.model.video_tokenizer import VideoTokenizer
+from worldline_core.model.tokenizers import (
+    DESCRIPTION,
+    PatchTokenizer,
+    Refinement,
+    VideoTokenizer,
+    fit_patch_tokenizer,
+    load_tokenizer,
+    tokenizer_fingerprint,
+)
 from worldline_core.store.atomic import write_json_atomic
 from worldline_core.training.clip_source import LoadedView, load_views
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train

@@ -22,8 +22,7 @@ from torch.nn import functional
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import CheckpointError, DataError, UnavailableError
-from worldline_core.model.checkpoint import described, fill, read_description
-from worldline_core.model.weight_files import read_weights
+from worldline_core.model.checkpoint import described, fill, read_description, read_weights
 from worldline_core.store.artifact_files import read_json
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.clip_source import LoadedView, load_views

@@ -25,7 +25,7 @@ from worldline_core.evaluation.planning.bracket import Selector, shown_video
 from worldline_core.evaluation.recordings import Trajectory, simulated_points
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.model.video_tokenizer import frames_to_video, video_to_frames
+from worldline_core.model.tokenizers import frames_to_video, video_to_frames
 from worldline_core.rollout.observation import Camera, image_size, project_controls
 from worldline_core.rollout.robot import CommandedRobot, Response
 from worldline_core.rollout.simulation import Simulation

@@ -30,8 +30,7 @@ from worldline_core.evaluation.evaluation_config import SegmenterConfig
 from worldline_core.evaluation.metrics import frames_to_unit, video_iou
 from worldline_core.evaluation.recordings import HEAD
 from worldline_core.geometry.cameras import ImageTransform
-from worldline_core.model.checkpoint import check_fit, fill
-from worldline_core.model.weight_files import read_weights
+from worldline_core.model.checkpoint import check_fit, fill, read_weights
 from worldline_core.store.artifact_files import read_json, read_json_lines
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 from worldline_core.training.trainer import Objective, ParameterGroup, step_generator, train
