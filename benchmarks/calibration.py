@@ -47,8 +47,7 @@ from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.filters.filter_config import FilterDoctorConfig
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import quaternion_xyzw_from_rotation
-from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
+from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz, quaternion_xyzw_from_rotation
 
 LAGS = (-4, -3, -2, -1, 1, 2, 3, 4)
 OFFSETS_M = (-0.1, -0.06, -0.03, 0.03, 0.06, 0.1, 0.15)

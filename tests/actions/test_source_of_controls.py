@@ -33,7 +33,7 @@ from worldline_core.data.sources.open import SourceConfig, open_source
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import euler_fixed_xyz_from_rotation, quaternion_xyzw_from_rotation
+from worldline_core.geometry.transforms import euler_fixed_xyz_from_rotation, quaternion_xyzw_from_rotation
 
 COMMANDED = {
     "episode_set", "lerobot_v21", "lerobot_v3", "agibot_world", "agibot_gesim_v2", "enerverse_ac_joints", "mcap",

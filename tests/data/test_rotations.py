@@ -18,18 +18,16 @@ from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWrite
 from worldline_core.data.episodes.recorded_poses import camera_pose, with_rigid_poses
 from worldline_core.data.guards.rejection import RejectedInputError
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.rotations import (
+from worldline_core.geometry.transforms import (
+    pose_from_euler_fixed_xyz,
+    pose_from_quaternion_wxyz,
+    pose_from_quaternion_xyzw,
     quaternion_wxyz_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
     rotation_deviation,
     rotation_from_euler_moving_xyz,
     rotation_from_quaternion_wxyz,
-)
-from worldline_core.geometry.transforms import (
-    pose_from_euler_fixed_xyz,
-    pose_from_quaternion_wxyz,
-    pose_from_quaternion_xyzw,
 )
 
 Make = Callable[..., tuple]

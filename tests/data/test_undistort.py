@@ -25,7 +25,7 @@ from worldline_core.data.mcap.exported import read_exported_episode, write_episo
 from worldline_core.data.mcap.file import McapFile
 from worldline_core.data.sources.agibot_gesim import AgibotGesimSourceConfig
 from worldline_core.data.sources.open import undistorted
-from worldline_core.geometry.distortion import Distortion
+from worldline_core.geometry.lens import Distortion
 
 Make = Callable[..., tuple]
 HEIGHT, WIDTH = 120, 160

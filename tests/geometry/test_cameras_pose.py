@@ -15,8 +15,13 @@ from scipy.spatial.transform import Rotation
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraPose, project_points
-from worldline_core.geometry.rotations import nearest_rotation, rotation_deviation
-from worldline_core.geometry.transforms import MAX_ROTATION_DEVIATION, mean_pose, repair_rotations
+from worldline_core.geometry.transforms import (
+    MAX_ROTATION_DEVIATION,
+    mean_pose,
+    nearest_rotation,
+    repair_rotations,
+    rotation_deviation,
+)
 
 K = np.array([[322.0, 0.0, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
 

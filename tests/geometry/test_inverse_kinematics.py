@@ -10,7 +10,7 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.embodiment_check import random_states
 from worldline_core.geometry.inverse_kinematics import InverseKinematics
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import rotation_about_axis, rotation_angle
+from worldline_core.geometry.transforms import rotation_about_axis, rotation_angle
 
 ROBOTS = ("ur5e_pair", "xarm7_pair", "aloha_viperx", "panda_pair", "yam_station", "agibot_g1", "kinova_gen3")
 _built: dict[str, InverseKinematics] = {}

@@ -15,8 +15,8 @@ from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.embodiment_check import random_states
 from worldline_core.geometry.kinematic_tree import read_mjcf
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import rotation_angle
 from worldline_core.geometry.tensor_transforms import is_rigid
+from worldline_core.geometry.transforms import rotation_angle
 
 # Everything that decides a pose: each way to write an orientation, joints off the body's origin, two joints on a
 # body, a slide, defaults by class and childclass, a site, an unnormalised axis and quaternion.

@@ -13,10 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from worldline_core.actions.tool_projection import project_tools
 from worldline_core.geometry.cameras import project_points
-from worldline_core.geometry.rotations import (
+from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
+from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
+    pose_from_quaternion_wxyz,
     quaternion_wxyz_from_rotation,
     quaternion_xyzw_from_rotation,
+    rigid_inverse,
     rotation_about_axis,
     rotation_angle_deg,
     rotation_from_euler_fixed_xyz,
@@ -25,8 +28,6 @@ from worldline_core.geometry.rotations import (
     rotation_from_quaternion_xyzw,
     rotation_from_rot6d,
 )
-from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
-from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, rigid_inverse
 
 K = np.array([[322.0, 0.5, 318.2], [0.0, 430.0, 241.7], [0.0, 0.0, 1.0]])
 steady = settings(derandomize=True, deadline=None)

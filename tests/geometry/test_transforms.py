@@ -11,9 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.rotations import rotation_angle, rotation_from_quaternion_wxyz, rotation_from_rot6d
 from worldline_core.geometry.tensor_transforms import invert, is_rigid, rot6d_from_rotation, transform_points
-from worldline_core.geometry.transforms import lengths, pose_from_quaternion_wxyz, repair_rotations
+from worldline_core.geometry.transforms import (
+    lengths,
+    pose_from_quaternion_wxyz,
+    repair_rotations,
+    rotation_angle,
+    rotation_from_quaternion_wxyz,
+    rotation_from_rot6d,
+)
 
 steady = settings(derandomize=True, deadline=None)
 unit = st.floats(-1.0, 1.0, allow_nan=False)

@@ -23,13 +23,13 @@ from worldline_core.data.episodes.conventions import (
     turned,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
-from worldline_core.geometry.rotations import (
+from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
     quaternion_wxyz_from_rotation,
+    rigid_inverse,
     rotation_from_euler_fixed_xyz,
     rotation_from_quaternion_xyzw,
 )
-from worldline_core.geometry.transforms import rigid_inverse
 
 
 def corrupt(episode: Episode, conventions: RecordedConventions) -> Episode:

@@ -24,8 +24,8 @@ from worldline_core.actions.tool_projection import Projection, TrackCounts, coun
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import rotation_angle_deg
 from worldline_core.geometry.tensor_transforms import invert, is_rigid
+from worldline_core.geometry.transforms import rotation_angle_deg
 
 Controls = Literal["action", "state"]
 Fallback = Literal["recorded", "first_frame_mount"]

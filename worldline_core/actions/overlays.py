@@ -29,7 +29,7 @@ from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import project_capsules
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
-from worldline_core.geometry.rotations import rotation_from_rot6d
+from worldline_core.geometry.transforms import rotation_from_rot6d
 from worldline_core.pictures import Picture, scale_frames, scaled_size
 
 Colour = tuple[int, int, int]

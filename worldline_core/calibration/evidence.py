@@ -28,8 +28,7 @@ from worldline_core.calibration.observation import (
 )
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.geometry.cameras import MIN_DEPTH_M, inside_image, project_points
-from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse
+from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse, rotation_angle_deg
 
 
 class Typical(NamedTuple):

@@ -18,8 +18,7 @@ from worldline_core.data.episodes.conventions import RecordedConventions, apply_
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.geometry.rotations import rotation_angle_deg
-from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse
+from worldline_core.geometry.transforms import hand_eye_residual, lengths, rigid_inverse, rotation_angle_deg
 
 GRAY_WIDTH = 96
 CELL_PX = 4

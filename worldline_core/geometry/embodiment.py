@@ -1,7 +1,8 @@
 """What a robot is made of, as far as this project needs: arms, joint order, tools, grippers, wrist cameras.
 
-One YAML file per embodiment in `configs/embodiments/`; the kinematic description lies beside it, in a Python package,
-or with the user (`description`). `observation.state` and `action` hold, for each arm in order, its joint positions,
+One YAML file per embodiment in `configs/embodiments/`. Its kinematic description (an MJCF or URDF file) is looked for in
+this order: a path given by the caller, the environment variable `WORLDLINE_DESCRIPTION_<NAME>`, a file of an installed
+Python package (`package`), a file beside the YAML. `observation.state` and `action` hold, for each arm in order, its joint positions,
 then its gripper.
 """
 
@@ -9,18 +10,22 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 from collections.abc import Mapping
-from pathlib import Path
+from importlib import metadata
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
+from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from pydantic import Field, model_validator
 
 from worldline_core.config import CONFIG_ROOT, StrictModel, read_yaml, validate
 from worldline_core.errors import ConfigError, DataError, UnavailableError
-from worldline_core.geometry.description import Description, RigidOffset, description_variable, locate_description
-from worldline_core.geometry.rotations import rotation_deviation
+from worldline_core.geometry.transforms import pose_from_quaternion_wxyz, rotation_deviation
 
+QUATERNION_TOLERANCE = 1e-3
+"""Largest deviation of a quaternion's length from 1 that is taken for rounding and normalised away."""
 EMBODIMENT_ROOT = CONFIG_ROOT / "embodiments"
 MAX_DESCRIPTION_BYTES = 16 << 20
 LIMIT_TOLERANCE_RAD = 0.02
@@ -29,6 +34,73 @@ LIMIT_TOLERANCE_RAD = 0.02
 Bound = Annotated[float, Field(allow_inf_nan=True)]
 Speed = Annotated[float, Field(gt=0)]
 Limits = Annotated[tuple[Bound, Bound], Field(description="lower, upper; -.inf and .inf where there is none")]
+
+
+class RigidOffset(StrictModel):
+    """A fixed transform by translation [m] and quaternion (wxyz); a length within 1e-3 of 1 is normalised."""
+
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _proper(self) -> RigidOffset:
+        if not all(math.isfinite(value) for value in (*self.translation, *self.rotation_wxyz)):
+            raise ValueError("translation and rotation_wxyz must be finite numbers")
+        norm = float(np.linalg.norm(self.rotation_wxyz))
+        if norm == 0.0:
+            raise ValueError("rotation_wxyz is the zero quaternion, which is no rotation (no rotation: 1 0 0 0)")
+        if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+            raise ValueError(f"rotation_wxyz has length {norm:.6f}, expected 1")
+        return self
+
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64."""
+        return pose_from_quaternion_wxyz(np.array(self.translation), np.array(self.rotation_wxyz))
+
+
+class Description(StrictModel):
+    """The kinematic description.
+
+    Attributes:
+        file: path beside the YAML; with `package`, path as in the wheel, package folder first
+            (`robosuite/models/assets/...`).
+        package: distribution on PyPI that carries the file.
+        version: versions of the distribution for which the embodiment was written, for example `>=0.2,<0.3`.
+        obtain: how to get the file, in words. With `package` this is `pip install` unless given.
+        source: where the file comes from, with version and licence.
+        mounts: the description is one arm and is placed once per entry, `T_world_root` each; its links and joints
+            bear the entry's name, a slash, and their own name (`left/joint1`), under a common link `world`.
+    """
+
+    format: Literal["mjcf", "urdf"]
+    file: str = Field(min_length=1)
+    package: str | None = None
+    version: str | None = None
+    obtain: str | None = None
+    source: str | None = None
+    mounts: dict[str, RigidOffset] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Description:
+        if self.version is not None and self.package is None:
+            raise ValueError("version says which versions of package fit, and there is no package")
+        if self.package is not None:
+            path = PurePosixPath(self.file)
+            if path.is_absolute() or ".." in path.parts or len(path.parts) < 2:
+                raise ValueError(f"file {self.file!r} is not a path inside the package {self.package}")
+        if self.version is not None:
+            try:
+                SpecifierSet(self.version)
+            except InvalidSpecifier as error:
+                raise ValueError(f"version {self.version!r} is no version specifier like '>=0.2,<0.3'") from error
+        return self
+
+    @property
+    def how_to_get(self) -> str | None:
+        """What a user without the file can do."""
+        if self.obtain is None and self.package is not None:
+            return f"pip install '{self.package}{self.version or ''}'"
+        return self.obtain
 
 
 class FingerJoint(StrictModel):
@@ -275,6 +347,62 @@ def load_embodiment(name_or_path: str | Path, description_path: Path | str | Non
     embodiment = validate(Embodiment, {**values, "description_path": path.parent}, where=path)
     located = locate_description(embodiment.name, embodiment.description, path.parent, description_path)
     return embodiment.model_copy(update={"description_path": located})
+
+
+def description_variable(name: str) -> str:
+    """Environment variable that says where the kinematic description of an embodiment is."""
+    return f"WORLDLINE_DESCRIPTION_{name.upper()}"
+
+
+def locate_description(name: str, description: Description, folder: Path, override: Path | str | None) -> Path:
+    """Where the description of an embodiment is, or would be; nothing is opened.
+
+    Args:
+        folder: of the embodiment's YAML.
+        override: a path that goes before everything else.
+    """
+    chosen = override or os.environ.get(description_variable(name))
+    if chosen:
+        return Path(chosen)
+    if description.package is not None:
+        return _in_package(description, description.package) or Path(description.package) / description.file
+    return folder / description.file
+
+
+def _in_package(description: Description, package: str) -> Path | None:
+    """The file of an installed distribution, or None where the distribution is not installed.
+
+    Raises:
+        ConfigError: the distribution has no such file, or the file lies outside of its package folder.
+        UnavailableError: another version than `version` is installed.
+    """
+    try:
+        distribution = metadata.distribution(package)
+    except metadata.PackageNotFoundError:
+        return None
+    if description.version is not None and not SpecifierSet(description.version).contains(
+        distribution.version, prereleases=True
+    ):
+        raise UnavailableError(
+            "The installed package that carries the kinematic description has another version",
+            where=package,
+            expected=description.version,
+            got=distribution.version,
+            next_step=f"pip install '{package}{description.version}'",
+        )
+    top = PurePosixPath(description.file).parts[0]
+    root = Path(str(distribution.locate_file(top))).resolve()
+    path = Path(str(distribution.locate_file(description.file)))
+    if not path.resolve().is_relative_to(root):
+        raise ConfigError("The kinematic description lies outside of its package", where=root, got=path.resolve())
+    if not path.is_file():
+        raise ConfigError(
+            "The installed package has no such kinematic description",
+            where=f"{package} {distribution.version}",
+            expected=description.file,
+            next_step="check description.file and description.version of the embodiment",
+        )
+    return path
 
 
 def how_to_get(embodiment: Embodiment) -> str:

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import ConfigError, UnavailableError, installing
-from worldline_core.geometry.description import RigidOffset
-from worldline_core.geometry.embodiment import Embodiment, read_description
+from worldline_core.geometry.embodiment import Embodiment, RigidOffset, read_description
 from worldline_core.geometry.kinematic_tree import TreeBody, parse_xml
-from worldline_core.geometry.rotations import rotation_angle
+from worldline_core.geometry.transforms import rotation_angle
 
 POSITION_TOLERANCE_M = 1e-5
 ROTATION_TOLERANCE_RAD = 1e-5

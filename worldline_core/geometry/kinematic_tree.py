@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.geometry.rotations import rotation_about_axis, rotation_from_euler_fixed_xyz
+from worldline_core.geometry.transforms import rotation_about_axis, rotation_from_euler_fixed_xyz
 
 _UNDECLARED_PREFIX = re.compile(r"</?([A-Za-z_][\w.-]*):|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=")
 MAX_BODIES, MAX_DEPTH = 5_000, 200

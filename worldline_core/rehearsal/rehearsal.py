@@ -18,7 +18,7 @@ from worldline_core.config import load_config
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.episodes.episode_set_writer import EpisodeSetWriter
-from worldline_core.geometry.rotations import nearest_rotation
+from worldline_core.geometry.transforms import nearest_rotation
 from worldline_core.pipeline.ablations import choose_variants, variant_config
 from worldline_core.pipeline.pipeline_config import PipelineConfig
 from worldline_core.rehearsal.outside_models import write_outside_models

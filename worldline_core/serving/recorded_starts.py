@@ -18,7 +18,7 @@ from worldline_core.data.video.frames import Frames
 from worldline_core.errors import DataError
 from worldline_core.exports.export import export
 from worldline_core.geometry.kinematics import ArmKinematics, KinematicsByName
-from worldline_core.geometry.rotations import nearest_rotation
+from worldline_core.geometry.transforms import nearest_rotation
 from worldline_core.rollout.observation import Camera, project_controls
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.rollout.worldline import WorldLine

@@ -17,13 +17,13 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
-from worldline_core.geometry.rotations import (
+from worldline_core.geometry.transforms import (
     quaternion_xyzw_from_rotation,
     reread_as_moving,
     reread_as_wxyz,
+    rigid_inverse,
     rotation_from_quaternion_xyzw,
 )
-from worldline_core.geometry.transforms import rigid_inverse
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -17,9 +17,14 @@ from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
 from worldline_core.geometry.cameras import CameraAxes, CameraPose
-from worldline_core.geometry.distortion import Distortion
-from worldline_core.geometry.rotations import rotation_deviation, rotation_from_quaternion_xyzw
-from worldline_core.geometry.transforms import MAX_ROTATION_DEVIATION, RotationRepair, repair_rotations
+from worldline_core.geometry.lens import Distortion
+from worldline_core.geometry.transforms import (
+    MAX_ROTATION_DEVIATION,
+    RotationRepair,
+    repair_rotations,
+    rotation_deviation,
+    rotation_from_quaternion_xyzw,
+)
 
 Extrinsics = Literal["camera_to_base", "base_to_camera"]
 REPAIRED = "rotations_repaired"

@@ -20,8 +20,8 @@ from worldline_core.data.video.clip import VideoClip, read_clip
 from worldline_core.data.video.frames import MadeFrames
 from worldline_core.errors import CalibrationError, ConfigError
 from worldline_core.geometry.cameras import Fit
-from worldline_core.geometry.distortion import Distortion, DistortionModel
 from worldline_core.geometry.embodiment import check_embodiment_name
+from worldline_core.geometry.lens import Distortion, DistortionModel
 
 Masks = np.ndarray | MadeFrames
 EVALUATION_LAYOUTS = ("droid annotation", "robotwin")

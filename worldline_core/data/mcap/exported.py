@@ -39,8 +39,7 @@ from worldline_core.data.mcap.messages import IMAGE_KINDS, Kind, Transform
 from worldline_core.data.mcap.resampling import add_camera
 from worldline_core.data.video.frames import Frames, MadeFrames, in_step
 from worldline_core.errors import DataError
-from worldline_core.geometry.rotations import quaternion_wxyz_from_rotation
-from worldline_core.geometry.transforms import pose_from_quaternion_xyzw
+from worldline_core.geometry.transforms import pose_from_quaternion_xyzw, quaternion_wxyz_from_rotation
 from worldline_core.store.atomic import atomic_path
 
 Encoding = Literal["protobuf", "ros2"]

@@ -21,7 +21,7 @@ from worldline_core.data.mcap.file import Stream
 from worldline_core.data.mcap.messages import Calibration, Transform
 from worldline_core.data.mcap.topics_config import McapTopicsSourceConfig
 from worldline_core.geometry.cameras import ImageTransform
-from worldline_core.geometry.distortion import distortion_from_ros
+from worldline_core.geometry.lens import distortion_from_ros
 from worldline_core.geometry.transforms import pose_from_rotation, rigid_inverse
 
 MAX_DISORDER_S = 1.0
@@ -368,7 +368,7 @@ def add_camera(
     K, size = _intrinsics(calibration, rectified=rectified, where=where)
     pose = camera_pose(view, poses, where=where)
     with rejected_as("invalid_distortion", where):
-        lens = None if rectified else distortion_from_ros(calibration.model, calibration.D, None)
+        lens = None if rectified else distortion_from_ros(calibration.model, calibration.D)
     cameras.add(view, K, pose, size, lens)
 
 

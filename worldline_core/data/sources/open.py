@@ -186,7 +186,7 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
     """
     if not loaded.distortions:
         return loaded
-    from worldline_core.geometry.undistortion import Undistortion, undistortion
+    from worldline_core.geometry.lens import Undistortion, undistortion
 
     where = f"episode {loaded.episode.episode_id}"
     cameras = dict(loaded.episode.cameras)
@@ -204,7 +204,7 @@ def undistorted(loaded: LoadedEpisode) -> LoadedEpisode:
         check_intrinsics(camera, f"{where}, view {view}")
         evidence = {"view": view, "model": distortion.model, "coefficients": list(distortion.coefficients)}
         with rejected_as("invalid_distortion", f"{where}, view {view}", evidence):
-            lenses[view] = undistortion(distortion, camera.K, (camera.height, camera.width), None)
+            lenses[view] = undistortion(distortion, camera.K, (camera.height, camera.width))
         cameras[view] = replace(camera, K=lenses[view].K)
 
     def straightened(image: np.ndarray, view: str) -> np.ndarray:
