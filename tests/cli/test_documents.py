@@ -74,7 +74,8 @@ def test_documented_commands_exist(page: str) -> None:
         if program == "worldline":
             check_words(build_parser(), words)
         elif words[0].startswith(("tasks.", "tools.", "benchmarks.", "flows.", "examples/", "benchmarks/", "tools/")):
-            script = ROOT / (words[0] if words[0].endswith(".py") else words[0].replace(".", "/") + ".py")
+            place = ROOT / (words[0] if words[0].endswith(".py") else words[0].replace(".", "/"))
+            script = place / "__main__.py" if place.is_dir() else place.with_suffix(".py")
             assert script.is_file() or words[0] == "tasks.X", f"no {script}"
             if words[0].startswith("tasks."):
                 parser = argparse.ArgumentParser()
