@@ -33,7 +33,7 @@ from worldline_core.actions.robot_masks import kinematic_robot_masks, robot_caps
 from worldline_core.actions.tool_projection import project_tools
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.geometry.embodiment import Embodiment, load_embodiment
-from worldline_core.geometry.embodiment_check import random_states
+from worldline_core.geometry.embodiment_report import random_states
 from worldline_core.geometry.kinematic_tree import TreeBody
 from worldline_core.geometry.kinematics import ArmKinematics
 

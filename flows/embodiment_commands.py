@@ -31,7 +31,7 @@ def add_embodiment_commands(commands: argparse._SubParsersAction[argparse.Argume
 
 
 def _embodiment_list(arguments: argparse.Namespace) -> None:
-    from worldline_core.geometry.embodiment_listing import format_list, list_embodiments
+    from worldline_core.geometry.embodiment_report import format_list, list_embodiments
 
     rows = list_embodiments()
     if arguments.json:
@@ -44,21 +44,21 @@ def _embodiment_list(arguments: argparse.Namespace) -> None:
 
 def _embodiment_show(arguments: argparse.Namespace) -> None:
     from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_listing import describe_embodiment
+    from worldline_core.geometry.embodiment_report import describe_embodiment
 
     print(describe_embodiment(load_embodiment(arguments.name, arguments.description)))
 
 
 def _embodiment_check(arguments: argparse.Namespace) -> None:
     from worldline_core.geometry.embodiment import load_embodiment
-    from worldline_core.geometry.embodiment_check import check_as_json, check_embodiment, format_check
+    from worldline_core.geometry.embodiment_report import check_embodiment, format_check
 
     check = check_embodiment(load_embodiment(arguments.name, arguments.description), arguments.samples, arguments.seed)
     if arguments.json:
         import json
 
-        print(json.dumps(check_as_json(check), indent=1))
+        print(json.dumps(check, indent=1))
     else:
         print(format_check(check))
-    if not check.passed:
+    if not check["passed"]:
         raise SystemExit(1)

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.geometry.embodiment_check import bare_mjcf, bare_urdf
+from worldline_core.geometry.embodiment_report import bare_mjcf, bare_urdf
 from worldline_core.geometry.kinematic_tree import parse_xml
 from worldline_core.store.atomic import write_bytes_atomic
 

@@ -180,7 +180,7 @@ def test_missing_view_is_zero_and_has_no_samples(kinematics, episode):
     assert counts["samples"] == 2 * 2 * tracks.num_frames
 
 
-def test_gripper_overshoot_is_clipped_and_counted_by_arm(kinematics, episode):
+def test_gripper_overshoot_is_clipped_and_counted(kinematics, episode):
     action = episode.action.copy()
     action[:, 3], action[:, 7] = 0.5, 1.0
     action[1, 3], action[4, 3], action[6, 7] = 1.25, -0.5, 1.0625
@@ -189,13 +189,9 @@ def test_gripper_overshoot_is_clipped_and_counted_by_arm(kinematics, episode):
     assert tracks.gripper[6, 0, 1] == 1.0
     assert tracks.gripper[0, 0].tolist() == [0.5, 1.0]
     assert counts["gripper_clipped"] == 3
-    assert counts["gripper_overshoot"] == {
-        "left": {"clipped": 2, "largest": 0.5},
-        "right": {"clipped": 1, "largest": 0.0625},
-    }
 
 
-def test_counts_of_episodes_add_and_the_largest_overshoot_stays(kinematics, episode):
+def test_counts_of_episodes_add(kinematics, episode):
     action = episode.action.copy()
     action[:, 3] = 3.0
     first = compute_tracks(episode, kinematics)[1]
@@ -204,15 +200,6 @@ def test_counts_of_episodes_add_and_the_largest_overshoot_stays(kinematics, epis
     for name in ("samples", "gripper_clipped", "outside_joint_limits", *COUNTED):
         assert total[name] == first[name] + second[name]
     assert total["episodes"] == 2
-    assert total["gripper_overshoot"]["left"] == {
-        "clipped": first["gripper_overshoot"]["left"]["clipped"] + len(action),
-        "largest": 2.0,
-    }
-    assert (
-        total["gripper_overshoot"]["right"]["largest"]
-        == first["gripper_overshoot"]["right"]["largest"]
-        == pytest.approx(0.3)
-    )
 
 
 def test_masked_samples_of_an_episode_are_counted_by_cause(kinematics, episode):

@@ -97,7 +97,6 @@ def test_every_episode_is_kept_or_quarantined(rendered):
     assert sum(samples[cause] for cause in causes) == samples["samples"] == N * (2 * 6 + 2)
     assert samples["valid"] > 0
     assert samples["episodes"] == 3
-    assert samples["gripper_overshoot"].keys() == {"left", "right"}
     assert summary["by_embodiment"]["so101"]["samples"] == N * 2
     assert summary["camera_motion"] == {
         "head": {"static": 3},

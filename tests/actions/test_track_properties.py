@@ -162,7 +162,7 @@ def test_every_sample_has_one_cause_and_the_counts_add_up(seed):
         cause = plain_cause(tools[n, a].numpy(), float(opening[n, a]), K[v].numpy(), cameras[n, v].numpy(), size)
         assert CAUSES[int(seen.cause[n, v, a])] == cause
         expected[cause] += 1
-    counts = count_samples(seen.cause, torch.nan_to_num(opening), ("left", "right"), 0)
+    counts = count_samples(seen.cause, torch.nan_to_num(opening), 0)
     assert {cause: counts[cause] for cause in CAUSES} == expected
     assert sum(expected.values()) == counts["samples"] == 30
 

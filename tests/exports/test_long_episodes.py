@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worldline_core.actions.overlay_views import write_overlay_video
+from worldline_core.actions.overlays import write_overlay_video
 from worldline_core.config import validate
 from worldline_core.data.curation.curate import curate
 from worldline_core.data.curation.curate_config import CurateConfig

@@ -10,29 +10,25 @@ import torch
 
 from worldline_core.actions.action_maps import render_action_maps
 from worldline_core.actions.episode_tracks import collate_tracks
-from worldline_core.actions.overlay_views import (
-    COLUMN_GAP_PX,
-    HEADING_HEIGHT_PX,
-    LEGEND_HEIGHT_PX,
-    legend_strip,
-    overlay_clip,
-    overlay_sheet,
-    write_overlay_video,
-)
 from worldline_core.actions.overlays import (
     ARM_COLOURS,
     AXIS_COLOURS,
+    LEGEND_HEIGHT_PX,
     OverlayStyle,
     arm_mask,
     axis_tips,
     draw_overlay,
     gaussian,
     heat_layer,
+    legend_strip,
+    overlay_clip,
+    overlay_sheet,
     picture_pixel,
+    write_overlay_video,
 )
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.errors import DataError
-from worldline_core.pictures import text_width_px
+from worldline_core.pictures import COLUMN_GAP_PX, LABEL_HEIGHT_PX, text_width_px
 
 HEIGHT, WIDTH = 32, 48
 """As `conftest` makes tracks."""
@@ -191,11 +187,11 @@ def test_a_clip_shows_all_views_and_moves(four_frames) -> None:
     frames = {"head": grey(4), "right_wrist": grey(3)}
     clip = np.stack(list(overlay_clip(frames, four_frames, 8.0, tile_height=128, title="robot")))
     # As long as the shortest; two tiles of 128 x 192, a gap, a heading and a legend; even sides.
-    height, width = 128 + HEADING_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 192 + COLUMN_GAP_PX
+    height, width = 128 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 2 * 192 + COLUMN_GAP_PX
     assert clip.shape == (3, height, width, 3)
     left, right = (
-        clip[:, HEADING_HEIGHT_PX:-LEGEND_HEIGHT_PX, :192],
-        clip[:, HEADING_HEIGHT_PX:-LEGEND_HEIGHT_PX, -192:],
+        clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX, :192],
+        clip[:, LABEL_HEIGHT_PX:-LEGEND_HEIGHT_PX, -192:],
     )
     assert np.array_equal(left, right)
     assert not np.array_equal(left[0], left[2])
@@ -210,7 +206,7 @@ def test_the_video_plays_and_repeats_to_the_byte(tmp_path: Path, four_frames) ->
         write_overlay_video(tmp_path / name, frames, four_frames, 8.0, tile_height=64)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
     shown = decode_video(tmp_path / "a.mp4")
-    assert shown.shape == (4, 64 + HEADING_HEIGHT_PX + LEGEND_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
+    assert shown.shape == (4, 64 + LABEL_HEIGHT_PX + LEGEND_HEIGHT_PX, 3 * 96 + 2 * COLUMN_GAP_PX, 3)
     assert near(shown[0], ARM_COLOURS["right"], 60).any()
 
 

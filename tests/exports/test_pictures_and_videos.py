@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from worldline_core.actions.overlays import heat_picture
 from worldline_core.data.video.frame_decoder import decode_video
 from worldline_core.pictures import (
     COLUMN_GAP_PX,
@@ -99,14 +98,6 @@ def test_side_by_side_video_and_poster(tmp_path: Path) -> None:
     assert poster.shape == frames[0].shape
     again = write_side_by_side(tmp_path / "again.mp4", columns, 8.0, tile_height=64)
     assert again.video.read_bytes() == made.video.read_bytes()
-
-
-def test_signed_channels_have_two_colours() -> None:
-    picture = heat_picture(np.array([[-1.0, 0.0, 1.0]]), tile_height=1)
-    negative, zero, positive = picture[0].astype(int)
-    assert negative[2] > negative[0]
-    assert positive[0] > positive[2]
-    assert zero.min() > 200
 
 
 def test_encoded_pictures_are_reproducible() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from worldline_core.errors import DataError
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.embodiment_check import random_states
+from worldline_core.geometry.embodiment_report import random_states
 from worldline_core.geometry.inverse_kinematics import InverseKinematics
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.transforms import rotation_about_axis, rotation_angle

@@ -12,7 +12,7 @@ import yaml
 
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
-from worldline_core.geometry.embodiment_check import random_states
+from worldline_core.geometry.embodiment_report import random_states
 from worldline_core.geometry.kinematic_tree import read_mjcf
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.geometry.tensor_transforms import is_rigid
@@ -128,7 +128,7 @@ def test_hand_written_description_equals_mujoco(tmp_path):
 
 @pytest.mark.parametrize("name", ["panda_pair", "yam_station", "fourier_gr1t2", "unitree_g1_29dof", "ur5e"])
 def test_every_link_and_site_equals_mujoco(name):
-    """A few positions, but each body by name and to 1e-9 m; all embodiments and many positions: test_embodiment_check."""
+    """A few positions, but each body by name and to 1e-9 m; all embodiments and many positions: test_embodiment_report."""
     embodiment = load_embodiment(name)
     states = random_states(embodiment, 5, seed=1)
     assert_equals_mujoco(ArmKinematics(embodiment), embodiment.description_path.read_text(), states)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from worldline_core.data.episodes.conventions import (
-    OPENGL_AXES,
     RecordedConventions,
     along_tool_z,
     check_applicable,
@@ -23,6 +22,7 @@ from worldline_core.data.episodes.conventions import (
     turned,
 )
 from worldline_core.data.episodes.episode import CameraTrack, Episode
+from worldline_core.geometry.cameras import OPENGL_AXES
 from worldline_core.geometry.transforms import (
     euler_fixed_xyz_from_rotation,
     quaternion_wxyz_from_rotation,

@@ -20,7 +20,7 @@ from torch import Tensor
 from worldline_core.actions.actions_config import TEMPORAL_FACTOR
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
-from worldline_core.actions.tool_projection import Projection, TrackCounts, count_samples, project_tools
+from worldline_core.actions.tool_projection import Projection, count_samples, project_tools
 from worldline_core.data.episodes.episode import VIEWS, Episode
 from worldline_core.errors import CalibrationError, DataError
 from worldline_core.geometry.kinematics import ArmKinematics
@@ -43,7 +43,7 @@ def compute_tracks(
     *,
     controls: Controls = "action",
     without_mount: Fallback = "recorded",
-) -> tuple[EpisodeTracks, TrackCounts]:
+) -> tuple[EpisodeTracks, dict[str, int]]:
     """Tracks of every frame, view and arm of an episode, and counts of what was masked or clipped.
 
     An unusable camera (a singular K, a pose that is not rigid) masks the samples of its view and is counted; controls
@@ -101,7 +101,7 @@ def compute_tracks(
     )  # fmt: skip
     present = [number for number, view in enumerate(VIEWS) if view in episode.cameras]
     native = np.asarray(episode.action if kind == "action" else episode.state, dtype=np.float32)
-    return replace(tracks, native=native), count_samples(seen.cause[:, present], gripper, arms, outside_limits)
+    return replace(tracks, native=native), count_samples(seen.cause[:, present], gripper, outside_limits)
 
 
 def tracks_of_projection(

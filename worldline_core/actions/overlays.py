@@ -1,4 +1,4 @@
-"""Overlays: action tracks drawn over one frame of one view (`overlay_views` puts views together).
+"""Overlays: action tracks drawn over frames, of one view or of all views together, with a legend.
 
 Every picture of the project in which controls lie over a frame is drawn here: previews of `render_actions`, the report,
 `worldline inspect`, Rerun layers and the pictures of `worldline calibrate check`.
@@ -15,24 +15,43 @@ numbers (`geometry.cameras`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from worldline_core.actions.action_maps import grid_sigma
 from worldline_core.actions.actions_config import REFERENCE_CANVAS, SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import EpisodeTracks
 from worldline_core.actions.robot_masks import project_capsules
+from worldline_core.data.video.encoder import encode_video
+from worldline_core.data.video.frames import Frames, MadeFrames
 from worldline_core.errors import DataError
 from worldline_core.geometry.cameras import Resize
 from worldline_core.geometry.transforms import rotation_from_rot6d
-from worldline_core.pictures import Picture, scale_frames, scaled_size
+from worldline_core.pictures import (
+    INK,
+    PAPER,
+    STRIP_INK,
+    STRIP_PAPER,
+    Colour,
+    Picture,
+    SheetRow,
+    contact_sheet,
+    font,
+    scale_frames,
+    scaled_size,
+    side_by_side,
+    text_width_px,
+)
+from worldline_core.store.atomic import atomic_path
 
-Colour = tuple[int, int, int]
 ARM_COLOURS: dict[str, Colour] = {"left": (255, 150, 20), "right": (40, 150, 255)}
 """RGB. Orange and blue differ for every kind of colour vision."""
 OTHER_ARM_COLOUR: Colour = (60, 200, 120)
@@ -43,6 +62,7 @@ OUTLINE_COLOUR: Colour = (255, 255, 255)
 SHADE: Colour = (20, 22, 26)
 """Under every line, so that it is seen on light and dark ground."""
 TILE_HEIGHT = 256
+LEGEND_HEIGHT_PX = 26
 _FRACTION_BITS = 4
 
 
@@ -228,11 +248,157 @@ def heat_layer(
     return np.clip(shown, 0, 255).astype(np.uint8)
 
 
-def heat_picture(channel: NDArray[np.floating], *, tile_height: int = 128) -> Picture:
-    """One channel of an action map as a picture: blue negative, grey zero, red positive, symmetric range."""
-    peak = float(np.abs(channel).max()) or 1.0
-    value = np.clip(channel / peak, -1.0, 1.0)[..., None].astype(np.float32)
-    zero, red, blue = (np.array(c, np.float32) for c in ((234, 232, 226), (200, 48, 38), (36, 84, 180)))
-    picture = np.where(value >= 0, zero + (red - zero) * value, zero + (blue - zero) * -value)
-    factor = max(1, tile_height // channel.shape[0])
-    return picture.round().astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)
+def view_name(view: str) -> str:
+    """A view in words: "left wrist"."""
+    return view.replace("_", " ")
+
+
+def legend_strip(
+    arms: Sequence[str],
+    width: int,
+    *,
+    note: str = "",
+    outline: bool = False,
+    ink: Colour = INK,
+    paper: Colour = PAPER,
+    size_px: int = 13,
+) -> Picture:
+    """A strip that says what is drawn: arms, axes, ring, outline; and a note (a frame number) at its right end.
+
+    What does not fit the width is left out from the end, the note never.
+    """
+    strip = Image.new("RGB", (width, LEGEND_HEIGHT_PX), paper)
+    draw = ImageDraw.Draw(strip)
+    middle, x = LEGEND_HEIGHT_PX / 2, 8.0
+    end = width - 8 - (text_width_px(note, size_px) if note else 0)
+    if note:
+        draw.text((end, middle), note, font=font(size_px), fill=ink, anchor="lm")
+    marks: list[tuple[str, int, Colour]] = []
+    items = [(f"{arm} tool", arm_colour(arms, index), "dot") for index, arm in enumerate(arms)]
+    items += [(name, colour, "line") for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)]
+    items += [("wide ring: gripper open", ink, "ring")]
+    items += [("where the arms should lie", OUTLINE_COLOUR, "outline")] if outline else []
+    for text, colour, mark in items:
+        needed = 20 + text_width_px(text, size_px) + 14
+        if x + needed > end:
+            break
+        draw.text((x + 20, middle), text, font=font(size_px), fill=ink, anchor="lm")
+        marks.append((mark, round(x), colour))
+        x += needed
+    picture = np.array(strip, dtype=np.uint8)
+    centre = LEGEND_HEIGHT_PX // 2
+    for mark, left, colour in marks:
+        if mark == "outline":
+            cv2.line(picture, (left, centre), (left + 14, centre), SHADE, 5, cv2.LINE_AA)
+        if mark in ("line", "outline"):
+            cv2.line(picture, (left, centre), (left + 14, centre), colour, 3, cv2.LINE_AA)
+        else:
+            cv2.circle(picture, (left + 7, centre), 6, colour, -1 if mark == "dot" else 2, cv2.LINE_AA)
+    return picture
+
+
+def overlay_clip(
+    frames: Mapping[str, Frames],
+    tracks: EpisodeTracks,
+    fps: float,
+    *,
+    tile_height: int = TILE_HEIGHT,
+    style: OverlayStyle = DEFAULT_STYLE,
+    title: str = "",
+) -> Iterator[Picture]:
+    """All views side by side, from the first frame on, as long as every view and the tracks have frames.
+
+    Args:
+        frames: by view, `n h w 3` RGB; views that are missing are left out.
+        title: shown with the name of the first view.
+
+    Returns: pictures (H, W, 3) one after the other, H and W even.
+
+    Raises:
+        DataError: the tracks have none of these views.
+    """
+    columns: dict[str, Frames] = {}
+    for view in tracks.views:
+        if view in frames:
+            label = view_name(view) + (f"  ·  {title}" if title and not columns else "")
+            columns[label] = _drawn(frames[view], tracks, view, tile_height, style)
+    if not columns:
+        raise DataError(
+            "No view to draw",
+            where=f"episode {tracks.episode_id}",
+            expected=", ".join(tracks.views),
+            got=", ".join(frames) or "no frames",
+        )
+    return _with_legend(side_by_side(columns, tile_height=tile_height), tracks, fps, style)
+
+
+def _drawn(frames: Frames, tracks: EpisodeTracks, view: str, tile_height: int, style: OverlayStyle) -> Frames:
+    count = min(len(frames), tracks.num_frames)
+
+    def draw() -> Iterator[Picture]:
+        for n, frame in enumerate(islice(frames, count)):
+            yield draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
+
+    height, width = scaled_size(frames.shape[1], frames.shape[2], tile_height)
+    return MadeFrames(draw, (count, height, width, 3), np.uint8)
+
+
+def _with_legend(rows: Iterator[Picture], tracks: EpisodeTracks, fps: float, style: OverlayStyle) -> Iterator[Picture]:
+    for n, row in enumerate(rows):
+        note = f"frame {n}  ·  {n / fps:.2f} s"
+        legend = legend_strip(
+            tracks.arms, row.shape[1], note=note, outline=style.outline, ink=STRIP_INK, paper=STRIP_PAPER
+        )
+        whole = np.concatenate([row, legend], axis=0)
+        yield np.ascontiguousarray(whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2])
+
+
+def write_overlay_video(
+    path: Path,
+    frames: Mapping[str, Frames],
+    tracks: EpisodeTracks,
+    fps: float,
+    *,
+    tile_height: int = TILE_HEIGHT,
+    style: OverlayStyle = DEFAULT_STYLE,
+    title: str = "",
+) -> None:
+    """Writes `overlay_clip` as an mp4 that browsers play, atomically; the bytes depend on the arguments alone."""
+    clip = overlay_clip(frames, tracks, fps, tile_height=tile_height, style=style, title=title)
+    with atomic_path(path) as temporary:
+        encode_video(temporary, clip, fps, crf=20, preset="veryfast")
+
+
+def overlay_sheet(
+    frames: Mapping[str, NDArray[np.uint8]],
+    tracks: EpisodeTracks,
+    moments: Sequence[int],
+    *,
+    tile_height: int = TILE_HEIGHT,
+    style: OverlayStyle = DEFAULT_STYLE,
+    title: str | None = None,
+) -> Picture:
+    """A sheet with a row per view, a column per moment, and a legend.
+
+    Args:
+        frames: by view, `m h w 3` RGB, the frames at the moments.
+        moments: m frame numbers of the tracks.
+
+    Raises:
+        DataError: the tracks have none of these views.
+    """
+    rows: list[SheetRow] = []
+    for position, view in enumerate(tracks.views):
+        if view not in frames:
+            continue
+        drawn = [
+            draw_overlay(frame, tracks, n, view, tile_height=tile_height, style=style)
+            for frame, n in zip(frames[view], moments, strict=True)
+        ]
+        seen = int(tracks.valid[:, position].any(axis=-1).sum())
+        text = f"{view_name(view)}  ·  a tool is in view in {seen} of {tracks.num_frames} frames"
+        rows.append(SheetRow(text, np.stack(drawn)))
+    if not rows:
+        raise DataError("The episode has no view with a track", where=f"episode {tracks.episode_id}")
+    sheet = contact_sheet(rows, tile_height=tile_height, title=title, column_titles=[f"frame {n}" for n in moments])
+    return np.concatenate([sheet, legend_strip(tracks.arms, sheet.shape[1], outline=style.outline)], axis=0)

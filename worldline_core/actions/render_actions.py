@@ -22,9 +22,8 @@ from worldline_core.actions.episode_tracks import (
     write_index,
     write_shard,
 )
-from worldline_core.actions.overlay_views import overlay_sheet, write_overlay_video
-from worldline_core.actions.overlays import OverlayStyle
-from worldline_core.actions.tool_projection import TrackCounts, add_counts
+from worldline_core.actions.overlays import OverlayStyle, overlay_sheet, write_overlay_video
+from worldline_core.actions.tool_projection import add_counts
 from worldline_core.data.episodes.episode import NO_EMBODIMENT
 from worldline_core.data.episodes.episode_index import QuarantineRow, nothing_kept, write_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet, ShardFilesWork
@@ -53,7 +52,7 @@ class ProjectedEpisode(InputRow):
 
     embodiment: str
     tracks: EpisodeTracks | None = None
-    counts: TrackCounts | None = None
+    counts: dict[str, int] | None = None
     rejection: QuarantineRow | None = None
 
 
@@ -126,7 +125,7 @@ class RenderWork(ShardFilesWork[ProjectedEpisode]):
 
     def finish_shard(self, number: int, results: Sequence[ProjectedEpisode]) -> None:
         """Write the tracks of a shard into one file; index rows, rejections, counts and account of its episodes into another."""
-        counts: dict[str, list[TrackCounts]] = {}
+        counts: dict[str, list[dict[str, int]]] = {}
         for result in results:
             if result.counts is not None:
                 counts.setdefault(result.embodiment, []).append(result.counts)
@@ -164,8 +163,8 @@ def render_actions(
         mapper: what does the shards, by default this process. The tracks do not depend on it.
 
     Returns:
-        Counts: episodes found, with tracks, quarantined; samples, masked ones by cause, and gripper overshoot by arm
-        (`TrackCounts`), of all episodes and by embodiment.
+        Counts: episodes found, with tracks, quarantined; samples, and masked ones by cause
+        (`count_samples`), of all episodes and by embodiment.
 
     Raises:
         ConfigError: no input `episodes`.
@@ -180,7 +179,7 @@ def render_actions(
     map_episodes(mapper or SerialMapper(), work, pieces)
     rows: list[dict[str, Any]] = []
     rejected: list[QuarantineRow] = []
-    counts: dict[str, list[TrackCounts]] = {}
+    counts: dict[str, list[dict[str, int]]] = {}
     account: list[InputRow] = []
     for number in range(len(pieces)):
         shard = work.summary(number)

@@ -11,14 +11,13 @@ A sample that is not valid has exactly one cause, the first in this order that a
 2. `behind_camera`: depth <= MIN_DEPTH_M, so a depth of 0 and of exactly MIN_DEPTH_M too;
 3. `outside_image`: not on a pixel, that is not -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5.
 
-The counts of the four causes add up to the number of samples; `TrackCounts` add up over episodes.
+The counts of the four causes add up to the number of samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TypedDict, cast
 
 import torch
 from einops import rearrange
@@ -121,68 +120,27 @@ def _project(
     )
 
 
-class GripperOvershoot(TypedDict):
-    """Openings of one arm beyond 0..1: how many were clipped, and the largest distance from the range."""
-
-    clipped: int
-    largest: float
-
-
-class TrackCounts(TypedDict):
-    """Counts of one episode, or of several.
-
-    A sample is one frame, view and arm; views that an episode lacks have none. valid + behind_camera + outside_image
-    + invalid_calibration = samples. `gripper_clipped` counts frames and arms, `outside_joint_limits` frames and
-    joints, `gripper_overshoot` is by arm.
-    """
-
-    episodes: int
-    samples: int
-    valid: int
-    behind_camera: int
-    outside_image: int
-    invalid_calibration: int
-    outside_joint_limits: int
-    gripper_clipped: int
-    gripper_overshoot: dict[str, GripperOvershoot]
-
-
 def count_samples(
-    cause: Int[Tensor, "n v a"], opening: Float[Tensor, "n a"], arms: Sequence[str], outside_joint_limits: int
-) -> TrackCounts:
-    """Counts of one episode.
+    cause: Int[Tensor, "n v a"], opening: Float[Tensor, "n a"], outside_joint_limits: int
+) -> dict[str, int]:
+    """Counts of one episode: valid + behind_camera + outside_image + invalid_calibration = samples.
+
+    A sample is one frame, view and arm. `gripper_clipped` counts frames and arms, `outside_joint_limits` frames and joints.
 
     Args:
         cause: of the views that the episode has.
         opening: gripper opening before it is clipped.
     """
-    valid, behind, outside, invalid = torch.bincount(cause.flatten(), minlength=len(CAUSES)).tolist()
-    beyond = torch.maximum(-opening, opening - 1).clamp_min(0)
-    overshoot: dict[str, GripperOvershoot] = {
-        arm: {"clipped": int((beyond[:, a] > 0).sum()), "largest": float(beyond[:, a].max())}
-        for a, arm in enumerate(arms)
-    }
+    by_cause = torch.bincount(cause.flatten(), minlength=len(CAUSES)).tolist()
     return {
         "episodes": 1,
         "samples": cause.numel(),
-        "valid": valid,
-        "behind_camera": behind,
-        "outside_image": outside,
-        "invalid_calibration": invalid,
+        **dict(zip(CAUSES, by_cause, strict=True)),
         "outside_joint_limits": outside_joint_limits,
-        "gripper_clipped": sum(arm["clipped"] for arm in overshoot.values()),
-        "gripper_overshoot": overshoot,
+        "gripper_clipped": int(((opening < 0) | (opening > 1)).sum()),
     }
 
 
-def add_counts(parts: Sequence[TrackCounts]) -> TrackCounts:
-    """Counts of several episodes together: numbers add, the largest overshoot of an arm is the largest of all."""
-    overshoot: dict[str, GripperOvershoot] = {}
-    for part in parts:
-        for arm, one in part["gripper_overshoot"].items():
-            before = overshoot.get(arm, {"clipped": 0, "largest": 0.0})
-            clipped, largest = before["clipped"] + one["clipped"], max(before["largest"], one["largest"])
-            overshoot[arm] = {"clipped": clipped, "largest": largest}
-    names = [name for name in TrackCounts.__annotations__ if name != "gripper_overshoot"]
-    numbers = {name: sum(part[name] for part in parts) for name in names}
-    return cast("TrackCounts", {**numbers, "gripper_overshoot": dict(sorted(overshoot.items()))})
+def add_counts(parts: Sequence[dict[str, int]]) -> dict[str, int]:
+    """Counts of several episodes together."""
+    return {name: sum(part[name] for part in parts) for name in parts[0]}

@@ -17,8 +17,7 @@ import torch
 
 from worldline_core.actions.action_tracks import tracks_of_projection
 from worldline_core.actions.episode_tracks import HEAD_VIEW, EpisodeTracks
-from worldline_core.actions.overlay_views import legend_strip, view_name
-from worldline_core.actions.overlays import OverlayStyle, draw_overlay
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, legend_strip, view_name
 from worldline_core.actions.robot_masks import robot_capsules, tool_capsules
 from worldline_core.actions.tool_projection import project_tools
 from worldline_core.calibration.camera_errors import corrected_camera

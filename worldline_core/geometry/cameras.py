@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -47,14 +47,15 @@ def inside_image[Array: (np.ndarray, Tensor)](uv: Array, image_size: tuple[int, 
 
 
 CameraAxes = Literal["opencv", "opengl"]
-Fit = Literal["stretch", "letterbox", "crop"]
 """`opencv` is x right, y down, z forward; `opengl` (also Blender, MuJoCo, USD) is x right, y up, z backward."""
-_OPENCV_FROM: dict[str, np.ndarray] = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+Extrinsics = Literal["camera_to_base", "base_to_camera"]
+Fit = Literal["stretch", "letterbox", "crop"]
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Where a camera is. Made only by `from_camera_to_base` or `from_base_to_camera`, which say what the matrices map.
+    """Where a camera is, made by `of` from matrices that state their convention.
 
     Attributes:
         T_base_camera: (N, 4, 4) float64, N = 1 for a fixed camera; maps camera points (OpenCV axes, metres) to base.
@@ -64,49 +65,28 @@ class CameraPose:
     T_base_camera: np.ndarray
     repair: RotationRepair
 
-    def __init__(self) -> None:
-        raise TypeError("Say what the matrices map: CameraPose.from_camera_to_base or CameraPose.from_base_to_camera")
-
     @classmethod
-    def from_camera_to_base(cls, T_base_camera: np.ndarray, *, axes: CameraAxes, where: object) -> CameraPose:
-        """From matrices (N or 1, 4, 4) or (4, 4) that map camera points to base (the camera's pose).
+    def of(cls, matrices: np.ndarray, *, extrinsics: Extrinsics, axes: CameraAxes, where: object) -> CameraPose:
+        """From matrices (N or 1, 4, 4) or (4, 4).
+
+        Args:
+            extrinsics: whether they map camera points to base, or base points to camera (OpenCV's rvec and tvec, COLMAP).
 
         Raises: CalibrationError when one is not rigid, beyond what `repair_rotations` mends.
         """
-        poses, repair = _rigid(T_base_camera, where)
-        return cls._of(poses @ _OPENCV_FROM[axes] if axes != "opencv" else poses, repair)
-
-    @classmethod
-    def from_base_to_camera(cls, T_camera_base: np.ndarray, *, axes: CameraAxes, where: object) -> CameraPose:
-        """From matrices (N or 1, 4, 4) or (4, 4) that map base points to camera (OpenCV's rvec and tvec, COLMAP).
-
-        Raises: CalibrationError when one is not rigid, beyond what `repair_rotations` mends.
-        """
-        poses, repair = _rigid(T_camera_base, where)
-        return cls._of(rigid_inverse(poses) @ _OPENCV_FROM[axes], repair)
-
-    @classmethod
-    def _of(cls, T_base_camera: np.ndarray, repair: RotationRepair) -> CameraPose:
-        pose = object.__new__(cls)
-        object.__setattr__(pose, "T_base_camera", T_base_camera)
-        object.__setattr__(pose, "repair", repair)
-        return pose
-
-    def __len__(self) -> int:
-        return len(self.T_base_camera)
-
-    def __array__(self, *_: object, **__: object) -> NoReturn:
-        raise TypeError("A CameraPose is no array: use its T_base_camera (camera to base, OpenCV axes)")
-
-
-def _rigid(matrices: np.ndarray, where: object) -> tuple[np.ndarray, RotationRepair]:
-    poses = np.asarray(matrices, dtype=np.float64)
-    poses = poses[None] if poses.ndim == 2 else poses
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
-        raise CalibrationError(
-            "Camera poses have a wrong shape", where=where, expected="(N or 1, 4, 4) or (4, 4)", got=np.shape(matrices)
-        )
-    return repair_rotations(poses, where)
+        poses = np.asarray(matrices, dtype=np.float64)
+        poses = poses[None] if poses.ndim == 2 else poses
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+            raise CalibrationError(
+                "Camera poses have a wrong shape",
+                where=where,
+                expected="(N or 1, 4, 4) or (4, 4)",
+                got=np.shape(matrices),
+            )
+        poses, repair = repair_rotations(poses, where)
+        if extrinsics == "base_to_camera":
+            poses = rigid_inverse(poses)
+        return cls(poses if axes == "opencv" else poses @ OPENGL_AXES, repair)
 
 
 @dataclass(frozen=True)

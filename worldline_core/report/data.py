@@ -14,8 +14,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.actions.overlay_views import overlay_sheet
-from worldline_core.actions.overlays import OverlayStyle, draw_overlay
+from worldline_core.actions.overlays import OverlayStyle, draw_overlay, overlay_sheet
 from worldline_core.data.episodes.episode_index import EpisodeRow, QuarantineRow, read_index, read_quarantine
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem

@@ -17,8 +17,7 @@ import numpy as np
 
 from worldline_core.actions.actions_config import SIGMA_PX_REFERENCE
 from worldline_core.actions.episode_tracks import ActionTracks, EpisodeTracks
-from worldline_core.actions.overlay_views import write_overlay_video
-from worldline_core.actions.overlays import OverlayStyle
+from worldline_core.actions.overlays import OverlayStyle, write_overlay_video
 from worldline_core.config import validate
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.data.guards.source_paths import safe_stem

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import RejectedInputError
+from worldline_core.geometry.cameras import OPENGL_AXES
 from worldline_core.geometry.transforms import (
     quaternion_xyzw_from_rotation,
     reread_as_moving,
@@ -24,8 +25,6 @@ from worldline_core.geometry.transforms import (
     rigid_inverse,
     rotation_from_quaternion_xyzw,
 )
-
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def arm_blocks(episode: Episode) -> tuple[tuple[int, ...], ...]:

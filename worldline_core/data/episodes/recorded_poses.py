@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from worldline_core.data.episodes.episode import CameraTrack, Episode
 from worldline_core.data.guards.rejection import Reason, RejectedInputError
 from worldline_core.errors import CalibrationError
-from worldline_core.geometry.cameras import CameraAxes, CameraPose
+from worldline_core.geometry.cameras import CameraAxes, CameraPose, Extrinsics
 from worldline_core.geometry.lens import Distortion
 from worldline_core.geometry.transforms import (
     MAX_ROTATION_DEVIATION,
@@ -26,7 +26,6 @@ from worldline_core.geometry.transforms import (
     rotation_from_quaternion_xyzw,
 )
 
-Extrinsics = Literal["camera_to_base", "base_to_camera"]
 REPAIRED = "rotations_repaired"
 
 
@@ -59,9 +58,8 @@ def camera_pose(
 
     Raises: RejectedInputError (invalid_extrinsics) with the deviation, when one is not rigid.
     """
-    build = CameraPose.from_camera_to_base if extrinsics == "camera_to_base" else CameraPose.from_base_to_camera
     with rejected_as("invalid_extrinsics", where, {"view": view, **_deviation(matrices)}):
-        return build(matrices, axes=axes, where=f"view {view}")
+        return CameraPose.of(matrices, extrinsics=extrinsics, axes=axes, where=f"view {view}")
 
 
 class RecordedCameras:

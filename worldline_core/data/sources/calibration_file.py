@@ -24,13 +24,13 @@ import yaml
 from pydantic import Field, model_validator
 
 from worldline_core.config import StrictModel, read_yaml
-from worldline_core.data.episodes.recorded_poses import Extrinsics, RecordedCameras, camera_pose
+from worldline_core.data.episodes.recorded_poses import RecordedCameras, camera_pose
 from worldline_core.data.episodes.source import LensConfig
 from worldline_core.data.guards.plain_files import read_json, validated
 from worldline_core.data.guards.rejection import RejectedInputError, check_shape
 from worldline_core.data.guards.source_paths import AnyPath, regular_file
 from worldline_core.errors import ConfigError
-from worldline_core.geometry.cameras import CameraAxes, ImageTransform
+from worldline_core.geometry.cameras import CameraAxes, Extrinsics, ImageTransform
 from worldline_core.geometry.transforms import pose_from_euler_fixed_xyz
 
 MAX_YAML_BYTES = 16 << 20

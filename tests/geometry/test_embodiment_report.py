@@ -14,7 +14,7 @@ from flows.command_line import main
 from worldline_core.errors import ConfigError, UnavailableError
 from worldline_core.geometry import kinematics
 from worldline_core.geometry.embodiment import embodiment_names, load_embodiment
-from worldline_core.geometry.embodiment_check import check_embodiment, random_states
+from worldline_core.geometry.embodiment_report import check_embodiment, random_states
 
 has_mujoco = pytest.mark.skipif(
     importlib.util.find_spec("mujoco") is None, reason="the independent kinematics are MuJoCo's"
@@ -28,17 +28,17 @@ def test_kinematics_equal_mujoco_at_a_thousand_random_positions(name):
     if not embodiment.description_path.is_file():
         pytest.skip(f"the description of {name} is not here: {embodiment.description.how_to_get}")
     check = check_embodiment(embodiment, samples=1000)
-    assert check.samples == 1000
-    frames = [(error.kind, error.frame) for error in check.errors]
+    assert check["samples"] == 1000
+    frames = [(error["kind"], error["frame"]) for error in check["errors"]]
     for arm in embodiment.arms:
         assert ("end-effector", arm.end_effector_link) in frames
         assert ("tool", arm.name) in frames
         assert arm.wrist_camera is None or ("camera", arm.camera_view) in frames
-    assert check.passed
+    assert check["passed"]
     # The promise is 1e-5; in float64 all of it is rounding.
-    assert max(error.max_position_m for error in check.errors) <= 1e-12
-    assert max(error.max_rotation_rad for error in check.errors) <= 1e-12
-    assert not [note for note in check.notes if "limits" in note]
+    assert max(error["max_position_m"] for error in check["errors"]) <= 1e-12
+    assert max(error["max_rotation_rad"] for error in check["errors"]) <= 1e-12
+    assert not [note for note in check["notes"] if "limits" in note]
 
 
 @has_mujoco
@@ -47,8 +47,8 @@ def test_agibot_equals_mujoco(shared_data):
     if not urdf.is_file():
         pytest.skip("the AgiBot G1 URDF is not here")
     check = check_embodiment(load_embodiment("agibot_g1", urdf), samples=1000)
-    assert check.passed
-    assert max(error.max_position_m for error in check.errors) <= 1e-9
+    assert check["passed"]
+    assert max(error["max_position_m"] for error in check["errors"]) <= 1e-9
 
 
 def test_random_states_stay_within_limits_and_turn_where_there_are_none():
@@ -78,9 +78,9 @@ def break_the_reader(monkeypatch: pytest.MonkeyPatch, metres: float) -> None:
 def test_a_wrong_pose_is_found(monkeypatch, metres, passed):
     break_the_reader(monkeypatch, metres)
     check = check_embodiment(load_embodiment("franka_panda"), samples=20)
-    assert check.passed is passed
-    flange = next(error for error in check.errors if error.kind == "end-effector")
-    assert flange.max_position_m == pytest.approx(metres, rel=1e-6)
+    assert check["passed"] is passed
+    flange = next(error for error in check["errors"] if error["kind"] == "end-effector")
+    assert flange["max_position_m"] == pytest.approx(metres, rel=1e-6)
 
 
 @has_mujoco
@@ -89,8 +89,8 @@ def test_other_limits_than_the_description_has_are_noted(tmp_path):
     text = (source.parent / "franka_panda.yaml").read_text().replace("[-1.7628, 1.7628]", "[-1.7628, 2.0]")
     (tmp_path / "franka_panda.yaml").write_text(text)
     (tmp_path / "franka_panda.xml").write_text(source.read_text())
-    notes = check_embodiment(load_embodiment(tmp_path / "franka_panda.yaml"), samples=2).notes
-    assert notes == ("panda_joint2: limits -1.7628 to 2 rad, the description has -1.7628 to 1.7628",)
+    notes = check_embodiment(load_embodiment(tmp_path / "franka_panda.yaml"), samples=2)["notes"]
+    assert notes == ["panda_joint2: limits -1.7628 to 2 rad, the description has -1.7628 to 1.7628"]
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch):

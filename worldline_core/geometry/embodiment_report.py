@@ -1,4 +1,4 @@
-"""An embodiment's forward kinematics checked against MuJoCo.
+"""What `worldline embodiment` prints: the list of robots, one robot, and its forward kinematics against MuJoCo.
 
 MuJoCo is an independent engine here: nothing of this project's readers is used on its side. The description's text goes
 to MuJoCo's own MJCF or URDF compiler, after meshes and all else that decides no pose were taken out (they are often not
@@ -11,13 +11,18 @@ import importlib
 import importlib.util
 import math
 import xml.etree.ElementTree as ET
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from worldline_core.errors import ConfigError, UnavailableError, installing
-from worldline_core.geometry.embodiment import Embodiment, RigidOffset, read_description
+from worldline_core.errors import ConfigError, UnavailableError, WorldLineError, installing
+from worldline_core.geometry.embodiment import (
+    Embodiment,
+    embodiment_names,
+    how_to_get,
+    load_embodiment,
+    read_description,
+)
 from worldline_core.geometry.kinematic_tree import TreeBody, parse_xml
 from worldline_core.geometry.transforms import rotation_angle
 
@@ -31,49 +36,94 @@ _NO_POSE = (
     "custom", "extension", "size", "deformable",
 )  # fmt: skip
 _NO_POSE_OF_A_BODY = ("geom", "camera", "light", "inertial", "composite", "flexcomp", "plugin")
+_BOUNDS = {"boundmass": "0.001", "boundinertia": "0.000001"}
 
 
-@dataclass(frozen=True)
-class PoseError:
-    """Difference between this project's pose of a frame and MuJoCo's, over all samples."""
-
-    frame: str
-    kind: str
-    max_position_m: float
-    mean_position_m: float
-    max_rotation_rad: float
-    mean_rotation_rad: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether both maxima are within the tolerances."""
-        return self.max_position_m <= POSITION_TOLERANCE_M and self.max_rotation_rad <= ROTATION_TOLERANCE_RAD
+def list_embodiments() -> list[dict[str, Any]]:
+    """One row per embodiment: arms, joints, state size, whether its description is here, whether it is verified."""
+    return [_row(name) for name in embodiment_names()]
 
 
-@dataclass(frozen=True)
-class EmbodimentCheck:
-    """What comparing an embodiment with MuJoCo gave.
+def _row(name: str) -> dict[str, Any]:
+    try:
+        embodiment = load_embodiment(name)
+    except WorldLineError as error:
+        # A package in another version makes one robot unusable, not the list of the others.
+        return {"name": name, "found": False, "problem": str(error)}
+    package, found = embodiment.description.package, embodiment.description_path.is_file()
+    return {
+        "name": name,
+        "arms": {arm.name: len(arm.joints) for arm in embodiment.arms},
+        "state_size": embodiment.state_size,
+        "wrist_cameras": [arm.camera_view for arm in embodiment.arms if arm.wrist_camera is not None],
+        "description": f"package {package}" if package else "shipped" if found else "your file",
+        "found": found,
+        "path": str(embodiment.description_path),
+        "how_to_get": None if found else how_to_get(embodiment),
+        "verified": embodiment.verified,
+        "unverified_reason": embodiment.unverified_reason,
+    }
 
-    Attributes:
-        errors: by frame: every end-effector, tool and wrist camera, and the worst of all links together.
-        notes: differences that are no pose error, such as limits that are not those of the description.
-    """
 
-    name: str
-    engine: str
-    samples: int
-    seed: int
-    errors: tuple[PoseError, ...]
-    notes: tuple[str, ...]
+def format_list(rows: list[dict[str, Any]]) -> str:
+    """A table of the robots, and below it what is missing or not verified."""
+    cells = [("name", "arms (joints)", "state", "wrist cameras", "description", "verified")]
+    notes: list[str] = []
+    for row in rows:
+        name = row["name"]
+        if "problem" in row:
+            cells.append((name, "-", "-", "-", "not usable", "-"))
+            notes.append(f"{name}: {row['problem']}")
+            continue
+        arms = ", ".join(f"{arm} ({joints})" for arm, joints in row["arms"].items())
+        wrists, verified = ", ".join(row["wrist_cameras"]) or "-", "yes" if row["verified"] else "no"
+        description = row["description"] if row["found"] else f"{row['description']}: not here"
+        cells.append((name, arms, str(row["state_size"]), wrists, description, verified))
+        notes += [] if row["found"] else [f"{name}: {row['how_to_get']}"]
+        notes += [] if row["verified"] else [f"{name}: not verified: {row['unverified_reason']}"]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return "\n".join([*lines, *([""] if notes else []), *notes])
 
-    @property
-    def passed(self) -> bool:
-        """Whether every frame is within the tolerances."""
-        return all(error.passed for error in self.errors)
+
+def describe_embodiment(embodiment: Embodiment) -> str:
+    """All that the file states, with the column of each joint and gripper in the state."""
+    description = embodiment.description
+    here = "" if embodiment.description_path.is_file() else f" (not here: {how_to_get(embodiment)})"
+    lines = [
+        f"{embodiment.name}: state of {embodiment.state_size} columns, angles in {embodiment.joint_units}, "
+        f"poses in {embodiment.base_link}",
+        f"  description  {description.format}, {embodiment.description_path}{here}",
+        *([f"  source       {description.source}"] if description.source else []),
+        f"  verified     {'yes' if embodiment.verified else f'no: {embodiment.unverified_reason}'}",
+    ]
+    for name, offset in description.mounts.items():
+        lines.append(f"  mount        {name}: {offset.translation} m, wxyz {offset.rotation_wxyz}")
+    if embodiment.posture:
+        lines.append("  posture      " + ", ".join(f"{name} {value:g}" for name, value in embodiment.posture.items()))
+    for arm in embodiment.arms:
+        gripper, tool, width = arm.gripper, arm.T_link_tool, max(map(len, arm.joints))
+        lines.append(f"  arm {arm.name}")
+        start = embodiment.joint_columns(arm).start
+        for number, (joint, (low, high)) in enumerate(zip(arm.joints, arm.limits, strict=True), start):
+            limits = "no limits" if (low, high) == (-math.inf, math.inf) else f"{low:g} to {high:g}"
+            lines.append(f"    column {number:<3} {joint:<{width}}  {limits}")
+        fingers = ", ".join(f"{f.name} {f.closed:g} to {f.open:g}" for f in gripper.finger_joints) or "no finger joints"
+        lines += [
+            f"    column {embodiment.gripper_column(arm):<3} {'gripper':<{width}}  {gripper.closed:g} closed, "
+            f"{gripper.open:g} open; {fingers}",
+            f"    tool       in {arm.end_effector_link}: {tool.translation} m, wxyz {tool.rotation_wxyz}",
+        ]
+        if arm.wrist_camera is not None:
+            lines.append(f"    camera     {arm.camera_view} in {arm.wrist_camera.link}")
+    return "\n".join(lines)
 
 
-def check_embodiment(embodiment: Embodiment, samples: int = 1000, seed: int = 0) -> EmbodimentCheck:
+def check_embodiment(embodiment: Embodiment, samples: int = 1000, seed: int = 0) -> dict[str, Any]:
     """Compare forward kinematics with MuJoCo at random joint positions within the limits.
+
+    Returns: errors of every end-effector, tool and wrist camera, and of all links together; notes on differences that
+        are no pose error, such as limits that are not those of the description; whether all errors are tolerable.
 
     Raises:
         UnavailableError: MuJoCo is not installed, or the kinematic description is not here.
@@ -95,37 +145,69 @@ def check_embodiment(embodiment: Embodiment, samples: int = 1000, seed: int = 0)
     ours = {name: poses.numpy() for name, poses in kinematics.link_poses(state).items()}
     theirs = _mujoco_poses(mujoco, embodiment, state, kinematics.links)
     tools, cameras = kinematics.tool_poses(state).numpy(), kinematics.wrist_camera_poses(state)
-    errors: list[PoseError] = []
+    errors = []
     for index, arm in enumerate(embodiment.arms):
-        flange = theirs[arm.end_effector_link]
-        errors.append(_pose_error("end-effector", arm.end_effector_link, ours[arm.end_effector_link], flange))
-        expected = flange @ _offset_matrix(mujoco, arm.T_link_tool)
-        errors.append(_pose_error("tool", arm.name, tools[:, index], expected))
+        link, flange, offset = arm.end_effector_link, theirs[arm.end_effector_link], np.eye(4)
+        rotation = np.zeros(9)
+        quaternion = np.asarray(arm.T_link_tool.rotation_wxyz)
+        mujoco.mju_quat2Mat(rotation, quaternion / np.linalg.norm(quaternion))
+        offset[:3, :3], offset[:3, 3] = rotation.reshape(3, 3), arm.T_link_tool.translation
+        errors.append(_pose_error("end-effector", link, ours[link], flange))
+        errors.append(_pose_error("tool", arm.name, tools[:, index], flange @ offset))
         if arm.wrist_camera is not None:
             expected = theirs[arm.wrist_camera.link] @ np.asarray(arm.wrist_camera.T_link_camera, dtype=np.float64)
             errors.append(_pose_error("camera", arm.camera_view, cameras[arm.camera_view].numpy(), expected))
-    links = [_pose_error("link", name, ours[name], theirs[name]) for name in kinematics.links if name in theirs]
-    worst = max(links, key=lambda e: max(e.max_position_m, e.max_rotation_rad))
-    together = PoseError(
-        f"{len(links)} links, worst {worst.frame}",
-        "all links",
-        max(e.max_position_m for e in links),
-        float(np.mean([e.mean_position_m for e in links])),
-        max(e.max_rotation_rad for e in links),
-        float(np.mean([e.mean_rotation_rad for e in links])),
-    )
+    links = [name for name in kinematics.links if name in theirs]
+    worst = max(links, key=lambda name: np.abs(ours[name] - theirs[name]).max())
+    together = (np.concatenate([poses[name] for name in links]) for poses in (ours, theirs))
+    errors.append(_pose_error("all links", f"{len(links)} links, worst {worst}", *together))
     notes = _limit_notes(embodiment, kinematics.tree)
     if missing := [name for name in kinematics.links if name not in theirs and "#" not in name]:
         notes.append(f"not compared, MuJoCo has no name for them: {', '.join(missing)}")
-    engine = f"MuJoCo {mujoco.__version__}"
-    return EmbodimentCheck(embodiment.name, engine, samples, seed, (*errors, together), tuple(notes))
+    return {
+        "name": embodiment.name,
+        "engine": f"MuJoCo {mujoco.__version__}",
+        "samples": samples,
+        "seed": seed,
+        "errors": errors,
+        "notes": notes,
+        "tolerances": {"position_m": POSITION_TOLERANCE_M, "rotation_rad": ROTATION_TOLERANCE_RAD},
+        "passed": all(error["passed"] for error in errors),
+    }
 
 
-def _pose_error(kind: str, frame: str, poses: np.ndarray, expected: np.ndarray) -> PoseError:
-    """Of poses (N, 4, 4)."""
+def _pose_error(kind: str, frame: str, poses: np.ndarray, expected: np.ndarray) -> dict[str, Any]:
+    """Differences between poses (N, 4, 4) of a frame."""
     position = np.linalg.norm(poses[:, :3, 3] - expected[:, :3, 3], axis=-1)
     rotation = rotation_angle(np.swapaxes(expected[:, :3, :3], -1, -2) @ poses[:, :3, :3])
-    return PoseError(frame, kind, *(float(value) for m in (position, rotation) for value in (m.max(), m.mean())))
+    return {
+        "frame": frame,
+        "kind": kind,
+        "max_position_m": float(position.max()),
+        "mean_position_m": float(position.mean()),
+        "max_rotation_rad": float(rotation.max()),
+        "mean_rotation_rad": float(rotation.mean()),
+        "passed": bool(position.max() <= POSITION_TOLERANCE_M and rotation.max() <= ROTATION_TOLERANCE_RAD),
+    }
+
+
+def format_check(check: dict[str, Any]) -> str:
+    """The errors of a check as a table, the verdict last."""
+    return "\n".join(
+        [
+            f"{check['name']}: forward kinematics against {check['engine']}, {check['samples']} random joint positions "
+            f"(seed {check['seed']})",
+            f"  {'frame':<49} {'max m':>9} {'mean m':>9} {'max rad':>9} {'mean rad':>9}",
+            *(
+                f"  {e['kind']:<12} {e['frame']:<36} {e['max_position_m']:>9.1e} {e['mean_position_m']:>9.1e} "
+                f"{e['max_rotation_rad']:>9.1e} {e['mean_rotation_rad']:>9.1e}  {'ok' if e['passed'] else 'FAILED'}"
+                for e in check["errors"]
+            ),
+            *(f"  note: {note}" for note in check["notes"]),
+            f"  {'passed' if check['passed'] else 'FAILED'}: the limit is {POSITION_TOLERANCE_M:g} m and "
+            f"{ROTATION_TOLERANCE_RAD:g} rad",
+        ]
+    )
 
 
 def random_states(embodiment: Embodiment, samples: int, seed: int = 0) -> np.ndarray:
@@ -204,9 +286,6 @@ def _compile(mujoco: Any, embodiment: Embodiment) -> Any:
     return stage.compile()
 
 
-_BOUNDS = {"boundmass": "0.001", "boundinertia": "0.000001"}
-
-
 def bare_urdf(robot: ET.Element) -> ET.Element:
     """A URDF of links and joints only, for MuJoCo; changed in place."""
     for element in list(robot):
@@ -242,14 +321,6 @@ def bare_mjcf(root: ET.Element) -> ET.Element:
     return root
 
 
-def _offset_matrix(mujoco: Any, offset: RigidOffset) -> np.ndarray:
-    """(4, 4) of a fixed offset, its quaternion converted by MuJoCo."""
-    flat, T = np.zeros(9), np.eye(4)
-    mujoco.mju_quat2Mat(flat, np.asarray(offset.rotation_wxyz) / np.linalg.norm(offset.rotation_wxyz))
-    T[:3, :3], T[:3, 3] = flat.reshape(3, 3), offset.translation
-    return T
-
-
 def _limit_notes(embodiment: Embodiment, tree: TreeBody) -> list[str]:
     """Limits of the YAML that are not those of the description."""
     described = {joint.name: joint for body in tree.walk() for joint in body.joints}
@@ -267,30 +338,3 @@ def _limit_notes(embodiment: Embodiment, tree: TreeBody) -> list[str]:
                     f"the description has {joint.limits[0]:g} to {joint.limits[1]:g}"
                 )
     return notes
-
-
-def format_check(check: EmbodimentCheck) -> str:
-    """The errors of a check as a table, the verdict last."""
-    rows = [
-        f"  {e.kind:<12} {e.frame:<36} {e.max_position_m:>9.1e} {e.mean_position_m:>9.1e} "
-        f"{e.max_rotation_rad:>9.1e} {e.mean_rotation_rad:>9.1e}  {'ok' if e.passed else 'FAILED'}"
-        for e in check.errors
-    ]
-    verdict = "passed" if check.passed else "FAILED"
-    return "\n".join(
-        [
-            f"{check.name}: forward kinematics against {check.engine}, {check.samples} random joint positions (seed "
-            f"{check.seed})",
-            f"  {'frame':<49} {'max m':>9} {'mean m':>9} {'max rad':>9} {'mean rad':>9}",
-            *rows,
-            *(f"  note: {note}" for note in check.notes),
-            f"  {verdict}: the limit is {POSITION_TOLERANCE_M:g} m and {ROTATION_TOLERANCE_RAD:g} rad",
-        ]
-    )
-
-
-def check_as_json(check: EmbodimentCheck) -> dict[str, Any]:
-    """The same as plain values."""
-    errors = [{**asdict(error), "passed": error.passed} for error in check.errors]
-    tolerances = {"position_m": POSITION_TOLERANCE_M, "rotation_rad": ROTATION_TOLERANCE_RAD}
-    return {**asdict(check), "errors": errors, "tolerances": tolerances, "passed": check.passed}
