@@ -44,14 +44,19 @@ from worldline_core.evaluation.scores import bootstrap_mean, paired_difference
 from worldline_core.evaluation.segmenters.learned import LearnedSegmenter
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
-from worldline_core.recorder.banks import BankGrid, BankSpec
-from worldline_core.recorder.controllers import TASK_SECONDS, plan_waypoints
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoint, sample_waypoints, tool_rotation
-from worldline_core.recorder.record import EMBODIMENT_STREAM, SPLIT_STREAM, open_recorder
+from worldline_core.recorder.attempts import BankGrid, BankSpec
+from worldline_core.recorder.controllers import (
+    TASK_SECONDS,
+    ArmSolver,
+    Waypoint,
+    plan_waypoints,
+    sample_waypoints,
+    tool_rotation,
+)
+from worldline_core.recorder.record import SPLIT_STREAM
 from worldline_core.recorder.rendering import TEST_SCENES, prepare_rendering
-from worldline_core.recorder.scene_model import FRAME_RATE
+from worldline_core.recorder.scene import FRAME_RATE, Layout, sample_layout
 from worldline_core.recorder.simulate import REACH_TOLERANCE_M, EpisodeRecorder, Motion
-from worldline_core.recorder.things import Layout, sample_layout
 from worldline_core.training.video_teacher import VideoTeacher, load_teacher
 
 SHIPPED = Path("artifacts/shipped")
@@ -134,7 +139,7 @@ class Attempts:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.solver = InverseKinematics(world.recorder.scene)
+        self.solver = ArmSolver(world.recorder.scene)
 
     def __call__(self, situation: Situation, count: int, random: np.random.Generator) -> np.ndarray:
         now = self.world.frame
@@ -209,7 +214,7 @@ class Start:
     def drawn(self, recorder: EpisodeRecorder) -> World:
         """The first initial state that all of the first proposals can reach."""
         for trial in range(20):
-            entropy = (SEED, EMBODIMENT_STREAM[self.spec.embodiment], SPLIT_STREAM["test"], self.spec.layout, trial)
+            entropy = (SEED, recorder.scene.robot.stream, SPLIT_STREAM["test"], self.spec.layout, trial)
             layout = sample_layout(recorder.scene.robot, self.spec.family, np.random.default_rng(entropy))
             try:
                 world = World(recorder, self.kinematics, layout, self.spec)
@@ -353,7 +358,7 @@ def main() -> None:
         missing = [arm for arm in options.arms if (spec.name, arm) not in done]
         if not missing:
             continue
-        recorder = open_recorder(spec.embodiment)
+        recorder = EpisodeRecorder(spec.embodiment)
         start = Start(spec, options.open, options.margin, model, selector, encoder)
         world = start.drawn(recorder)
         for arm in missing:

@@ -39,7 +39,7 @@ from worldline_core.evaluation.segmenters.segmenter import MaskStream, Segmenter
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.model.tokenizers import VideoTokenizer, frames_to_video, load_tokenizer, video_to_frames
-from worldline_core.recorder.banks import SEALED_FILE
+from worldline_core.recorder.attempts import SEALED_FILE
 from worldline_core.rollout.rollout_set import RolloutSet
 from worldline_core.rollout.samplers import Noise, integrate, shifted_sigmas
 from worldline_core.rollout.worldline import WorldLine

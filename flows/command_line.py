@@ -189,8 +189,7 @@ def _task(arguments: argparse.Namespace) -> None:
 
 def _record(arguments: argparse.Namespace) -> None:
     from worldline_core.config import load_config, read_yaml
-    from worldline_core.recorder.banks import RecordBanksConfig, record_banks
-    from worldline_core.recorder.policies import RecordPoliciesConfig, record_policies
+    from worldline_core.recorder.attempts import RecordBanksConfig, RecordPoliciesConfig, record_banks, record_policies
     from worldline_core.recorder.record import RecordConfig, record, record_with_manifest
 
     path, overrides, output = arguments.config, arguments.overrides, arguments.output
@@ -198,7 +197,7 @@ def _record(arguments: argparse.Namespace) -> None:
     if "policies" in keys:
         config = load_config(RecordPoliciesConfig, path=path, overrides=overrides)
         print(record_with_manifest("record_policies", record_policies, config, output))
-    elif {"banks", "grid"} & keys:
+    elif "banks" in keys:
         config = load_config(RecordBanksConfig, path=path, overrides=overrides)
         print(record_with_manifest("record_banks", record_banks, config, output))
     else:

@@ -16,8 +16,7 @@ import yaml
 from tools.description_import import kinematics_text
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.rendering import OPENCV_AXES, prepare_rendering, wrist_camera_pose
-from worldline_core.recorder.scene_model import SceneModel
-from worldline_core.recorder.things import build_scene
+from worldline_core.recorder.scene import SceneModel, build_scene
 
 # Capsule radii [m] of the kinematic robot masks (links, hand, fingers) per model, fitted to the exact masks of recordings.
 RADII = {

@@ -33,9 +33,9 @@ from worldline_core.distillation.auxiliary_losses import clip_robot_masks
 from worldline_core.errors import DataError
 from worldline_core.geometry.kinematics import KinematicsByName
 from worldline_core.model.world_model_config import VIEWS
-from worldline_core.recorder.record import Job, RecordConfig, open_recorder, plan_jobs
+from worldline_core.recorder.record import RecordConfig, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.simulate import EpisodeRecorder, Recording
+from worldline_core.recorder.simulate import EpisodeRecorder, Job, Recording
 from worldline_core.store.atomic import write_arrays_atomic
 
 SIZE, GRID, SIGMA_PX_REF = (64, 96), (8, 12), 36.0
@@ -141,7 +141,7 @@ def record_files(tasks: list[FileTask], workers: int) -> None:
 
 
 # A compiled model serves all files of its body in this process.
-_recorder = functools.cache(open_recorder)
+_recorder = functools.cache(EpisodeRecorder)
 
 
 @functools.cache
@@ -155,7 +155,7 @@ def record_file(task: FileTask) -> None:
     arrays: dict[str, list[np.ndarray]] = defaultdict(list)
     facts: list[Fact] = []
     for job in task.jobs:
-        recording = _recorded(recorder, job, task.num_frames)
+        recording = recorder.record(job, task.num_frames)
         for name, array in _arrays(recording, task.with_masks).items():
             arrays[name].append(array)
         episode = recording.episode
@@ -175,17 +175,6 @@ def record_file(task: FileTask) -> None:
     recorder.close()
     header = {"facts": json.dumps([asdict(fact) for fact in facts])}
     write_arrays_atomic(task.path, {name: np.stack(values) for name, values in arrays.items()}, header)
-
-
-def _recorded(recorder: EpisodeRecorder, job: Job, num_frames: int) -> Recording:
-    return recorder.record(
-        episode_id=job.episode_id,
-        split=job.split,
-        family=job.family,
-        entropy=job.entropy,
-        num_frames=num_frames,
-        policy=job.policy,
-    )
 
 
 def _arrays(recording: Recording, with_masks: bool) -> dict[str, np.ndarray]:

@@ -18,8 +18,7 @@ from worldline_core.data.sources.robomind import ROBOMIND_LAYOUTS
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import embodiment_names
 from worldline_core.pipeline.pipeline_config import PipelineConfig
-from worldline_core.recorder.banks import RecordBanksConfig
-from worldline_core.recorder.policies import RecordPoliciesConfig
+from worldline_core.recorder.attempts import RecordBanksConfig, RecordPoliciesConfig
 from worldline_core.recorder.record import RecordConfig, plan_jobs
 
 TEMPLATES = sorted([*(CONFIG_ROOT / "sources").glob("*.yaml"), *(CONFIG_ROOT / "filters").glob("*.yaml")])

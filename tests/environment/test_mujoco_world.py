@@ -18,15 +18,14 @@ from gymnasium.utils.env_checker import check_env
 pytest.importorskip("mujoco")
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment import MUJOCO_ENVIRONMENT, mujoco_world
+from worldline_core.environment import MUJOCO_ENVIRONMENT
 from worldline_core.environment.environment import WorldLineEnv
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.model.tokenizers import resize_frame
-from worldline_core.recorder.banks import BankGrid
+from worldline_core.recorder.attempts import BankGrid, RecordPoliciesConfig, record_policies
 from worldline_core.recorder.controllers import ScriptedPolicy
-from worldline_core.recorder.policies import RecordPoliciesConfig, draw_start, record_policies
 from worldline_core.recorder.record import record_with_manifest
 
 ROBOT = "ur5e_silver"
@@ -132,12 +131,13 @@ def test_a_start_is_drawn_by_the_policies_in_the_order_of_their_recording(
     compared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[list[str]] = []
+    original = RecordPoliciesConfig.draw
 
-    def draw(recorder: Any, spec: Any, config: RecordPoliciesConfig) -> Any:
+    def draw(config: RecordPoliciesConfig, recorder: Any, spec: Any) -> Any:
         drawn.append(list(config.policies))
-        return draw_start(recorder, spec, config)
+        return original(config, recorder, spec)
 
-    monkeypatch.setattr(mujoco_world, "draw_start", draw)
+    monkeypatch.setattr(RecordPoliciesConfig, "draw", draw)
     again = MujocoEnv(compared, embodiment=ROBOT)
     again.reset(seed=1)
     assert drawn == [["expert", "blind", "late"]]

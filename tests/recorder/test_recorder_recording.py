@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,13 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.recorder.banks import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
-from worldline_core.recorder.defects import DEFECTS
+from worldline_core.recorder.attempts import SEALED_FILE, BankSpec, RecordBanksConfig, record_banks
+from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.record import RecordConfig, RecordGroup, _record_job, plan_jobs, record
-from worldline_core.recorder.simulate import EpisodeRecorder, Motion, Recording
-from worldline_core.recorder.things import sample_layout
+from worldline_core.recorder.scene import sample_layout
+from worldline_core.recorder.simulate import EpisodeRecorder, Job, Motion, Recording
+
+JOB = Job("one", "viperx_graphite", "train", "place", (1, 2, 3))
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +32,7 @@ def recorder(rendering: None) -> EpisodeRecorder:
 
 @pytest.fixture(scope="module")
 def recording(recorder: EpisodeRecorder) -> Recording:
-    return recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 3), num_frames=17)
+    return recorder.record(JOB, 17)
 
 
 def digests(root: Path) -> dict[str, str]:
@@ -38,9 +41,9 @@ def digests(root: Path) -> dict[str, str]:
 
 
 def test_an_episode_is_a_function_of_its_entropy(recorder: EpisodeRecorder, recording: Recording) -> None:
-    recorder.record(episode_id="between", split="test", family="press", entropy=(9,), num_frames=17)
-    again = recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 3), num_frames=17)
-    other = recorder.record(episode_id="one", split="train", family="place", entropy=(1, 2, 4), num_frames=17)
+    recorder.record(replace(JOB, split="test", family="press", entropy=(9,)), 17)
+    again = recorder.record(JOB, 17)
+    other = recorder.record(replace(JOB, entropy=(1, 2, 4)), 17)
     np.testing.assert_array_equal(again.episode.state, recording.episode.state)
     for view, images in recording.frames.items():
         np.testing.assert_array_equal(again.frames[view], images)
@@ -110,8 +113,8 @@ def test_a_killed_recording_ends_with_the_same_bytes(recorder: EpisodeRecorder, 
     _record_job((plan_jobs(config)[-1], config, tmp_path / "resumed"))
     record(config, tmp_path / "resumed")
     assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
-    # And one between the last file of the set and the account of it.
-    (tmp_path / "whole" / "recording.json").unlink()
+    # And one between the last file of the set and those beside it.
+    (tmp_path / "whole" / DEFECTS_FILE).unlink()
     assert record(config, tmp_path / "whole") == counts
     assert digests(tmp_path / "whole") == digests(tmp_path / "resumed")
     with pytest.raises(

@@ -13,12 +13,10 @@ from tools.kinematics_export import embodiment_yaml, kinematics_xml
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.geometry.kinematics import ArmKinematics
 from worldline_core.recorder.bodies import BODIES, REACH_X
-from worldline_core.recorder.controllers import plan_waypoints
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoint, sample_waypoints, tool_rotation
+from worldline_core.recorder.controllers import ArmSolver, Waypoint, plan_waypoints, sample_waypoints, tool_rotation
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES
-from worldline_core.recorder.scene_model import SceneModel
+from worldline_core.recorder.scene import SceneModel, build_scene, sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder
-from worldline_core.recorder.things import build_scene, sample_layout
 
 EMBODIMENTS = Path(__file__).resolve().parents[2] / "configs" / "embodiments"
 
@@ -78,7 +76,7 @@ def test_state_columns_follow_the_embodiment(scene: SceneModel) -> None:
 
 
 def test_inverse_kinematics_reaches_the_table(scene: SceneModel) -> None:
-    solver = InverseKinematics(scene)
+    solver = ArmSolver(scene)
     robot = scene.robot
     for arm, placed in enumerate(robot.arms):
         for x in REACH_X:

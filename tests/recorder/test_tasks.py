@@ -15,13 +15,12 @@ mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra:
 from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.recorder.banks import BankSpec, RecordBanksConfig, draw_bank
+from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import FAILURES_FILE, RecordConfig, RecordGroup, record
 from worldline_core.recorder.rendering import TEST_SCENES
-from worldline_core.recorder.simulate import HEAD_CAMERAS, EpisodeRecorder
-from worldline_core.recorder.things import (
+from worldline_core.recorder.scene import (
     BUTTON_TRAVEL,
     DRAWER_TRAVEL,
     KINDS,
@@ -33,6 +32,7 @@ from worldline_core.recorder.things import (
     light_buttons,
     sample_layout,
 )
+from worldline_core.recorder.simulate import HEAD_CAMERAS, EpisodeRecorder
 
 
 @pytest.fixture(scope="module")
@@ -236,18 +236,14 @@ def test_a_grid_of_banks_has_five_of_every_task_and_body_in_several_test_scenes(
         assert len({spec.scene for spec in specs if (spec.embodiment, spec.family) == cell}) >= 4
 
 
-def test_banks_are_given_one_way() -> None:
-    with pytest.raises(ValidationError, match="give either banks or a grid; got neither"):
-        RecordBanksConfig()
-
-
 def test_a_bank_mixes_successes_and_failures_of_one_initial_state(recorder: EpisodeRecorder) -> None:
     spec = BankSpec(name="b", embodiment="ur5e_slate", family="carry", scene="scene_12", layout=3)
-    layout, motions = draw_bank(recorder, spec, RecordBanksConfig(banks=(spec,), candidates=8))
+    layout, motions = RecordBanksConfig(banks=(spec,), candidates=8).draw(recorder, spec)
     assert layout.family == "carry"
-    assert 0.25 <= np.mean([motion.outcome == "success" for motion in motions]) <= 0.75
-    for motion in motions[1:]:
-        np.testing.assert_array_equal(motion.qpos[0], motions[0].qpos[0])
+    assert list(motions) == [f"{candidate:03d}" for candidate in range(8)]
+    assert 0.25 <= np.mean([motion.outcome == "success" for motion in motions.values()]) <= 0.75
+    for motion in motions.values():
+        np.testing.assert_array_equal(motion.qpos[0], motions["000"].qpos[0])
 
 
 def test_what_nobody_can_record_is_refused() -> None:

@@ -26,13 +26,12 @@ from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment
 from worldline_core.model.tokenizers import resize_frame
+from worldline_core.recorder.attempts import RecordPoliciesConfig
 from worldline_core.recorder.outcomes import outcome
-from worldline_core.recorder.policies import RecordPoliciesConfig, camera_draws, draw_start
-from worldline_core.recorder.record import RecordConfig, open_recorder, plan_jobs
+from worldline_core.recorder.record import RecordConfig, plan_jobs
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene_model import FRAME_RATE
+from worldline_core.recorder.scene import FRAME_RATE, Layout, apply_layout
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion, drive, motor_targets, place_arms, read_state
-from worldline_core.recorder.things import Layout, apply_layout
 from worldline_core.shipped import shipped_folder
 from worldline_core.store.artifact_files import MANIFEST_NAME, read_manifest
 
@@ -79,7 +78,7 @@ class MujocoEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._max_episode_steps, self._observe_every = episode_frames, observe_every
         self.robot = load_embodiment(self.starts.embodiment)
         self.action_space, self.observation_space = robot_spaces(self.robot, self.views, image_size)
-        self._recorder = open_recorder(self.starts.embodiment)
+        self._recorder = EpisodeRecorder(self.starts.embodiment)
         self._data = self._recorder.new_data()
         self._recipe = _recipe(folder)
         # Drawing a start again tries every policy that recorded it.
@@ -187,8 +186,8 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
 
         def of_policies(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
             spec = specs[row.bank or ""]
-            layout, motions = draw_start(recorder, spec, compared)
-            return layout, spec.scene, camera_draws(compared, spec), motions[row.source].action[0]
+            layout, motions = compared.draw(recorder, spec)
+            return layout, spec.scene, compared.camera_draws(spec), motions[row.source].action[0]
 
         return of_policies
     if step == "record_episodes":
@@ -197,11 +196,8 @@ def _recipe(recordings: Path) -> Callable[[EpisodeRecorder, EpisodeRow], Drawn]:
 
         def of_episodes(recorder: EpisodeRecorder, row: EpisodeRow) -> Drawn:
             job = jobs[row.episode_id]
-            recorder.cameras = "held_out" if job.held_out_camera else "training"
-            layout, motion, scene, random = recorder.draw(
-                episode_id=job.episode_id, split=job.split, family=job.family, entropy=job.entropy,
-                num_frames=config.num_frames, policy=job.policy,
-            )  # fmt: skip
+            recorder.held_out_camera = job.held_out_camera
+            layout, motion, scene, random = recorder.draw(job, config.num_frames)
             return layout, scene, random, motion.action[0]
 
         return of_episodes

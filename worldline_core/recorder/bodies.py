@@ -57,6 +57,7 @@ class Robot:
             robot stands out from the tables.
         link_scale: lengthens or shortens the arm from its base to the wrist; hand and fingers keep their size.
         reach_y: where tools may be [m]: from the middle plane on an arm's own side; of a single arm, on both sides.
+        stream: number of its random draws; it never changes, because recordings must stay the same.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Robot:
     wrist: CameraMount
     link_scale: float
     reach_y: tuple[float, float]
+    stream: int
 
     def side(self, arm: int) -> float:
         """-1 for an arm whose half of the table is y < 0, +1 otherwise; a single arm uses the whole width."""
@@ -81,6 +83,7 @@ _PANDA_HOME = (0.0, 0.0, 0.0, -2.3, 0.0, 2.3, 0.785)
 
 def _body(
     name: str,
+    stream: int,
     home: tuple[float, ...],
     base: tuple[float, float],
     yaw: float,
@@ -106,20 +109,21 @@ def _body(
         wrist=wrist,
         link_scale=link_scale,
         reach_y=REACH_Y if pair else (-0.14, 0.14),
+        stream=stream,
     )
 
 
 # Six pairs and a single arm are for training; panda_ivory is held out. Colours stay weakly saturated: things are
 # saturated.
 _BODIES = (
-    _body("viperx_graphite", _VIPERX_HOME, (0.0, 0.27), 0.15, 0.042, (((0.5, 0.5, 0.5), (0.13, 0.13, 0.15)),)),
+    _body("viperx_graphite", 5, _VIPERX_HOME, (0.0, 0.27), 0.15, 0.042, (((0.5, 0.5, 0.5), (0.13, 0.13, 0.15)),)),
     _body(
-        "viperx_pearl", _VIPERX_HOME, (-0.03, 0.31), 0.25, 0.042, (((0.5, 0.5, 0.5), (0.86, 0.86, 0.84)),),
+        "viperx_pearl", 6, _VIPERX_HOME, (-0.03, 0.31), 0.25, 0.042, (((0.5, 0.5, 0.5), (0.86, 0.86, 0.84)),),
         link_scale=1.1, wrist=WRIST_FLAT,
     ),
-    _body("ur5e_silver", _UR5E_HOME, (-0.07, 0.38), 0.0, 0.040, (((0.75, 0.0, 0.0), (0.20, 0.20, 0.22)),)),
+    _body("ur5e_silver", 7, _UR5E_HOME, (-0.07, 0.38), 0.0, 0.040, (((0.75, 0.0, 0.0), (0.20, 0.20, 0.22)),)),
     _body(
-        "ur5e_slate", _UR5E_HOME, (-0.04, 0.33), 0.1, 0.040,
+        "ur5e_slate", 8, _UR5E_HOME, (-0.04, 0.33), 0.1, 0.040,
         (
             ((0.75, 0.0, 0.0), (0.30, 0.33, 0.38)), ((0.75, 0.75, 0.75), (0.24, 0.28, 0.34)),
             ((0.5, 0.75, 0.75), (0.70, 0.68, 0.62)), ((0.25, 0.25, 0.25), (0.62, 0.60, 0.55)),
@@ -127,13 +131,13 @@ _BODIES = (
         ),
         link_scale=0.94, wrist=WRIST_FLAT,
     ),
-    _body("xarm7_white", _XARM7_HOME, (-0.06, 0.30), 0.0, 0.042, (((1.0, 1.0, 1.0), (0.86, 0.87, 0.90)),)),
+    _body("xarm7_white", 9, _XARM7_HOME, (-0.06, 0.30), 0.0, 0.042, (((1.0, 1.0, 1.0), (0.86, 0.87, 0.90)),)),
     _body(
-        "xarm7_bronze", _XARM7_HOME, (-0.08, 0.35), 0.2, 0.042,
+        "xarm7_bronze", 10, _XARM7_HOME, (-0.08, 0.35), 0.2, 0.042,
         (((1.0, 1.0, 1.0), (0.46, 0.38, 0.31)), ((0.25, 0.25, 0.25), (0.16, 0.15, 0.14))),
         link_scale=1.07, wrist=WRIST_FLAT,
     ),
-    _body("xarm7_single", _XARM7_HOME, (-0.06, 0.0), 0.0, 0.042, (((1.0, 1.0, 1.0), (0.60, 0.64, 0.70)),)),
-    _body("panda_ivory", _PANDA_HOME, (-0.08, 0.32), 0.0, 0.040, (((1.0, 1.0, 1.0), (0.84, 0.80, 0.72)),)),
+    _body("xarm7_single", 12, _XARM7_HOME, (-0.06, 0.0), 0.0, 0.042, (((1.0, 1.0, 1.0), (0.60, 0.64, 0.70)),)),
+    _body("panda_ivory", 11, _PANDA_HOME, (-0.08, 0.32), 0.0, 0.040, (((1.0, 1.0, 1.0), (0.84, 0.80, 0.72)),)),
 )  # fmt: skip
 BODIES: dict[str, Robot] = {body.name: body for body in _BODIES}

@@ -7,8 +7,15 @@ from typing import Any
 import numpy as np
 
 from worldline_core.errors import DataError
-from worldline_core.recorder.scene_model import SceneModel
-from worldline_core.recorder.things import BUTTON_DOWN, BUTTON_TRAVEL, DRAWER_TRAVEL, HANDLES, STANDING, Layout
+from worldline_core.recorder.scene import (
+    BUTTON_DOWN,
+    BUTTON_TRAVEL,
+    DRAWER_TRAVEL,
+    HANDLES,
+    STANDING,
+    Layout,
+    SceneModel,
+)
 
 # What counts as done.
 LIFTED = 0.07

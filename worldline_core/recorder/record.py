@@ -10,13 +10,12 @@ import importlib.metadata
 import json
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from worldline_core.config import StrictModel
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWriter
@@ -26,46 +25,26 @@ from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene_model import FRAME_RATE
-from worldline_core.recorder.simulate import EpisodeRecorder
-from worldline_core.recorder.things import TASKS
+from worldline_core.recorder.scene import FRAME_RATE, TASKS, Family
+from worldline_core.recorder.simulate import EpisodeRecorder, Job
 from worldline_core.scale.process import end_with_pool
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
 from worldline_core.store.atomic import remove_unfinished, write_json_atomic
 from worldline_core.store.store import describe_environment, folder_lock
 
-Embodiment = Literal[
-    "viperx_graphite",
-    "viperx_pearl",
-    "ur5e_silver",
-    "ur5e_slate",
-    "xarm7_white",
-    "xarm7_bronze",
-    "xarm7_single",
-    "panda_ivory",
-]
-Family = Literal["lift", "place", "close", "press", "carry"]
-Defect = Literal[
-    "static_lead_in",
-    "reset_segment",
-    "frozen_camera",
-    "corrupted_frames",
-    "lagged_state",
-    "inverted_extrinsics",
-    "intrinsics_of_other_size",
-]
 
-# The random streams of embodiments and splits: once released, a number never changes.
-EMBODIMENT_STREAM: dict[str, int] = {
-    "viperx_graphite": 5,
-    "viperx_pearl": 6,
-    "ur5e_silver": 7,
-    "ur5e_slate": 8,
-    "xarm7_white": 9,
-    "xarm7_bronze": 10,
-    "panda_ivory": 11,
-    "xarm7_single": 12,
-}
+def _one_of(names: Collection[str]) -> AfterValidator:
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueError(f"expected one of {', '.join(sorted(names))}")
+        return name
+
+    return AfterValidator(check)
+
+
+Embodiment = Annotated[str, _one_of(BODIES)]
+Defect = Annotated[str, _one_of(DEFECTS)]
+# Random streams of the splits; a number never changes, because recordings must stay the same.
 SPLIT_STREAM = {"train": 0, "validation": 1, "test": 2, "ood_test": 3, "bank": 4}
 
 # What went wrong in each failed episode; for evaluation, never read by a judge.
@@ -139,7 +118,6 @@ class RecordConfig(StrictModel):
         num_frames: frames per episode at 8 per second.
         workers: processes.
         video_crf: x264 quality of the stored videos.
-        mcap: also write every episode as an MCAP file under ``mcap/``.
         defects: per embodiment, how many of the first training recordings are spoiled in which way (see
             ``defects.py``); what was done to which episode is written to ``injected_defects.json``.
         variety: carry some episodes out worse than planned.
@@ -150,7 +128,6 @@ class RecordConfig(StrictModel):
     num_frames: int = Field(default=33, ge=17, le=2000)
     workers: int = Field(default=2, ge=1, le=64)
     video_crf: int = Field(default=18, ge=0, le=51)
-    mcap: bool = False
     defects: dict[Embodiment, dict[Defect, int]] = Field(default_factory=dict)
     variety: Variety | None = None
 
@@ -161,20 +138,6 @@ class RecordConfig(StrictModel):
             if sum(wanted.values()) > recorded:
                 raise ValueError(f"{sum(wanted.values())} defects for {recorded} training episodes of {embodiment}")
         return self
-
-
-@dataclass(frozen=True)
-class Job:
-    """One episode to record: what it is, and the seed of all its draws."""
-
-    episode_id: str
-    embodiment: str
-    split: str
-    family: str
-    entropy: tuple[int, ...]
-    defect: str | None = None
-    held_out_camera: bool = False
-    policy: ScriptedPolicy | None = None
 
 
 def plan_jobs(config: RecordConfig) -> list[Job]:
@@ -189,7 +152,7 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
         for position in range(group.count):
             number = recorded[group.embodiment, group.split]
             recorded[group.embodiment, group.split] += 1
-            entropy = (config.seed, EMBODIMENT_STREAM[group.embodiment], SPLIT_STREAM[group.split], number)
+            entropy = (config.seed, BODIES[group.embodiment].stream, SPLIT_STREAM[group.split], number)
             left = defects.get(group.embodiment, []) if group.split == "train" else []
             job = Job(
                 episode_id=f"{group.embodiment}-{group.split}-s{config.seed}-{number:05d}",
@@ -205,14 +168,6 @@ def plan_jobs(config: RecordConfig) -> list[Job]:
     # A tenth of every group in turn, so that a worker keeps its compiled model for a while.
     jobs.sort(key=lambda item: (item[0], item[1].embodiment, item[1].split, item[1].episode_id))
     return [job for _, job in jobs]
-
-
-def open_recorder(embodiment: str, held_out_camera: bool = False) -> EpisodeRecorder:
-    """The recorder of an embodiment.
-
-    Raises: DataError for an unknown embodiment.
-    """
-    return EpisodeRecorder(embodiment, "held_out" if held_out_camera else "training")
 
 
 # One recorder per process: a compiled model and its renderers are reused while the embodiment stays the same.
@@ -231,30 +186,18 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
     key = (job.embodiment, job.held_out_camera)
     if key not in _RECORDERS:
         _close_recorders()
-        _RECORDERS[key] = open_recorder(*key)
-    recording = _RECORDERS[key].record(
-        episode_id=job.episode_id,
-        split=job.split,
-        family=job.family,
-        entropy=job.entropy,
-        num_frames=config.num_frames,
-        policy=job.policy,
-    )
+        _RECORDERS[key] = EpisodeRecorder(*key)
+    recording = _RECORDERS[key].record(job, config.num_frames)
     if recording.failure:
         write_json_atomic(output / "run" / "failures" / f"{job.episode_id}.json", recording.failure)
     if job.defect is not None:
         recording = DEFECTS[job.defect](recording, np.random.default_rng((*job.entropy, 1)))
-    if config.mcap:
-        from worldline_core.data.mcap.exported import write_episode_mcap
-
-        path = output / "mcap" / f"{job.episode_id}.mcap"
-        write_episode_mcap(path, recording.episode, recording.frames, robot_masks=recording.robot_masks)
     writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
     writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
 
 
 def run_in_processes[T, R](work: Callable[[T], R], tasks: Sequence[T], workers: int, chunk: int = 1) -> Iterator[R]:
-    """What `work` returns for each task, in their order; the processes end with this one."""
+    """Results of `work` for each task, in their order; the processes end with this one."""
     if workers == 1 or len(tasks) <= 1:
         yield from map(work, tasks)
         return
@@ -284,9 +227,7 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
         _close_recorders()
         writer.close()
     table: dict[str, dict[str, dict[str, int]]] = {}
-    rows = EpisodeSet.open(output).rows
-    check_recorded(output, {row.episode_id for row in rows}, {job.episode_id for job in jobs})
-    for row in rows:
+    for row in check_recorded(output, [job.episode_id for job in jobs]).rows:
         cell = table.setdefault(row.embodiment, {}).setdefault(row.task_family, {})
         cell[row.outcome] = cell.get(row.outcome, 0) + 1
     defects = {job.episode_id: job.defect for job in sorted(jobs, key=lambda job: job.episode_id) if job.defect}
@@ -299,29 +240,29 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     if failures:
         write_json_atomic(output / FAILURES_FILE, failures)
         counts["failures"] = dict(sorted(Counter(failures.values()).items()))
-    write_json_atomic(output / "recording.json", counts)
     return counts
 
 
-def check_recorded(output: Path, recorded: set[str], planned: set[str]) -> None:
-    """Every episode is accounted for.
+def check_recorded(output: Path, planned: Collection[str]) -> EpisodeSet:
+    """The finished set.
 
-    Raises: DataError where the set holds other episodes than were planned.
+    Raises: DataError where it holds other episodes than were planned.
     """
-    if recorded != planned:
+    episodes, wanted = EpisodeSet.open(output), set(planned)
+    recorded = {row.episode_id for row in episodes.rows}
+    if recorded != wanted:
         raise DataError(
-            "The folder holds other episodes than the configuration plans",
-            where=output,
-            expected=f"{len(planned)} episodes",
-            got=f"{len(planned - recorded)} of them missing, {len(recorded - planned)} others",
+            "The folder holds other episodes than the configuration plans", where=output, expected=f"{len(wanted)} episodes",
+            got=f"{len(wanted - recorded)} of them missing, {len(recorded - wanted)} others",
             next_step="record into a new folder",
-        )
+        )  # fmt: skip
+    return episodes
 
 
 def record_with_manifest[C: StrictModel](
     step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
 ) -> dict[str, Any]:
-    """``run(config, output)``, which continues a killed recording; the manifest is written last.
+    """The metrics of ``run(config, output)``, which continues a killed recording; the manifest is written last.
 
     Args:
         step: ``record_episodes``, ``record_banks`` or ``record_policies``.
@@ -330,22 +271,16 @@ def record_with_manifest[C: StrictModel](
     Raises:
         DataError: the folder holds a finished recording.
         ArtifactError: another command is recording into it.
-        WorldLineError: what ``run`` raises.
+        WorldLineError: raised by ``run``.
     """
     with folder_lock(output):
-        return _recorded(step, run, config, output)
-
-
-def _recorded[C: StrictModel](
-    step: str, run: Callable[[C, Path], dict[str, Any]], config: C, output: Path
-) -> dict[str, Any]:
-    if (output / MANIFEST_NAME).exists():
-        raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
-    remove_unfinished(output)
-    counts = run(config, output)
-    environment = describe_environment()
-    environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
-    values = config.model_dump(mode="json")
-    facts = {"step": step, "version": 1, "config": values, "seeds": {"seed": values["seed"]}, "metrics": counts}
-    write_manifest(output, {**facts, "environment": environment})
-    return counts
+        if (output / MANIFEST_NAME).exists():
+            raise DataError("Folder already holds a recording", where=output, next_step="record into a new folder")
+        remove_unfinished(output)
+        counts = run(config, output)
+        environment = describe_environment()
+        environment["packages"]["mujoco"] = importlib.metadata.version("mujoco")
+        values = config.model_dump(mode="json")
+        facts = {"step": step, "version": 1, "config": values, "seeds": {"seed": values["seed"]}, "metrics": counts}
+        write_manifest(output, {**facts, "environment": environment})
+        return counts

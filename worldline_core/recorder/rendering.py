@@ -21,7 +21,7 @@ import numpy as np
 from worldline_core.data.episodes.episode import CameraTrack
 from worldline_core.errors import UnavailableError, installing
 from worldline_core.recorder.bodies import Colour
-from worldline_core.recorder.scene_model import SceneModel
+from worldline_core.recorder.scene import SceneModel
 
 FRAME_SIZE = (128, 192)
 # MuJoCo cameras look along -z with y up.

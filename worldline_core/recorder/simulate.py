@@ -11,7 +11,7 @@ actions alone reproduce the motion.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,27 +19,56 @@ import numpy as np
 from worldline_core.data.episodes.episode import Episode
 from worldline_core.errors import DataError
 from worldline_core.recorder.bodies import BODIES, CENTRE, Robot
-from worldline_core.recorder.controllers import ScriptedPolicy, late, plan_waypoints, shifted
-from worldline_core.recorder.inverse_kinematics import InverseKinematics, Waypoint, plan_actions
+from worldline_core.recorder.controllers import (
+    ArmSolver,
+    ScriptedPolicy,
+    Waypoint,
+    late,
+    plan_actions,
+    plan_waypoints,
+    shifted,
+)
 from worldline_core.recorder.outcomes import outcome
 from worldline_core.recorder.rendering import SCENES, TEST_SCENES, TRAIN_SCENES, SceneRenderer
-from worldline_core.recorder.scene_model import FRAME_RATE, SUBSTEPS, SceneModel
-from worldline_core.recorder.things import Layout, apply_layout, build_scene, light_buttons, sample_layout, thing_labels
+from worldline_core.recorder.scene import (
+    FRAME_RATE,
+    SUBSTEPS,
+    Layout,
+    SceneModel,
+    apply_layout,
+    build_scene,
+    light_buttons,
+    sample_layout,
+    thing_labels,
+)
 
 # Largest accepted distance between a planned tool position and what the arm can reach.
 REACH_TOLERANCE_M = 0.012
 # What a recorded episode calls a task: what changes a thing's state is one family, whatever is lifted another.
 _TASK_FAMILIES = {"close": "state_change", "press": "state_change", "carry": "lift"}
 
-Cameras = Literal["training", "held_out"]
 # Where head cameras stand, across the table, so that arms do not hide what they work on: how far aside from facing the
 # robot [deg], elevation [deg], distance to the workspace [m].
-HEAD_CAMERAS: dict[Cameras, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+HEAD_CAMERAS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "training": ((-25.0, 25.0), (50.0, 64.0), (0.80, 0.92)),
     "held_out": ((40.0, 55.0), (38.0, 45.0), (0.80, 0.92)),
 }
 # Share of the training episodes in which a body's links have drawn colours instead of its own.
 REPAINTED = 0.4
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to record, with the seed of all its draws."""
+
+    episode_id: str
+    embodiment: str
+    split: str
+    family: str
+    entropy: tuple[int, ...]
+    defect: str | None = None
+    held_out_camera: bool = False
+    policy: ScriptedPolicy | None = None
 
 
 @dataclass(frozen=True)
@@ -146,15 +175,17 @@ def read_state(scene: SceneModel, data: Any) -> np.ndarray:
 class EpisodeRecorder:
     """Records episodes of one body; holds the compiled model and its renderers.
 
-    ``cameras`` says where head cameras may stand.
+    With ``held_out_camera`` the head camera is placed where it never is otherwise.
+
+    Raises: DataError for an unknown body.
     """
 
-    def __init__(self, body: str, cameras: Cameras = "training") -> None:
+    def __init__(self, body: str, held_out_camera: bool = False) -> None:
         if body not in BODIES:
             raise DataError("Unknown body", expected=" | ".join(sorted(BODIES)), got=body)
         self.scene = build_scene(BODIES[body])
-        self.cameras: Cameras = cameras
-        self._solver = InverseKinematics(self.scene)
+        self.held_out_camera = held_out_camera
+        self._solver = ArmSolver(self.scene)
         self._data = self.new_data()
         self._kinematics = self.new_data()
         self._own_colours = self.scene.model.geom_rgba[self.scene.robot_geoms].copy()
@@ -243,48 +274,27 @@ class EpisodeRecorder:
         )
         return Recording(episode, frames, masks, motion.failure, things)
 
-    def draw(
-        self,
-        *,
-        episode_id: str,
-        split: str,
-        family: str,
-        entropy: tuple[int, ...],
-        num_frames: int,
-        policy: ScriptedPolicy | None = None,
-    ) -> tuple[Layout, Motion, str, np.random.Generator]:
-        """Layout, executed motion and scene id of one episode, and the generator that goes on to its cameras.
+    def draw(self, job: Job, num_frames: int) -> tuple[Layout, Motion, str, np.random.Generator]:
+        """Layout, executed motion and scene id of one episode, and the generator to continue with for its cameras.
 
         Raises: DataError when no reachable plan is found in 50 draws.
         """
-        random = np.random.default_rng(entropy)
-        scenes = TRAIN_SCENES if split in ("train", "validation") else TEST_SCENES
+        random = np.random.default_rng(job.entropy)
+        scenes = TRAIN_SCENES if job.split in ("train", "validation") else TEST_SCENES
         scene_id = str(random.choice(scenes))
         for _ in range(50):
-            layout = sample_layout(self.scene.robot, family, random)
-            motion = self.move(layout, random, num_frames, policy)
+            layout = sample_layout(self.scene.robot, job.family, random)
+            motion = self.move(layout, random, num_frames, job.policy)
             if motion is not None:
                 return layout, motion, scene_id, random
-        raise DataError("No reachable plan found", where=f"episode {episode_id}", next_step="check the robot's reach")
-
-    def record(
-        self,
-        *,
-        episode_id: str,
-        split: str,
-        family: str,
-        entropy: tuple[int, ...],
-        num_frames: int,
-        policy: ScriptedPolicy | None = None,
-    ) -> Recording:
-        """Draw, execute and film one episode; the same ``entropy`` gives the same episode.
-
-        Raises: DataError when no reachable plan is found in 50 draws.
-        """
-        layout, motion, scene_id, random = self.draw(
-            episode_id=episode_id, split=split, family=family, entropy=entropy, num_frames=num_frames, policy=policy
+        raise DataError(
+            "No reachable plan found", where=f"episode {job.episode_id}", next_step="check the robot's reach"
         )
-        return self.film(layout, motion, episode_id=episode_id, scene_id=scene_id, split=split, jitter=random)
+
+    def record(self, job: Job, num_frames: int) -> Recording:
+        """Draw, execute and film one episode, a function of the job's ``entropy``; raises as :meth:`draw`."""
+        layout, motion, scene_id, random = self.draw(job, num_frames)
+        return self.film(layout, motion, episode_id=job.episode_id, scene_id=scene_id, split=job.split, jitter=random)
 
     def tool_positions(self, arm: int, qpos: np.ndarray) -> np.ndarray:
         """(N, 3) of an arm's tool."""
@@ -300,7 +310,9 @@ class EpisodeRecorder:
 
     def _set_scene(self, renderer: SceneRenderer, scene_id: str, jitter: np.random.Generator) -> None:
         """Colours, light and cameras of an episode."""
-        azimuth, elevation, distance = (jitter.uniform(*limits) for limits in HEAD_CAMERAS[self.cameras])
+        azimuth, elevation, distance = (
+            jitter.uniform(*limits) for limits in HEAD_CAMERAS["held_out" if self.held_out_camera else "training"]
+        )
         turn, rise = np.deg2rad(azimuth * jitter.choice([-1.0, 1.0])), np.deg2rad(elevation)
         target = np.array(CENTRE) + jitter.normal(0, 0.01, 3)
         back = np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
