@@ -234,7 +234,7 @@ def make_contract() -> Callable[..., ActionContract]:
             "grid_size": (4, 4),
             "tokenizer": "0123",
         }
-        return ActionContract.of_these_maps(**values | changes)
+        return ActionContract.model_validate(values | changes)
 
     return make
 

@@ -28,8 +28,6 @@ from worldline_core.model.layers import new_action_branch
 from worldline_core.model.text import load_text_encoder
 from worldline_core.model.world_model import WorldModel
 from worldline_core.model.world_model_config import (
-    NATIVE_VECTORS,
-    TEMPORAL,
     ActionContract,
     TextConfig,
     TrainedClips,
@@ -253,15 +251,13 @@ def stage2_step(start: Start, settings: Stage2Settings) -> Step:
             weights=object_weights(episodes.things[rows][:, chosen].float(), *settings.things),
         )
 
-    contract = ActionContract.of_these_maps(
+    contract = ActionContract(
         controls="action",
         sigma_px_ref=SIGMA_PX_REF,
         wrist_projection="current_camera",
         fps=8.0,
         grid_size=GRID,
         tokenizer=start.memory.tokenizer.encoder_digest[:16],
-        temporal=TEMPORAL[taken],
-        **({} if size is None else {"maps": NATIVE_VECTORS}),
     )
     trained = None if settings.views == VIEWS else TrainedClips(views=settings.views, strides=(1,))
     if settings.compile:

@@ -101,8 +101,3 @@ def test_full_history_can_still_be_trained_on(make_model: Callable[..., WorldMod
     rolled = blockwise(model, config, given)
     assert torch.allclose(given[-1][..., :5, :, :], rolled[..., :5, :, :], atol=1e-5)  # the window holds two blocks
     assert not torch.allclose(given[-1][..., 5:, :, :], rolled[..., 5:, :, :], atol=1e-3)
-
-
-def test_the_setting_is_left_out_of_dumps_at_its_default() -> None:
-    assert "trained_on" not in config_of().model_dump()["window"]
-    assert config_of(trained_on="full_history").model_dump()["window"]["trained_on"] == "full_history"

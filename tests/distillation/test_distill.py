@@ -29,7 +29,7 @@ from worldline_core.errors import ArtifactError, CheckpointError
 from worldline_core.model.block_causal_attention import KVCache
 from worldline_core.model.checkpoint import load_checkpoint, read_checkpoint_info, save_checkpoint
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TEMPORAL, TrainedClips
+from worldline_core.model.world_model_config import TrainedClips
 from worldline_core.rollout.speed import long_rollout
 from worldline_core.rollout.worldline import WorldLine
 from worldline_core.store.artifact_files import digest_file, folder_files
@@ -271,7 +271,7 @@ def test_masks_follow_the_robot_and_skip_views_without_calibration(inputs: dict[
 def test_controls_of_whole_intervals_reach_every_step(
     inputs: dict[str, Path], tmp_path: Path, make_model: Callable[..., WorldModel], make_contract: Callable
 ) -> None:
-    contract = make_contract(sigma_px_ref=40.0, temporal=TEMPORAL[4])
+    contract = make_contract(sigma_px_ref=40.0)
     save_checkpoint(inputs["stage2"], make_model(0, action_frames=4), kind="stage2", action_contract=contract)
     distill(config(), inputs, tmp_path / "out")
     model, info = load_checkpoint(tmp_path / "out", expect_kind="causal")

@@ -105,7 +105,6 @@ def test_stage2_says_in_part_what_blocks_of_clips_it_knows_should_become(
 
 def test_the_step_trains_with_both(inputs: dict[str, Path], tmp_path: Path) -> None:
     plain = config().model_dump(mode="json")
-    assert not {"history", "teacher_share", "teacher_frames"} & plain["teacher_forcing"].keys()
     plain["teacher_forcing"] |= {"history": "generated", "history_noise": 0.0, "teacher_share": 0.5}
     changed = DistillConfig.model_validate(plain)
     distill(config(), inputs, tmp_path / "plain")

@@ -17,7 +17,7 @@ from worldline_core.model.checkpoint import save_checkpoint
 from worldline_core.model.layers import new_action_branch
 from worldline_core.model.tokenizers import fit_patch_tokenizer
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import CAUSAL_SIGMAS, NATIVE_VECTORS, CausalSpec, WorldModelConfig
+from worldline_core.model.world_model_config import CAUSAL_SIGMAS, CausalSpec, WorldModelConfig
 
 SIZE = (32, 48)
 SPEC = CausalSpec(block_size=4, sink_blocks=1, recent_blocks=1, sigmas=CAUSAL_SIGMAS)
@@ -109,7 +109,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, make_contract: Callable, ma
     save_checkpoint(root / "silent", both, kind="base", action_contract=None)
     save_checkpoint(root / "foreign", both, kind="base", action_contract=None, metadata=facts | {"tokenizer": "0123"})
     film = config.model_copy(update={"action_conditioning": "native_film", "action_channels": 14})
-    contract = contract.model_copy(update={"maps": NATIVE_VECTORS})
     model.config, model.action_encoder = film, new_action_branch(film)
     torch.nn.init.normal_(model.action_encoder.proj[0].weight, generator=generator)
     save_checkpoint(root / "film", model, kind="stage2", action_contract=contract)

@@ -49,7 +49,7 @@ class WindowConfig(StrictModel):
 
     sink_blocks: int = Field(default=1, ge=1)
     recent_blocks: int = Field(default=3, ge=0)
-    trained_on: Literal["window", "full_history"] = Field(default="window", exclude_if=lambda value: value == "window")
+    trained_on: Literal["window", "full_history"] = "window"
 
 
 class TeacherForcingConfig(StrictModel):
@@ -68,11 +68,10 @@ class TeacherForcingConfig(StrictModel):
     trainer: TrainerConfig = TrainerConfig(steps=2000, optimizer=OptimizerConfig(learning_rate=3e-4))
     sigma: SigmaSampling = SigmaSampling(shift=2.0)
     weighting: LossWeighting = LossWeighting()
-    # Left out of dumps at their defaults: what was made before they existed keeps its key in the store.
-    history: Literal["recorded", "generated"] = Field(default="recorded", exclude_if=lambda value: value == "recorded")
+    history: Literal["recorded", "generated"] = "recorded"
     history_noise: float = Field(default=0.0, ge=0)
-    teacher_share: float = Field(default=0.0, ge=0, le=1, exclude_if=lambda value: value == 0)
-    teacher_frames: int | None = Field(default=None, ge=1 + TEMPORAL_FACTOR, exclude_if=lambda value: value is None)
+    teacher_share: float = Field(default=0.0, ge=0, le=1)
+    teacher_frames: int | None = Field(default=None, ge=1 + TEMPORAL_FACTOR)
     view_weights: dict[str, float] | None = None
     single_view_factor: int = Field(default=1, ge=1)
 
@@ -145,8 +144,7 @@ class DistillConfig(StrictModel):
     are encoded when the teacher sees them; the trajectories keep the latents of their clips.
     """
 
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    input: ClipInput = Field(default=LatentInput(), exclude_if=lambda value: value == LatentInput())
+    input: ClipInput = LatentInput()
     clips: ClipSampling = ClipSampling()
     splits: list[str] = Field(default=["train"], min_length=1)
     validation_splits: list[str] = Field(default=["validation"])
@@ -157,10 +155,7 @@ class DistillConfig(StrictModel):
     teacher_forcing: TeacherForcingConfig = TeacherForcingConfig()
     trajectory_regression: TrajectoryRegressionConfig = TrajectoryRegressionConfig()
     distribution_matching: DistributionMatchingConfig = DistributionMatchingConfig()
-    # Left out of dumps at its default: what was made before it existed keeps its key in the store.
-    perceptual: PerceptualConfig = Field(
-        default=PerceptualConfig(), exclude_if=lambda value: value == PerceptualConfig()
-    )
+    perceptual: PerceptualConfig = PerceptualConfig()
     lpips_weights: Path | None = Field(default=None, description="folder of the LPIPS weights; None: that term is off")
 
     @model_validator(mode="after")

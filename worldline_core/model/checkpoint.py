@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import torch
-from pydantic import BaseModel, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ValidationError, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -22,7 +22,7 @@ from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 from worldline_core.model.layers import is_text_parameter
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import TEMPORAL, ActionContract, CausalSpec, TrainedClips, WorldModelConfig
+from worldline_core.model.world_model_config import ActionContract, CausalSpec, TrainedClips, WorldModelConfig
 from worldline_core.store.artifact_files import digest_file
 from worldline_core.store.atomic import write_bytes_atomic, write_json_atomic
 
@@ -184,11 +184,10 @@ SINGLE_PRECISION = ("time_embedder.",)
 
 
 class CheckpointInfo(StrictModel):
-    """What ``checkpoint.json`` says; every field is read strictly, and none has a default for a model that needs it.
+    """The content of ``checkpoint.json``, read strictly.
 
     Attributes:
-        action_contract: what the action maps meant that it was trained with; None (an empty object in the file) for
-            models that have seen none.
+        action_contract: meaning of the action maps in training; None for models that have seen none.
         causal: blocks, window and nodes of a block-causal model.
         trained: views and strides of the clips that it was trained on; None: all views, at stride 1.
         metadata: where it comes from; nothing is computed from it.
@@ -203,20 +202,10 @@ class CheckpointInfo(StrictModel):
     dtype: str
     weights_sha256: str
 
-    @field_validator("action_contract", mode="before")
-    @classmethod
-    def _empty_is_none(cls, value: object) -> object:
-        return None if value == {} else value
-
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if self.kind in ("stage2", "causal") and self.action_contract is None:
             raise ValueError(f"action_contract: a checkpoint of kind {self.kind} needs one")
-        if self.action_contract is not None and self.action_contract.temporal != TEMPORAL[self.config.action_frames]:
-            frames = self.config.action_frames
-            raise ValueError(
-                f"action_contract.temporal: a model with action_frames {frames} needs {TEMPORAL[frames]!r}"
-            )
         if (self.kind == "causal") != (self.causal is not None):
             raise ValueError(f"causal: needed by the kind causal and no other, not by {self.kind}")
         unknown = [view for view in self.views if view not in self.config.views]
@@ -289,16 +278,8 @@ def save_checkpoint(
     )
     # The description goes last: until then the folder is no checkpoint.
     digest = write_weights(folder / WEIGHTS, source, max_shard_bytes, dtype)
-    write_description(folder, info.model_copy(update={"weights_sha256": digest}))
-
-
-def write_description(folder: Path, info: CheckpointInfo) -> None:
-    """Write ``checkpoint.json``."""
-    content = info.model_dump(
-        mode="json", exclude={name for name in ("causal", "trained") if getattr(info, name) is None}
-    )
-    content["action_contract"] = content["action_contract"] or {}
-    write_json_atomic(folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **content})
+    described = info.model_copy(update={"weights_sha256": digest}).model_dump(mode="json")
+    write_json_atomic(folder / DESCRIPTION, {"format": FORMAT, "version": VERSION, **described})
 
 
 def read_checkpoint_info(folder: Path) -> CheckpointInfo:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from worldline_core.actions.actions_config import REFERENCE_CANVAS, WristProjection
+from worldline_core.actions.actions_config import WristProjection
 from worldline_core.config import StrictModel
 from worldline_core.errors import CheckpointError
 
@@ -71,10 +71,9 @@ class WorldModelConfig(StrictModel):
     """The time embedding sees ``1000 * sigma * timestep_scale`` (Cosmos3: 0.001)."""
     action_channels: int = Field(default=9, ge=1)
     """Channels of the map of one control frame; with ``native_film`` the size that control vectors are padded to."""
-    # Left out of dumps at their defaults: checkpoints without them stay the same bytes.
-    action_frames: Literal[1, 4] = Field(default=1, exclude_if=lambda value: value == 1)
+    action_frames: Literal[1, 4] = 1
     """Control frames whose maps a latent frame takes: its own (the paper), or all four of its interval."""
-    action_conditioning: ActionConditioning = Field(default="maps", exclude_if=lambda value: value == "maps")
+    action_conditioning: ActionConditioning = "maps"
     """``maps``: added to the tokens (the method). ``native_film``: control vectors by FiLM (the paper's ablation)."""
     prediction: Literal["velocity", "sample", "first_frame_residual"] = "velocity"
     """What the head emits. ``sample``: the clean latents; the velocity follows as ``(x - x0) / sigma``.
@@ -165,8 +164,6 @@ class ImportBackboneConfig(StrictModel):
     changes: dict[str, Any] = Field(default={}, description="fields of the model's config to set besides (view slots)")
 
 
-NATIVE_VECTORS = "none: native control vectors, zero-padded"
-"""In place of maps: what drives a model with FiLM. Their layout is that of the embodiment's state."""
 FULL_STEPS = 35
 """Euler steps of the whole-clip sampler, at even noise levels."""
 CAUSAL_SHIFT = 5.0
@@ -174,18 +171,14 @@ CAUSAL_SIGMAS = (1.0, 15 / 16, 5 / 6, 5 / 8, 0.0)
 """Nodes of the paper's four-step causal sampler: shift 5 on 1, 3/4, 1/2, 1/4, 0."""
 
 
-OWN_FRAME = "latent frame 0 takes frame 0, latent frame j takes frame 4 j"
-INTERVAL = "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3"
-TEMPORAL = {1: OWN_FRAME, 4: INTERVAL}
-"""Which controls a latent frame takes, by the number of control frames (``WorldModelConfig.action_frames``)."""
-
-
 class ActionContract(StrictModel):
-    """What the action maps mean; a model understands no other maps than those it was trained with.
+    """Meaning of the action maps; a model understands no other maps than those it was trained with.
+
+    Of each arm, maps hold ``[h, d h, r1 h .. r6 h, g h]``: the Gaussian h, the depth d [m], the rotation r of the end effector in
+    the camera frame (rot6d), and the gripper's opening g (0 closed, 1 open). Arms are added.
 
     Attributes:
         controls: what is projected: commands, measured joints, or recorded tool poses.
-        maps, depth_unit, rotation, gripper, temporal, reference_canvas: conventions of this version of the maps.
         sigma_px_ref: width of the Gaussian, pixels on the reference canvas (H, W).
         wrist_projection: into each frame's wrist camera, or into that of the clip's first frame.
         fps: control frames per second of the recordings.
@@ -194,33 +187,11 @@ class ActionContract(StrictModel):
     """
 
     controls: Literal["action", "state", "ee_pose"]
-    maps: Literal["[h, d h, r1 h .. r6 h, g h], arms added", "none: native control vectors, zero-padded"]
-    depth_unit: Literal["m"]
-    rotation: Literal["rot6d, end effector in the camera frame"]
-    gripper: Literal["0 closed, 1 open"]
-    temporal: Literal[
-        "latent frame 0 takes frame 0, latent frame j takes frame 4 j",
-        "latent frame 0 takes frame 0, latent frame j takes frames 4 j, 4 j - 1, 4 j - 2, 4 j - 3",
-    ]
-    reference_canvas: tuple[Literal[384], Literal[512]]
     sigma_px_ref: float = Field(gt=0)
     wrist_projection: WristProjection
     fps: float = Field(gt=0)
     grid_size: tuple[int, int]
     tokenizer: str = Field(min_length=1)
-
-    @classmethod
-    def of_these_maps(cls, **values: object) -> Self:
-        """With the conventions of the maps that this version draws, and ``values`` for the other fields."""
-        conventions = {
-            "maps": "[h, d h, r1 h .. r6 h, g h], arms added",
-            "depth_unit": "m",
-            "rotation": "rot6d, end effector in the camera frame",
-            "gripper": "0 closed, 1 open",
-            "temporal": OWN_FRAME,
-            "reference_canvas": REFERENCE_CANVAS,
-        }
-        return cls.model_validate(conventions | values)
 
     def require(self, *, where: object, **found: object) -> None:
         """Refuse data that other maps would be drawn from, naming every field that differs.

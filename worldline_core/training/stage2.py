@@ -11,11 +11,11 @@ from typing import Any
 
 from worldline_core.actions.episode_tracks import ActionTracks
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.errors import ConfigError
+from worldline_core.errors import CheckpointError, ConfigError
 from worldline_core.model.checkpoint import CheckpointInfo, load_checkpoint, read_checkpoint_info
 from worldline_core.model.layers import new_action_branch
 from worldline_core.model.world_model import WorldModel
-from worldline_core.model.world_model_config import NATIVE_VECTORS, TEMPORAL, ActionContract, WorldModelConfig
+from worldline_core.model.world_model_config import ActionContract, WorldModelConfig
 from worldline_core.training.flow_matching import FlowMatchingObjective
 from worldline_core.training.processes import processes
 from worldline_core.training.relational import RelationalTerm, TeacherSimilarities
@@ -76,19 +76,25 @@ def train_stage2(config: Stage2Config, inputs: Mapping[str, Path], output: Path)
 
     stage = Stage.open(config, inputs, output, number=2, title="stage II", load_model=load_model, tracks=tracks)
     model = stage.model
-    contract = ActionContract.of_these_maps(
-        controls=tracks.tracks(stage.training_rows[0].episode_id).controls,
-        fps=stage.episodes.rows[0].fps,
-        sigma_px_ref=tracks.sigma_px_ref,
-        wrist_projection=config.wrist_projection,
-        grid_size=stage.source.latent_shape[1:],
-        tokenizer=stage.source.description["tokenizer"],
-        temporal=TEMPORAL[config.action_frames],
-        **({"maps": NATIVE_VECTORS} if native else {}),
+    contract = ActionContract.model_validate(
+        {
+            "controls": tracks.tracks(stage.training_rows[0].episode_id).controls,
+            "fps": stage.episodes.rows[0].fps,
+            "sigma_px_ref": tracks.sigma_px_ref,
+            "wrist_projection": config.wrist_projection,
+            "grid_size": stage.source.latent_shape[1:],
+            "tokenizer": stage.source.description["tokenizer"],
+        }
     )
-    learnt = read_checkpoint_info(parent).action_contract
+    before = read_checkpoint_info(parent)
+    learnt = before.action_contract
     if learnt is not None:
-        kept = {"maps", "sigma_px_ref", "wrist_projection", "tokenizer", "fps"}
+        if before.config.native_size != config.native_size:
+            raise CheckpointError(
+                "The Stage II model is driven otherwise", where=f"{parent}: native_size", expected=before.config.native_size,
+                got=config.native_size,
+            )  # fmt: skip
+        kept = {"sigma_px_ref", "wrist_projection", "tokenizer", "fps"}
         learnt.require_tracks((row.episode_id for row in stage.rows), tracks)
         learnt.require(where=inputs["tracks"], **contract.model_dump(include=kept))
     loader = stage.loader(tracks=tracks, wrist_projection=config.wrist_projection)
