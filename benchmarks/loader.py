@@ -64,7 +64,7 @@ def scene(seed: int, count: int, height: int, width: int) -> np.ndarray:
 def write_recordings(root: Path, case: dict[str, Any]) -> EpisodeSet:
     """An EpisodeSet of the case's size."""
     count = case["frames"]
-    with EpisodeSetWriter(root, fps=case["fps"], image_size=case["size"], video_preset="fast") as writer:
+    with EpisodeSetWriter(root, video_preset="fast") as writer:
         for number in range(case["episodes"]):
             state = np.zeros((count, 2), np.float32)
             episode = Episode(

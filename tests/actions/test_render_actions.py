@@ -60,7 +60,7 @@ def episode_set(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("episodes")
     good = [episode_of("ur5e_pair", 0), episode_of("ur5e_pair", 1), episode_of("so101", 0)]
     unknown = replace(good[0], episode_id="alien-0", embodiment="alien")
-    with EpisodeSetWriter(root, fps=8, image_size=(64, 96)) as writer:
+    with EpisodeSetWriter(root) as writer:
         for episode in [*good, unknown]:
             frames = {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras}
             writer.add(episode, frames)
@@ -210,7 +210,7 @@ def test_damaged_data_is_no_verdict_on_an_episode(linked, tmp_path, damage, file
 
 def test_previews_have_names_of_their_own_however_long_or_alike_ids_are(tmp_path):
     ids = ["a/b", "a_b", "x" * 400, "../../up"]
-    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(64, 96)) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         for name in ids:
             episode = replace(episode_of("so101", 0), episode_id=name)
             writer.add(episode, {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras})
@@ -238,7 +238,7 @@ def test_tracks_that_are_no_numbers_are_refused(rendered, tmp_path, value, name)
 
 
 def test_a_set_without_any_tracks_is_an_error(tmp_path):
-    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(64, 96)) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         for number in range(2):
             blind = replace(episode_of("so101", number), cameras={})
             writer.add(blind, {"right_wrist": np.full((N, 64, 96, 3), 90, np.uint8)})
@@ -249,7 +249,7 @@ def test_a_set_without_any_tracks_is_an_error(tmp_path):
 
 
 def test_of_a_robot_that_nobody_describes_it_is_said_what_it_is_good_for(tmp_path):
-    with EpisodeSetWriter(tmp_path / "set", fps=8, image_size=(64, 96)) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         episode = replace(episode_of("so101", 0), embodiment="none")
         writer.add(episode, {view: np.full((N, 64, 96, 3), 90, np.uint8) for view in episode.cameras})
     with pytest.raises(

@@ -33,7 +33,7 @@ def test_lerobots_own_class_reads_the_same_frames_and_values(
 ) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
-    with EpisodeSetWriter(tmp_path / "set", fps=8) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         for number in range(3):
             writer.add(*sample(number, num_frames=5 + number))
     stored = EpisodeSet.open(tmp_path / "set")
@@ -53,7 +53,7 @@ def test_lerobots_own_class_reads_the_same_frames_and_values(
             assert np.array_equal(pixels, stored.frames(episode, view, [frame])[0])
     # Videos copied as they were recorded, with frames stored out of order, one file an episode.
     shown = {}
-    with EpisodeSetWriter(tmp_path / "copied", fps=8) as writer:
+    with EpisodeSetWriter(tmp_path / "copied") as writer:
         for number in range(2):
             episode, frames, _ = sample(number, num_frames=15)
             path = tmp_path / f"{number}.mp4"

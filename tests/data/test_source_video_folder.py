@@ -215,7 +215,7 @@ def test_from_a_folder_of_videos_to_a_step_of_stage_1(tmp_path: Path, project_ro
     write_video(root / "moving.mp4", pictures(1))
     (root / "moving.txt").write_text("push the red block")
     write_video(root / "still.mp4", pictures(2, moving=False))
-    with EpisodeSetWriter(robot, fps=8) as writer:
+    with EpisodeSetWriter(robot) as writer:
         writer.add(*sample(0, num_frames=FRAMES, height=HEIGHT, width=WIDTH))
     config = settings(root)
     both = CurateConfig(sources=(*config.sources, *_robot(robot)))

@@ -106,7 +106,7 @@ def test_what_changes_the_picture_or_asks_for_it_is_encoded(tmp_path: Path, samp
     assert len(shown) == after.rows[0].num_frames == FRAMES // step
     if "image_size" not in changes:
         assert np.abs(shown.astype(int) - expected).mean() < 3
-    assert not list((tmp_path / "out" / "run").rglob("*.arrow"))
+    assert not list((tmp_path / "out" / "run").rglob("*.npz"))
 
 
 def test_an_image_size_that_is_the_recordings_own_changes_nothing(tmp_path: Path, sample: Make) -> None:
@@ -116,7 +116,7 @@ def test_an_image_size_that_is_the_recordings_own_changes_nothing(tmp_path: Path
 
 def test_verdicts_do_not_depend_on_the_cached_thumbnails(tmp_path: Path, sample: Make) -> None:
     curate(config(recordings(tmp_path, sample)), {}, tmp_path / "out")
-    left = sorted((tmp_path / "out" / "run" / "thumbnails").rglob("*.arrow"))
+    left = sorted((tmp_path / "out" / "run" / "thumbnails").rglob("*.npz"))
     assert len(left) == 9
     curated = EpisodeSet.open(tmp_path / "out")
     cached = {view: curated.thumbnails(1, view) for view in curated.rows[1].views}
@@ -139,7 +139,7 @@ def test_cached_thumbnails_of_another_video_are_not_used(tmp_path: Path, sample:
     path = curated.clip(0, "head").path
     shutil.copy(curated.clip(1, "head").path, path)  # type: ignore[arg-type]
     assert np.array_equal(curated.thumbnails(0, "head").gray, other.gray)
-    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.arrow"))
+    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.npz"))
     content = cache.read_bytes()
     cache.write_bytes(content[:200])
     assert np.array_equal(curated.thumbnails(0, "head").gray, other.gray)
@@ -148,7 +148,7 @@ def test_cached_thumbnails_of_another_video_are_not_used(tmp_path: Path, sample:
 def test_a_flipped_byte_in_cached_thumbnails_changes_nothing(tmp_path: Path, sample: Make) -> None:
     curate(config(recordings(tmp_path, sample, 1)), {}, tmp_path / "out")
     curated = EpisodeSet.open(tmp_path / "out")
-    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.arrow"))
+    cache = next((tmp_path / "out" / "run" / "thumbnails").rglob("*head*/*/file-000.npz"))
     content, true = cache.read_bytes(), curated.thumbnails(0, "head")
     for position in range(0, len(content), len(content) // 40):
         cache.write_bytes(content[:position] + bytes([content[position] ^ 16]) + content[position + 1 :])

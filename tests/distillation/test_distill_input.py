@@ -38,7 +38,7 @@ def recorded(tmp_path: Path, make_model: Callable, make_contract: Callable) -> d
     names = ("episodes", "tokenizer", "latents", "tracks", "stage2")
     folders = {name: tmp_path / "in" / name for name in names}
     K, random = np.array([[20.0, 0, 15.5], [0, 20.0, 15.5], [0, 0, 1.0]]), np.random.default_rng(0)
-    with EpisodeSetWriter(folders["episodes"], fps=8, image_size=IMAGE) as writer:
+    with EpisodeSetWriter(folders["episodes"]) as writer:
         for name, split in EPISODES.items():
             blocks = random.integers(30, 220, (FRAMES, 4, 4, 3)).repeat(8, 1).repeat(8, 2)
             state = np.linspace([0, 0], [1, 1], FRAMES, dtype=np.float32)

@@ -91,7 +91,7 @@ def _write(
     methods = {"good": root / "good", "copy": root / "copy"}
     writers = {name: RolloutSetWriter(path, name, FPS) for name, path in methods.items()}
     index = []
-    with EpisodeSetWriter(episodes, fps=FPS, image_size=(HEIGHT, WIDTH), pixel_format="yuv444p") as writer:
+    with EpisodeSetWriter(episodes, pixel_format="yuv444p") as writer:
         learned = {f"train-{number:02d}": bool(number % 2) for number in range(training)}
         for number, (episode_id, success) in enumerate({**cases, **learned}.items()):
             frames, masks, points = make_film(success, seed=0 if bank else number)

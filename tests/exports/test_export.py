@@ -33,7 +33,7 @@ FRAMES = 20
 def linked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set like a filter's: segments of episodes whose datasets lie in another artifact, with that one's licences."""
     root = tmp_path_factory.mktemp("sets")
-    with EpisodeSetWriter(root / "curated", fps=10) as writer:
+    with EpisodeSetWriter(root / "curated") as writer:
         for number in range(3):
             time = np.arange(FRAMES) / 10
             state = np.stack([np.sin(time + number), np.cos(time)], axis=1).astype(np.float32)
@@ -130,7 +130,7 @@ def test_a_rerun_export_holds_the_tools_as_inspect_shows_them(tmp_path: Path, ca
     poses[:, 0, :3, 3] = np.linspace([-0.2, 0, 0.8], [0.2, 0.1, 0.6], 6)
     cameras = {"head": CameraTrack("head", np.diag([40.0, 41.0, 1.0]), np.eye(4)[None], 48, 32)}
     state = np.linspace(0, 1, 12, dtype=np.float32).reshape(6, 2)
-    with EpisodeSetWriter(tmp_path / "set", fps=10) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         for name, tools in (("recorded", poses), ("unknown", None)):
             episode = Episode(
                 episode_id=name, source="toy", embodiment="nobody", scene="s", task_family="lift", instruction="lift", outcome="success",

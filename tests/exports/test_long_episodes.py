@@ -48,7 +48,7 @@ def write_set(root: Path, count: int) -> None:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     shade = ((columns + rows)[None] + 3 * np.arange(count)[:, None, None]) % 200
     frames = np.stack([shade, 200 - shade, shade // 2], axis=-1).astype(np.uint8)
-    with EpisodeSetWriter(root / "episodes", FPS, video_preset="ultrafast", pixel_format="yuv444p") as writer:
+    with EpisodeSetWriter(root / "episodes", video_preset="ultrafast", pixel_format="yuv444p") as writer:
         writer.add(
             episode, dict.fromkeys(VIEWS, frames), {"head": shade < 60}, None, {"head": (shade < 20).astype(np.uint8)}
         )

@@ -278,7 +278,7 @@ def test_a_robot_whose_description_is_not_here_is_left_out_not_fatal(monkeypatch
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:3000])])
 @pytest.mark.parametrize("pattern", ["*.mp4", "cameras.parquet"])
 def test_damaged_data_is_no_verdict_on_an_episode(tmp_path: Path, pattern: str, damage: Any) -> None:
-    with EpisodeSetWriter(tmp_path / "set", fps=FPS, image_size=(HEIGHT, WIDTH)) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         writer.add(*record(0))
     shutil.rmtree(tmp_path / "set" / "thumbnails", ignore_errors=True)
     damage(sorted((tmp_path / "set").rglob(pattern))[0])

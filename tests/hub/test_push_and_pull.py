@@ -19,7 +19,7 @@ PLACE = "hf://datasets/lab/toy"
 
 
 def make_set(root: Path, *, episodes: int = 2, conventions: dict[str, Any] | None = None) -> Path:
-    with EpisodeSetWriter(root, fps=8) as writer:
+    with EpisodeSetWriter(root) as writer:
         for number in range(episodes):
             rng = np.random.default_rng(number)
             state = rng.normal(size=(12, 3)).astype(np.float32) * 0.1
@@ -194,7 +194,7 @@ def test_licences_are_kept(
 
 def test_evaluation_sources_are_not_handed_on(hub: Any, tmp_path: Path) -> None:
     root = tmp_path / "set"
-    with EpisodeSetWriter(root, fps=8) as writer:
+    with EpisodeSetWriter(root) as writer:
         state = np.zeros((4, 1), np.float32)
         episode = Episode(
             episode_id="e", source="toy", embodiment="toy", scene="s", task_family="lift", instruction="", outcome="unknown", split="test",

@@ -84,7 +84,7 @@ def write_episode_set(
     folder: Path, kept: tuple[tuple[str, ...], ...] = EPISODES, name: str = "broken-1", reason: str = "truncated_video"
 ) -> None:
     """An EpisodeSet with one quarantined input."""
-    with EpisodeSetWriter(folder, FPS, (HEIGHT, WIDTH)) as writer:
+    with EpisodeSetWriter(folder) as writer:
         for row in kept:
             writer.add(episode(*row), frames(EPISODES.index(row)))
         writer.quarantine(

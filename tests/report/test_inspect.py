@@ -83,7 +83,7 @@ def test_a_damaged_artifact_is_refused_before_it_is_read(run_artifacts: dict[str
 
 
 def test_episodes_with_similar_names_get_different_files(tmp_path: Path) -> None:
-    with EpisodeSetWriter(tmp_path / "set", 8.0, (64, 96)) as writer:
+    with EpisodeSetWriter(tmp_path / "set") as writer:
         for name in ("run 1", "run_1"):
             writer.add(episode(name, *EPISODES[0][1:]), frames(0))
     names = [

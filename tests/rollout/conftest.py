@@ -64,7 +64,7 @@ def write_recordings(
     """
     K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     tracks = []
-    with EpisodeSetWriter(root / "episodes", fps=8, image_size=SIZE) as writer:
+    with EpisodeSetWriter(root / "episodes") as writer:
         for seed, (name, split, count, views, calibrated) in enumerate(episodes):
             joints = np.linspace(np.zeros(joints_of), np.full(joints_of, seed), count, dtype=np.float32)
             episode = Episode(

@@ -35,7 +35,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("import") / "episodes"
     K = np.array([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     joints = np.zeros((N, 14), np.float32)
-    with EpisodeSetWriter(root, fps=8, image_size=SIZE) as writer:
+    with EpisodeSetWriter(root) as writer:
         for name in (*EPISODES, "robot_train"):
             episode = Episode(
                 episode_id=name, source="synthetic", embodiment="ur5e_pair", scene="s", task_family="lift",

@@ -38,7 +38,7 @@ def inputs_of(
     root: Path, recordings: Sequence[tuple[Episode, dict[str, np.ndarray]]], fps: float, make_model: Callable, make_contract: Callable
 ) -> dict[str, str]:  # fmt: skip
     """The recordings as an EpisodeSet with its tracks, and a causal and a Stage II model of random weights for them."""
-    with EpisodeSetWriter(root / "episodes", fps=fps, image_size=SIZE) as writer:
+    with EpisodeSetWriter(root / "episodes") as writer:
         for episode, frames in recordings:
             writer.add(episode, frames)
     config = RenderActionsConfig(source="state", sigma_px_ref=SIGMA_PX_REF, previews=0)  # pyright: ignore[reportCallIssue]

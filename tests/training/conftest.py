@@ -133,7 +133,7 @@ def write_episodes(root: Path, count: int, validation: int) -> None:
         view: CameraTrack(view, np.array([[20.0, 0, 15.5], [0, 20.0, 15.5], [0, 0, 1.0]]), np.eye(4)[None], 32, 32)
         for view in VIEWS
     }
-    with EpisodeSetWriter(root, fps=8, image_size=IMAGE) as writer:
+    with EpisodeSetWriter(root) as writer:
         for number in range(count):
             rows, columns = np.mgrid[: IMAGE[0], : IMAGE[1]]
             frames = np.zeros((FRAMES, *IMAGE, 3), np.uint8)

@@ -26,7 +26,7 @@ from worldline_core.recorder.bodies import Robot
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.record import SPLIT_STREAM, Embodiment, check_recorded, run_in_processes
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene import FRAME_RATE, Family, Layout, sample_layout
+from worldline_core.recorder.scene import Family, Layout, sample_layout
 from worldline_core.recorder.simulate import EpisodeRecorder, Motion
 from worldline_core.store.atomic import atomic_path
 
@@ -180,7 +180,7 @@ def _record_start(task: tuple[BankSpec, RecordBanksConfig | RecordPoliciesConfig
     recorder = EpisodeRecorder(start.embodiment)
     layout, motions = config.draw(recorder, start)
     finished = EpisodeSetWriter.finished(output)
-    writer = None if finished else EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
+    writer = None if finished else EpisodeSetWriter(output, video_crf=config.video_crf)
     for number, (name, motion) in enumerate(motions.items()):
         episode_id = f"{start.name}-{name}"
         if writer is None or writer.has(episode_id):
@@ -211,7 +211,7 @@ def _record_starts(
             outcomes.append(found)
             progress.advance()
     if not EpisodeSetWriter.finished(output):
-        EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf).close()
+        EpisodeSetWriter(output, video_crf=config.video_crf).close()
     recorded = list(zip(specs, outcomes, strict=True))
     check_recorded(output, [f"{spec.name}-{name}" for spec, found in recorded for name in found])
     return recorded

@@ -25,7 +25,7 @@ from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.controllers import ScriptedPolicy
 from worldline_core.recorder.defects import DEFECTS, DEFECTS_FILE
 from worldline_core.recorder.rendering import prepare_rendering
-from worldline_core.recorder.scene import FRAME_RATE, TASKS, Family
+from worldline_core.recorder.scene import TASKS, Family
 from worldline_core.recorder.simulate import EpisodeRecorder, Job
 from worldline_core.scale.process import end_with_pool
 from worldline_core.store.artifact_files import MANIFEST_NAME, write_manifest
@@ -192,7 +192,7 @@ def _record_job(task: tuple[Job, RecordConfig, Path]) -> None:
         write_json_atomic(output / "run" / "failures" / f"{job.episode_id}.json", recording.failure)
     if job.defect is not None:
         recording = DEFECTS[job.defect](recording, np.random.default_rng((*job.entropy, 1)))
-    writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
+    writer = EpisodeSetWriter(output, video_crf=config.video_crf)
     writer.add(recording.episode, recording.frames, recording.robot_masks, thing_labels=recording.thing_labels)
 
 
@@ -218,7 +218,7 @@ def record(config: RecordConfig, output: Path) -> dict[str, Any]:
     # A kill may come between the set's last file and the account of it.
     if not EpisodeSetWriter.finished(output):
         prepare_rendering()
-        writer = EpisodeSetWriter(output, fps=FRAME_RATE, video_crf=config.video_crf)
+        writer = EpisodeSetWriter(output, video_crf=config.video_crf)
         missing = [job for job in jobs if not writer.has(job.episode_id)]
         done = len(jobs) - len(missing)
         with Progress("record", len(jobs), "episode", done=done) as progress:

@@ -207,7 +207,7 @@ def write_recordings(folder: Path, episodes: Sequence[str], *, split: str | None
         split: given to all of them; by default each keeps its own.
     """
     shipped = EpisodeSet.open(shipped_folder() / "recordings")
-    with EpisodeSetWriter(folder, fps=FPS, video_crf=10, video_preset="ultrafast") as writer:
+    with EpisodeSetWriter(folder, video_crf=10, video_preset="ultrafast") as writer:
         for name in episodes:
             position = shipped.position(name)
             episode = shipped.episode(position)

@@ -145,7 +145,7 @@ def save_played(
         conventions={"pictures": "predicted", "started_at": recorded.episode_id, **notes},
     )  # fmt: skip
     root = folder / safe_stem(name)
-    with EpisodeSetWriter(root / "episodes", fps=fps, pixel_format="yuv444p", video_preset="veryfast") as writer:
+    with EpisodeSetWriter(root / "episodes", pixel_format="yuv444p", video_preset="veryfast") as writer:
         views = {view: RecordedView(pictures.__iter__, len(pictures)) for view, pictures in frames.items()}
         writer.add(episode, views)
     others = [wanted for wanted in formats if wanted != "episodes"]

@@ -132,8 +132,6 @@ class CurateWork(EpisodeWork[ListedEpisode, InputRow]):
         """The set that all shards write into."""
         return EpisodeSetWriter(
             self.output,
-            fps=self.config.common_fps,
-            image_size=self.config.common_image_size,
             video_crf=self.config.video_crf,
             video_preset=self.config.video_preset,
             pixel_format=self.config.pixel_format,

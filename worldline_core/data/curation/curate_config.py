@@ -135,15 +135,3 @@ class CurateConfig(StrictModel):
         if source.target_fps is not None or source.stride is not None:
             changes |= {"fps": source.target_fps, "stride": source.stride}
         return self.model_copy(update=changes) if changes else self
-
-    @property
-    def common_fps(self) -> float | None:
-        """The rate that every episode of the set has; None where it follows from each recording or source."""
-        rates = {self.for_source(number).fps for number in range(len(self.sources))}
-        return rates.pop() if len(rates) == 1 else None
-
-    @property
-    def common_image_size(self) -> tuple[int, int] | None:
-        """(height, width) of all images of the set; None where sources differ or keep theirs."""
-        sizes = {self.for_source(number).image_size for number in range(len(self.sources))}
-        return sizes.pop() if len(sizes) == 1 else None

@@ -39,6 +39,7 @@ from worldline_core.data.episodes.episode_index import (
     write_quarantine,
 )
 from worldline_core.data.episodes.fingerprint import fingerprint
+from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, write_dataset
 from worldline_core.data.episodes.sidecar import write_sidecar
 from worldline_core.data.episodes.view_recording import (
     RECORDED_SIZE,
@@ -47,11 +48,9 @@ from worldline_core.data.episodes.view_recording import (
     VideoSettings,
     recorded_size,
     store_view,
-    thumbnails_beside,
 )
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
 from worldline_core.data.guards.source_paths import safe_name
-from worldline_core.data.lerobot.v3_writer import DatasetEpisode, EpisodeVideo, write_dataset
 from worldline_core.data.video.encoder import PixelFormat
 from worldline_core.data.video.frames import Frames, packed_images
 from worldline_core.data.video.thumbnails import ViewThumbnails
@@ -67,8 +66,6 @@ class EpisodeSetWriter:
 
     Args:
         root: the set's folder; work in progress lies in root/run/.
-        fps: frame rate every episode must have; None accepts several (each rate becomes a dataset of its own).
-        image_size: (H, W) every image must have; None accepts several.
         video_crf: x264 quality; 18 is visually exact, 28 small.
         video_mode: "auto" copies encoded videos in which nothing changes, "encode" encodes every picture.
         key_frame_interval: frames from one key frame of an encoded video to the next.
@@ -79,8 +76,6 @@ class EpisodeSetWriter:
     def __init__(
         self,
         root: Path,
-        fps: float | None = None,
-        image_size: tuple[int, int] | None = None,
         video_crf: int = 18,
         video_preset: str = "slow",
         pixel_format: PixelFormat = "yuv420p",
@@ -90,8 +85,6 @@ class EpisodeSetWriter:
         if self.finished(root):
             raise DataError("Folder already holds a finished EpisodeSet", where=root, next_step="write to a new folder")
         self.root = root
-        self.fps = fps
-        self.image_size = image_size
         self.video = VideoSettings(video_crf, video_preset, pixel_format, key_frame_interval, video_mode)
         self._work = root / "run" / "episodes"
         self._parts = self._work / "parts"
@@ -141,34 +134,14 @@ class EpisodeSetWriter:
         where = f"episode {episode.episode_id}"
         if not frames:
             raise DataError("Episode has no images", where=where, expected="at least one view", got="none")
-        if self.fps is not None and abs(episode.fps - self.fps) > 1e-6:
-            raise DataError(
-                "Episode has another frame rate than the set",
-                where=where,
-                expected=f"{self.fps} fps",
-                got=f"{episode.fps} fps",
-            )
         safe_name(episode.embodiment, "Embodiment")
         views: dict[str, RecordedView] = {}
         for view, images in frames.items():
             safe_name(view, "View")
             if isinstance(images, np.ndarray):
-                self._check_images(images, episode, f"{where}, view {view}")
+                _check_images(images, episode, f"{where}, view {view}")
             views[view] = RecordedView.of(images) if isinstance(images, np.ndarray) else images
         write_part(self._parts, episode, views, robot_masks or {}, self.video, described, thing_labels or {})
-
-    def _check_images(self, images: np.ndarray, episode: Episode, where: str) -> None:
-        """Raises: DataError when they are no pictures, or not of the set's size; RejectedInputError for a wrong number."""
-        size = ("H", "W") if self.image_size is None else self.image_size
-        fits = images.ndim == 4 and images.shape[3] == 3 and self.image_size in (None, images.shape[1:3])
-        if images.dtype != np.uint8 or not fits:
-            raise DataError(
-                "Images have a wrong size or type",
-                where=where,
-                expected=f"uint8 (N, {size[0]}, {size[1]}, 3)",
-                got=f"{images.dtype} {images.shape}",
-            )
-        check_length("Images", where, states=episode.num_video_frames, unit="frames", found=len(images))
 
     def quarantine(
         self, episode_id: str, source: str, reason: str, detail: str, evidence: Mapping[str, Any] | None = None
@@ -218,7 +191,9 @@ class EpisodeSetWriter:
             used[embodiment] += 1
             name = embodiment if used[embodiment] == 1 else f"{embodiment}_{used[embodiment]}"
             dataset = self.root / "datasets" / name
-            write_dataset(dataset, [_dataset_episode(part) for part in members])
+            # LeRobot has no frames without images: the sidecar holds the states that go on after them.
+            filmed = [part.episode.cut(0, part.episode.num_video_frames) for part in members]
+            write_dataset(dataset, filmed, [part.videos for part in members])
             write_sidecar(dataset, members)
             rows += [_row(part, f"datasets/{name}", index) for index, part in enumerate(members)]
         write_json_atomic(self.root / VIDEOS_FILE, _count_videos(parts))
@@ -240,18 +215,11 @@ def _count_videos(parts: Sequence[Part]) -> dict[str, Any]:
     return {"copied": copied, "encoded": len(videos) - copied, "codecs": dict(sorted(codecs.items()))}
 
 
-def _dataset_episode(part: Part) -> DatasetEpisode:
-    episode = part.episode
-    return DatasetEpisode(
-        instruction=episode.instruction,
-        embodiment=episode.embodiment,
-        fps=episode.fps,
-        num_frames=episode.num_video_frames,
-        state=episode.state[: episode.num_video_frames],
-        action=episode.action[: episode.num_video_frames],
-        state_names=None if episode.state_names is None else list(episode.state_names),
-        videos=part.videos,
-    )
+def _check_images(images: np.ndarray, episode: Episode, where: str) -> None:
+    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
+        got = f"{images.dtype} {images.shape}"
+        raise DataError("Images have a wrong size or type", where=where, expected="uint8 (N, H, W, 3)", got=got)
+    check_length("Images", where, states=episode.num_video_frames, unit="frames", found=len(images))
 
 
 def _row(part: Part, dataset: str, episode_index: int) -> EpisodeRow:
@@ -386,7 +354,6 @@ class Part:
             view: EpisodeVideo(
                 path=self.folder / f"{view}.mp4",
                 histogram=self._arrays[f"histogram.{view}"],
-                thumbnails=thumbnails_beside(self.folder / f"{view}.mp4"),
                 **found[view] | {"size": tuple(found[view]["size"])},
             )
             for view in sorted(found, key=lambda view: (VIEWS.index(view) if view in VIEWS else len(VIEWS), view))

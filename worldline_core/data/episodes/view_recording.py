@@ -22,10 +22,10 @@ from av.container import InputContainer
 from av.packet import Packet
 from av.video.stream import VideoStream
 
+from worldline_core.data.episodes.lerobot_writer import EpisodeVideo, ImageSampler
 from worldline_core.data.guards.plain_files import expect_layout
 from worldline_core.data.guards.reader_process import still_reading
 from worldline_core.data.guards.rejection import RejectedInputError, check_length
-from worldline_core.data.lerobot.v3_writer import EpisodeVideo, ImageSampler
 from worldline_core.data.video.clip import (
     FRAME_TOLERANCE,
     Picture,
@@ -116,16 +116,11 @@ def store_view(
     size, before = fitted.image_size, enlarged_from or fitted.source_size
     scales = np.diagonal(fitted.affine)[1::-1] * fitted.source_size / before
     height, width = (round(side / max(1.0, scale)) for side, scale in zip(size, scales, strict=True))
-    thumbnails, cache = small.thumbnails(), thumbnails_beside(path)
+    thumbnails = small.thumbnails()
+    stored = EpisodeVideo(path, size, codec, pixel_format, bool(copied), sampler.histogram)
     if copied:
-        write_thumbnails(cache, path, thumbnails)
-    stored = EpisodeVideo(path, size, codec, pixel_format, bool(copied), sampler.histogram, cache)
+        write_thumbnails(stored.thumbnails, path, thumbnails)
     return stored, thumbnails, (height, width)
-
-
-def thumbnails_beside(video: Path) -> Path:
-    """Where the thumbnails of a view lie until its set is assembled."""
-    return video.with_name(f"{video.stem}.arrow")
 
 
 type _Format = tuple[ImageTransform, str, str]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from worldline_core.data.episodes.episode import Episode
 from worldline_core.data.lerobot.dataset import DATA_PATH, IMAGE_PREFIX, VERSION, VIDEO_PATH
 from worldline_core.data.video.encoder import concatenate_videos
 from worldline_core.data.video.thumbnails import cache_path
@@ -32,7 +33,6 @@ class EpisodeVideo:
         codec, pixel_format: as FFmpeg names them.
         copied: whether it holds the packets of the recording, and so shares no file with other episodes.
         histogram: (3, 256) counts of sampled pixels, from `ImageSampler`.
-        thumbnails: file of the thumbnails of a copied video.
     """
 
     path: Path
@@ -41,39 +41,28 @@ class EpisodeVideo:
     pixel_format: str
     copied: bool
     histogram: np.ndarray
-    thumbnails: Path
+
+    @property
+    def thumbnails(self) -> Path:
+        """File of the thumbnails of a copied video, until the set is assembled."""
+        return self.path.with_suffix(".npz")
 
 
-@dataclass(frozen=True)
-class DatasetEpisode:
-    """One episode of a dataset.
-
-    Attributes:
-        num_frames: of state, action and every video.
-        state, action: (num_frames, J) float32; J may be 0.
-        videos: by view, in the order of the dataset's features.
-    """
-
-    instruction: str
-    embodiment: str
-    fps: float
-    num_frames: int
-    state: np.ndarray
-    action: np.ndarray
-    state_names: list[str] | None
-    videos: Mapping[str, EpisodeVideo]
-
-
-def write_dataset(root: Path, episodes: Sequence[DatasetEpisode]) -> None:
-    """Write the dataset of episodes that have the same features and rate.
+def write_dataset(root: Path, episodes: Sequence[Episode], videos: Sequence[Mapping[str, EpisodeVideo]]) -> None:
+    """Write the dataset of episodes that have the same features and rate, and images in each frame.
 
     A rerun over a half-written folder overwrites each file with the same bytes.
+
+    Args:
+        videos: of each episode by view, in the order of the dataset's features.
     """
     lengths = [episode.num_frames for episode in episodes]
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int).tolist()
     instructions = list(dict.fromkeys(episode.instruction for episode in episodes))
     table = _data_table(episodes, starts, {text: index for index, text in enumerate(instructions)})
-    videos = {view: _write_videos(root, view, episodes) for view in episodes[0].videos}
+    by_view = {view: [own[view] for own in videos] for view in videos[0]}
+    places = [_write_videos(root, view, found, lengths, episodes[0].fps) for view, found in by_view.items()]
+    histograms = {view: [video.histogram for video in found] for view, found in by_view.items()}
     sizes = [24 * length * max(table.num_columns, 1) for length in lengths]
     rows: list[dict[str, Any]] = []
     for file, members in enumerate(_files_by_size(sizes, _DATA_MEGABYTES)):
@@ -90,16 +79,17 @@ def write_dataset(root: Path, episodes: Sequence[DatasetEpisode]) -> None:
                 "dataset_from_index": starts[index],
                 "dataset_to_index": starts[index + 1],
             }
-            for columns in videos.values():
+            for columns in places:
                 row |= columns[index]
-            statistics = _statistics([episodes[index]], table.slice(starts[index], lengths[index]))
+            own = {view: counts[index : index + 1] for view, counts in histograms.items()}
+            statistics = _statistics(table.slice(starts[index], lengths[index]), own)
             for key, feature in statistics.items():
                 row |= {f"stats/{key}/{name}": value.tolist() for name, value in feature.items()}
             rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
     write_table_atomic(root / _EPISODES_PATH, pa.Table.from_pylist(rows))
     write_table_atomic(root / "meta" / "tasks.parquet", _tasks_table(instructions))
-    write_json_atomic(root / "meta" / "stats.json", as_json(_statistics(episodes, table)))
-    write_json_atomic(root / "meta" / "info.json", _info(episodes, len(instructions)))
+    write_json_atomic(root / "meta" / "stats.json", as_json(_statistics(table, histograms)))
+    write_json_atomic(root / "meta" / "info.json", _info(episodes, videos[0], len(instructions)))
 
 
 def _place(file: int) -> dict[str, int]:
@@ -120,7 +110,7 @@ def _files_by_size(sizes: Sequence[int], megabytes: int, alone: Collection[int] 
     return files
 
 
-def _data_table(episodes: Sequence[DatasetEpisode], starts: Sequence[int], task_of: dict[str, int]) -> pa.Table:
+def _data_table(episodes: Sequence[Episode], starts: Sequence[int], task_of: dict[str, int]) -> pa.Table:
     columns: dict[str, list[np.ndarray]] = {}
     for index, episode in enumerate(episodes):
         length, fps = episode.num_frames, episode.fps
@@ -145,7 +135,9 @@ def _data_table(episodes: Sequence[DatasetEpisode], starts: Sequence[int], task_
     return pa.table(arrays)
 
 
-def _write_videos(root: Path, view: str, episodes: Sequence[DatasetEpisode]) -> list[dict[str, Any]]:
+def _write_videos(
+    root: Path, view: str, videos: Sequence[EpisodeVideo], lengths: Sequence[int], fps: float
+) -> list[dict[str, Any]]:
     """Join the clips of one view; returns the videos/<key>/* columns of each episode.
 
     A video that was copied as it was recorded has a file of its own: copied videos may differ in parameter sets, and have
@@ -153,25 +145,24 @@ def _write_videos(root: Path, view: str, episodes: Sequence[DatasetEpisode]) -> 
     """
     key = IMAGE_PREFIX + view
     rows: list[dict[str, Any]] = []
-    videos = [episode.videos[view] for episode in episodes]
     copied = {index for index, video in enumerate(videos) if video.copied}
     sizes = [video.path.stat().st_size for video in videos]
     for file, members in enumerate(_files_by_size(sizes, _VIDEO_MEGABYTES, alone=copied)):
-        place, fps = _place(file), episodes[0].fps
+        place = _place(file)
         target = root / VIDEO_PATH.format(video_key=key, **place)
         first = videos[members[0]]
         with atomic_path(target) as temporary:
             if first.copied:
                 _link(first.path, temporary)
             else:
-                concatenate_videos(temporary, [(videos[i].path, episodes[i].num_frames) for i in members], fps)
+                concatenate_videos(temporary, [(videos[i].path, lengths[i]) for i in members], fps)
         if first.copied:
             thumbnails = cache_path(root.parents[1], target)
             thumbnails.parent.mkdir(parents=True, exist_ok=True)
             _link(first.thumbnails, thumbnails)
         frame = 0
-        for episode in (episodes[index] for index in members):
-            stop = frame + episode.num_frames
+        for index in members:
+            stop = frame + lengths[index]
             rows.append(
                 {
                     **{f"videos/{key}/{name}": number for name, number in place.items()},
@@ -199,13 +190,11 @@ def _column(table: pa.Table, name: str) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _statistics(episodes: Sequence[DatasetEpisode], table: pa.Table) -> dict[str, dict[str, np.ndarray]]:
-    """Feature -> statistics over these episodes, whose rows are the table's."""
+def _statistics(table: pa.Table, histograms: Mapping[str, Sequence[np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+    """Feature -> statistics over the episodes that have these rows, and by view these counts of pixels."""
     statistics = {name: vector_statistics(_column(table, name)) for name in table.column_names}
-    num_frames = sum(episode.num_frames for episode in episodes)
-    for view in episodes[0].videos:
-        histograms = [episode.videos[view].histogram for episode in episodes]
-        statistics[IMAGE_PREFIX + view] = image_statistics(histograms, num_frames)
+    for view, counts in histograms.items():
+        statistics[IMAGE_PREFIX + view] = image_statistics(counts, len(table))
     return statistics
 
 
@@ -225,15 +214,15 @@ def _tasks_table(instructions: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(metadata)})
 
 
-def _info(episodes: Sequence[DatasetEpisode], total_tasks: int) -> dict[str, Any]:
+def _info(episodes: Sequence[Episode], videos: Mapping[str, EpisodeVideo], total_tasks: int) -> dict[str, Any]:
     first = episodes[0]
     fps = int(first.fps) if first.fps == int(first.fps) else first.fps
     width = first.state.shape[1]
-    names = first.state_names or [f"state_{index}" for index in range(width)]
+    names = list(first.state_names or ()) or [f"state_{index}" for index in range(width)]
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": [width], "names": names} for key in ("observation.state", "action") if width
     }
-    for view, video in first.videos.items():
+    for view, video in videos.items():
         image_height, image_width = video.size
         features[IMAGE_PREFIX + view] = {
             "dtype": "video",
