@@ -31,8 +31,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from benchmarks.harness import command_line
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.environment import WorldLineVectorEnv
-from worldline_core.environment.episodes import judge_of
+from worldline_core.environment.environment import WorldLineVectorEnv, judge_of
 from worldline_core.environment.mujoco_world import MujocoEnv
 from worldline_core.evaluation.paired import paired_tests
 from worldline_core.evaluation.policy.agreement import STATISTICS, policy_agreement

@@ -12,10 +12,9 @@ from pydantic import ValidationError
 
 mujoco = pytest.importorskip("mujoco", reason="the recorder needs MuJoCo (extra: sim)")
 
-from worldline_core.config import CONFIG_ROOT, load_config
 from worldline_core.data.episodes.episode_set import EpisodeSet
 from worldline_core.errors import DataError
-from worldline_core.recorder.attempts import BankSpec, RecordBanksConfig
+from worldline_core.recorder.attempts import BankGrid, BankSpec, RecordBanksConfig
 from worldline_core.recorder.bodies import BODIES
 from worldline_core.recorder.outcomes import LIFTED, outcome
 from worldline_core.recorder.record import FAILURES_FILE, RecordConfig, RecordGroup, record
@@ -208,32 +207,12 @@ def test_the_held_out_camera_arrangement_is_none_of_the_training_ones() -> None:
         assert max(training) < min(held_out) or max(held_out) < min(training)
 
 
-def test_the_committed_configurations_train_on_six_bodies_and_hold_one_and_a_camera_out() -> None:
-    training, test = (
-        load_config(RecordConfig, path=CONFIG_ROOT / "recording" / f"{name}.yaml")
-        for name in ("small_world", "small_world_test")
-    )
-    assert {group.split for group in training.groups} == {"train", "validation"}
-    trained = {group.embodiment for group in training.groups}
-    assert len(trained) == 6
-    assert not any(group.held_out_camera for group in training.groups)
-    assert {group.split for group in test.groups} == {"test", "ood_test"}
-    assert {group.embodiment for group in test.groups if group.split == "test"} == trained
-    assert {group.embodiment for group in test.groups} - trained == {"panda_ivory"}
-    assert {group.split for group in test.groups if group.held_out_camera} == {"ood_test"}
-    assert all(group.families == TASKS for group in (*training.groups, *test.groups))
-
-
-def test_a_grid_of_banks_has_five_of_every_task_and_body_in_several_test_scenes() -> None:
-    config = load_config(RecordBanksConfig, path=CONFIG_ROOT / "recording" / "small_world_banks.yaml")
-    specs = config.specs()
-    cells = Counter((spec.embodiment, spec.family) for spec in specs)
-    assert len(cells) == 30
-    assert set(cells.values()) == {5}
-    assert len({spec.name for spec in specs}) == len({spec.layout for spec in specs}) == 150
-    assert {spec.scene for spec in specs} == set(TEST_SCENES)
-    for cell in cells:
-        assert len({spec.scene for spec in specs if (spec.embodiment, spec.family) == cell}) >= 4
+def test_a_grid_of_banks_gives_each_an_initial_state_and_each_cell_several_scenes() -> None:
+    grid = BankGrid(embodiments=("ur5e_silver", "xarm7_white"), families=("lift", "close"), scenes=TEST_SCENES, count=5)
+    specs = grid.specs()
+    assert len({spec.name for spec in specs}) == len({spec.layout for spec in specs}) == 20
+    for cell in {(spec.embodiment, spec.family) for spec in specs}:
+        assert {spec.scene for spec in specs if (spec.embodiment, spec.family) == cell} == set(TEST_SCENES)
 
 
 def test_a_bank_mixes_successes_and_failures_of_one_initial_state(recorder: EpisodeRecorder) -> None:

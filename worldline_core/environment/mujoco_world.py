@@ -21,7 +21,7 @@ from worldline_core.config import validate
 from worldline_core.data.episodes.episode import VIEWS
 from worldline_core.data.episodes.episode_index import EpisodeRow
 from worldline_core.data.episodes.episode_set import EpisodeSet
-from worldline_core.environment.episodes import checked_commands, robot_spaces
+from worldline_core.environment.environment import checked_commands, robot_spaces
 from worldline_core.environment.starts import EpisodeStarts
 from worldline_core.errors import ConfigError, DataError
 from worldline_core.geometry.embodiment import load_embodiment

@@ -16,7 +16,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_robot_worldline.curation import write_cameras, write_source
 from lerobot_robot_worldline.device import Announcements, Columns, Recordings
-from worldline_core.environment.episodes import Together
+from worldline_core.environment.environment import Together
 from worldline_core.environment.starts import EpisodeStarts, Start, read_start
 from worldline_core.errors import ConfigError
 from worldline_core.geometry.embodiment import load_embodiment
