@@ -104,14 +104,14 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
         for change, match in (
             ({"embodiment": "/etc/passwd"}, "Unknown embodiment"),
             ({"embodiment": "../ur5e.yaml"}, "Unknown embodiment"),
-            ({"images": {"head": start.images["head"].astype(np.float32)}}, r"(?s)image is no picture.*uint8"),
+            ({"images": {"head": start.images["head"].astype(np.float32)}}, r"(?s)images.head.*uint8.*float32"),
             ({"state": np.zeros(3)}, "wrong length"),
             ({"state": np.full(14, np.nan)}, "not finite"),
-            ({"state": np.array(["a"] * 14)}, "Not an array of numbers"),
+            ({"state": np.array(["a"] * 14)}, r"(?s)state.*array of numbers"),
             ({"state": np.array(0.0)}, "wrong length"),
             (
                 {"cameras": posed(T_base_camera=np.array([["a"] * 4] * 4))},
-                r"(?s)Not an array of numbers.*T_base_camera",
+                r"(?s)T_base_camera.*array of numbers",
             ),
             (
                 {"cameras": posed(T_base_camera=np.diag([1.0, 1.0, -1.0, 1.0]))},
@@ -122,7 +122,7 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
             ({"cameras": posed(K=np.diag([-80.0, 80.0, 1.0]))}, "camera matrix is not usable"),
             ({"episode": EPISODE}, r"(?s)starts at a recording, or at an observation.*got: images, cameras"),
             ({"cameras": None}, "starts at a recording, or at an observation"),
-            ({"seeds": [-1]}, "seed is out of range"),
+            ({"seeds": [-1]}, r"(?s)seeds.0.*greater than or equal to 0"),
             ({"seeds": []}, "not understood"),
             ({"seeds": [0] * 10_000}, "Too many clips"),
         ):
@@ -132,14 +132,15 @@ def test_a_session_starts_at_an_observation_of_the_client(url: str, small_world:
             client.start("nobody")
         with pytest.raises(DataError, match=r"(?s)Controls of a step have another shape.*\(2, 4, 14\)"):
             sent.step(np.zeros((1, 4, 14)))
-        with pytest.raises(DataError, match=r"(?s)Not an array of numbers.*controls"):
+        with pytest.raises(DataError, match=r"(?s)controls.*array of numbers"):
             client.call({"op": "step", "session": sent.session, "controls": np.full((2, 4, 14), "a")})
         with pytest.raises(DataError, match="No such clips"):
             sent.select([7])
         assert len(sent.step(np.repeat(sent.state[:, None], 4, axis=1))) == 2  # as it was before the errors
         for request, match in (
-            ([1], "no map"),
-            ({"op": "eval"}, "Unknown request"),
+            ([1], "not understood"),
+            ({"op": "eval"}, "eval"),
+            ({"op": ["step"]}, "not understood"),
             ({"op": "step", "session": "x"}, "not understood"),
         ):
             with pytest.raises(DataError, match=match):

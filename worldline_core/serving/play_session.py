@@ -28,7 +28,7 @@ from worldline_core.pictures import jpeg_bytes
 from worldline_core.policies.openpi import OpenpiPolicy
 from worldline_core.rollout.simulation import Simulation
 from worldline_core.serving.recorded_starts import RecordedStart, save_played
-from worldline_core.serving.session_host import LARGEST_SEED, SessionHost, error_message
+from worldline_core.serving.session_host import Seed, SessionHost, error_message
 from worldline_core.serving.teleoperation import ArmInput, Teleoperation, frame_marks
 
 BY_HAND = "by hand"
@@ -39,12 +39,12 @@ class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Start(_Message):
+class StartMessage(_Message):
     """Begin at a recording."""
 
     type: Literal["start"]
     episode: str
-    seed: int = Field(42, ge=0, le=LARGEST_SEED)
+    seed: Seed = 42
 
 
 class Tick(_Message):
@@ -75,8 +75,8 @@ class Save(_Message):
     formats: tuple[Literal["episodes", "mcap", "rrd"], ...] = Field(max_length=3)
 
 
-Message = Annotated[Start | Tick | Go | Advance | Save, Field(discriminator="type")]
-_MESSAGE: TypeAdapter[Start | Tick | Go | Advance | Save] = TypeAdapter(Message)
+Message = StartMessage | Tick | Go | Advance | Save
+_MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="type")])
 
 
 @dataclass(frozen=True)
@@ -116,11 +116,11 @@ class PlaySession:
         self._policies: dict[str, OpenpiPolicy] = {}
 
     async def greet(self) -> None:
-        """What the page may choose from."""
+        """Send the page its choices."""
         await self._send(json.dumps({"type": "hello", **self._host.metadata()}))
 
     async def receive(self, text: str) -> None:
-        """Take one message; what is wrong with it is told to the page."""
+        """Act on one message; the page is sent any error."""
         try:
             try:
                 message = _MESSAGE.validate_json(text)
@@ -131,8 +131,8 @@ class PlaySession:
         except WorldLineError as error:
             await self._send(json.dumps({"type": "error", **error_message(error)}))
 
-    async def _act(self, message: Start | Tick | Go | Advance | Save) -> None:
-        if isinstance(message, Start):
+    async def _act(self, message: Message) -> None:
+        if isinstance(message, StartMessage):
             await self._begin(message)
             return
         if self._hand is None:
@@ -154,7 +154,7 @@ class PlaySession:
             await self._settled()
             await self._save(message)
 
-    async def _begin(self, message: Start) -> None:
+    async def _begin(self, message: StartMessage) -> None:
         begin = time.monotonic()
         self._host.admit(self)
         await self._settled()
@@ -313,7 +313,7 @@ class PlaySession:
         await self._send(json.dumps({"type": "saved", "paths": [str(path) for path in paths], "frames": len(states)}))
 
     async def close(self) -> None:
-        """Let go of what is under way, of the session's room, and of the policies."""
+        """Cancel the running block; free the session's room and the policies."""
         self._host.dismiss(self)
         if self._working is not None:
             self._working.cancel()

@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from worldline_core.errors import DataError, UnavailableError, WorldLineError
 from worldline_core.geometry.embodiment import check_embodiment_name
@@ -29,13 +29,31 @@ from worldline_core.untrusted_text import shown
 LARGEST_SEED = 2**63 - 1
 
 
+Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+
+
+def _numbers(values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"an array of numbers wanted, got {values.dtype}")
+    return values
+
+
+def _picture(values: np.ndarray) -> np.ndarray:
+    if values.dtype != np.uint8 or values.ndim != 3 or not values.size:
+        raise ValueError(f"a picture uint8 (H, W, 3) wanted, got {values.dtype} {values.shape}")
+    return values
+
+
+Numbers = Annotated[np.ndarray, AfterValidator(_numbers)]
+
+
 class _Request(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True)
 
 
 class _CameraMessage(_Request):
-    K: np.ndarray
-    T_base_camera: np.ndarray | None = None
+    K: Numbers
+    T_base_camera: Numbers | None = None
 
 
 class StartRequest(_Request):
@@ -43,11 +61,11 @@ class StartRequest(_Request):
 
     op: Literal["start"]
     episode: str | None = None
-    images: dict[str, np.ndarray] | None = None
+    images: dict[str, Annotated[np.ndarray, AfterValidator(_picture)]] | None = None
     cameras: dict[str, _CameraMessage] | None = None
     embodiment: str | None = None
-    state: np.ndarray | None = None
-    seeds: list[int] = Field(default=[42], min_length=1)
+    state: Numbers | None = None
+    seeds: list[Seed] = Field(default=[42], min_length=1)
 
 
 class StepRequest(_Request):
@@ -55,7 +73,7 @@ class StepRequest(_Request):
 
     op: Literal["step"]
     session: str
-    controls: np.ndarray
+    controls: Numbers
 
 
 class ForkRequest(_Request):
@@ -64,7 +82,7 @@ class ForkRequest(_Request):
     op: Literal["fork"]
     session: str
     clips: list[int] = Field(min_length=1)
-    seeds: list[int] | None = None
+    seeds: list[Seed] | None = None
 
 
 class SessionRequest(_Request):
@@ -75,6 +93,7 @@ class SessionRequest(_Request):
 
 
 Request = StartRequest | StepRequest | ForkRequest | SessionRequest
+_REQUEST: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminator="op")])
 
 
 @dataclass
@@ -138,7 +157,6 @@ class SessionHost:
             raise DataError("There is no such session", got=request.session, next_step="start one")
         simulation = running.simulation
         if isinstance(request, StepRequest):
-            _check_numbers({"controls": request.controls})
             begin = time.monotonic()
             frames = await self.compute(lambda: simulation.step(request.controls))
             seconds = time.monotonic() - begin
@@ -171,15 +189,6 @@ class SessionHost:
             return self.starts.simulate(self.starts.read(request.episode), request.seeds)
         images, cameras, name = request.images or {}, request.cameras or {}, request.embodiment or ""
         check_embodiment_name(name)  # a path would name a file of this machine
-        if wrong := [
-            view for view, image in images.items() if image.dtype != np.uint8 or image.ndim != 3 or not image.size
-        ]:
-            raise DataError(
-                "An image is no picture", where=wrong[0], expected="uint8 (H, W, 3)", got=images[wrong[0]].dtype
-            )
-        arrays = {"state": request.state, **{f"K of {view}": camera.K for view, camera in cameras.items()}}
-        poses = {f"T_base_camera of {view}": camera.T_base_camera for view, camera in cameras.items()}
-        _check_numbers({**arrays, **{what: pose for what, pose in poses.items() if pose is not None}})
         posed = {view: Camera(camera.K, camera.T_base_camera) for view, camera in cameras.items()}
         rows = np.asarray(request.state, np.float64)
         rows = np.repeat(rows[None], len(request.seeds), axis=0) if rows.ndim == 1 else rows
@@ -245,37 +254,14 @@ class SessionHost:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
 
-def _check_numbers(arrays: Mapping[str, np.ndarray | None]) -> None:
-    if wrong := [what for what, values in arrays.items() if values is None or values.dtype.kind not in "fiu"]:
-        raise DataError("Not an array of numbers", where=wrong[0], expected="reals or integers")
-
-
 def _parsed(message: object) -> Request:
-    if not isinstance(message, Mapping):
-        raise DataError("A request is no map", expected="op and its values", got=type(message).__name__)
-    kinds = {
-        "start": StartRequest,
-        "step": StepRequest,
-        "fork": ForkRequest,
-        "reset": SessionRequest,
-        "close": SessionRequest,
-    }
-    kind = kinds.get(str(message.get("op")))
-    if kind is None:
-        raise DataError("Unknown request", where="op", expected=", ".join(kinds), got=message.get("op"))
     try:
-        request = kind.model_validate(dict(message))
+        return _REQUEST.validate_python(message)
     except (ValidationError, TypeError) as error:
         found = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
         raise DataError(
-            "A request is not understood",
-            where=f"{message['op']}: {'.'.join(map(str, found['loc']))}",
-            got=found["msg"],
+            "A request is not understood", where=".".join(map(str, found["loc"])) or "op", got=found["msg"]
         ) from error
-    seeds = getattr(request, "seeds", None) or ()
-    if any(not 0 <= seed <= LARGEST_SEED for seed in seeds):
-        raise DataError("A seed is out of range", expected=f"0 to {LARGEST_SEED}")
-    return request
 
 
 def _state_of(simulation: Simulation) -> dict[str, Any]:
