@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldline_core.filters.alignment import (
+from worldline_core.filters.calibration import (
+    detect_camera,
+    detect_fixed_camera,
+    detect_hand_eye,
     detect_image_lag,
     detect_pose_lag,
     detect_projection,
     lag_by_correlation,
 )
-from worldline_core.filters.calibration import detect_camera, detect_fixed_camera, detect_hand_eye
 from worldline_core.filters.filter_config import (
     BaseMotionConfig,
     BlurConfig,

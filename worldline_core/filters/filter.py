@@ -34,8 +34,7 @@ from worldline_core.data.episodes.episode_index import (
 )
 from worldline_core.data.episodes.episode_set import EpisodeSet, EpisodeSetWork
 from worldline_core.data.episodes.episode_set_writer import part_name
-from worldline_core.filters.alignment import find_lags, find_projection
-from worldline_core.filters.calibration import find_calibration_faults, find_mistake
+from worldline_core.filters.calibration import find_calibration_faults, find_lags, find_mistake, find_projection
 from worldline_core.filters.filter_config import FilterConfig
 from worldline_core.filters.motion import find_base_motion, find_joint_faults, find_static
 from worldline_core.filters.pictures import find_picture_faults

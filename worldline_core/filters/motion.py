@@ -42,20 +42,13 @@ def detect_static(
     # At either end half a window also covers the motion beside the stretch.
     still = _widened(still, max(1, round(SPEED_WINDOW_S * fps / 2)))
     still &= image_change < config.max_image_change
-    bad = np.zeros(len(still), dtype=bool)
-    longest = 0
-    for start, stop in runs(still):
-        longest = max(longest, stop - start)
-        if stop - start >= config.min_run_s * fps:
-            bad[start:stop] = True
+    bad = long_runs(still, config.min_run_s * fps)
     return Verdict(
         "static",
         not bad.all(),
         {
             "static_share": float(bad.mean()),
-            "longest_still_s": longest / fps,
-            "max_joint_speed_rad_s": float(joint_speed.max()),
-            "max_image_change": float(image_change.max()),
+            "longest_still_s": max((stop - start for start, stop in runs(still)), default=0) / fps,
             "threshold_run_s": config.min_run_s,
         },
         bad,
@@ -79,7 +72,7 @@ def return_home(joints: np.ndarray, fps: float, config: ResetConfig) -> tuple[in
     Args:
         joints: (n, j) [rad].
     """
-    steps = np.abs(np.diff(joints, axis=0)).max(axis=1) if len(joints) > 1 else np.zeros(0)
+    steps = np.abs(np.diff(joints, axis=0)).max(axis=1)
     from_home = np.abs(joints - joints[0]).max(axis=1)
     longest = min(max(1, round(config.max_return_s * fps)), len(steps))
     for i, j in _candidates(from_home, steps, longest, config):
@@ -148,7 +141,6 @@ def detect_reset(joints: np.ndarray, fps: float, config: ResetConfig) -> Verdict
         "reset",
         True,  # the attempt before the return stays, if it is long enough
         {
-            "furthest_from_home_rad": float(from_home.max()),
             "reset_frame": None if found is None else found[0] + 1,
             "way_home_rad": None if found is None else float(from_home[found[0]] - from_home[found[1]]),
             "way_home_s": None if found is None else (found[1] - found[0]) / fps,
@@ -189,7 +181,7 @@ def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
     """
     bad = np.zeros(len(joints), dtype=bool)
     steps = np.abs(np.diff(joints, axis=0))
-    jumps = jump_steps(joints, config) if len(joints) > 1 else np.zeros((0, joints.shape[1]), dtype=bool)
+    jumps = jump_steps(joints, config)
     for joint in np.flatnonzero(jumps.any(axis=0)):
         at = np.flatnonzero(jumps[:, joint])
         bad[at + 1] = True
@@ -199,10 +191,10 @@ def detect_joint_jump(joints: np.ndarray, config: JointMotionConfig) -> Verdict:
                 bad[first + 1 : second + 1] = True
     numbers: Numbers = {
         "jumps": int(jumps.sum()),
-        "largest_jump_rad": float(steps[jumps].max()) if jumps.any() else 0.0,
+        "largest_jump_rad": float(steps[jumps].max(initial=0.0)),
         "threshold_jump_rad": config.min_jump_rad,
     }
-    curve = np.concatenate([[0.0], steps.max(axis=1)]) if len(steps) else np.zeros(len(joints))
+    curve = np.concatenate([[0.0], steps.max(axis=1)])
     return Verdict("joint_jump", True, numbers, bad, {"largest_step_rad": Curve(curve, config.min_jump_rad)})
 
 
@@ -212,9 +204,9 @@ def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig
     Args:
         joints: (n, j) joint positions [rad], without grippers.
     """
-    speed = np.abs(np.diff(joints, axis=0)).max(axis=1) * fps if len(joints) > 1 else np.zeros(0)
+    speed = np.abs(np.diff(joints, axis=0)).max(axis=1) * fps
     bad = np.zeros(len(joints), dtype=bool)
-    jumps = jump_steps(joints, config).any(axis=1) if len(joints) > 1 else np.zeros(0, dtype=bool)
+    jumps = jump_steps(joints, config).any(axis=1)
     for start, stop in runs((speed > config.max_speed_rad_s) & ~jumps):
         if stop - start >= 2:
             bad[start + 1 : stop + 1] = True
@@ -222,8 +214,7 @@ def detect_joint_speed(joints: np.ndarray, fps: float, config: JointMotionConfig
         "joint_speed",
         True,  # the rest of the episode stays, if it is long enough
         {
-            "max_joint_speed_rad_s": float(speed.max()) if len(speed) else 0.0,
-            "frames_over": int(bad.sum()),
+            "max_joint_speed_rad_s": float(speed.max(initial=0.0)),
             "threshold_rad_s": config.max_speed_rad_s,
         },
         bad,
@@ -240,13 +231,12 @@ def find_joint_faults(signals: Signals, config: FilterConfig, _: Sequence[Findin
     frame = reset.numbers["reset_frame"]
     before = joints if frame is None else joints[: int(frame)]
     findings = [Finding("reset", None, 1, reset)]
-    for name, verdict in (
-        ("joint_jump", detect_joint_jump(before, config.joint_motion)),
-        ("joint_speed", detect_joint_speed(before, fps, config.joint_motion)),
+    for verdict in (
+        detect_joint_jump(before, config.joint_motion),
+        detect_joint_speed(before, fps, config.joint_motion),
     ):
-        bad = bad_frames([Finding(name, None, 1, verdict)], len(before))
-        verdict = replace(verdict, bad_frames=np.pad(bad, (0, len(joints) - len(before))))
-        findings.append(Finding(name, None, 1, verdict))
+        verdict = replace(verdict, bad_frames=np.pad(verdict.bad_frames, (0, len(joints) - len(before))))
+        findings.append(Finding(verdict.reason, None, 1, verdict))
     return findings
 
 
@@ -315,7 +305,6 @@ def detect_base_motion(area: np.ndarray, fps: float, config: BaseMotionConfig) -
         share <= config.max_moving_share,
         {
             "moving_share": share,
-            "median_changed_area": float(np.median(area)),
             "max_changed_area": float(area.max()),
             "threshold_changed_area": config.min_changed_area,
             "threshold_share": config.max_moving_share,

@@ -219,7 +219,6 @@ def detect_corrupted(
             "noise_frames": int(noise.sum()),
             "garbled_frames": int(garbled.sum()),
             "frozen_frames": int(frozen.sum()),
-            "largest_roughness": float(pictures.roughness.max()),
             "threshold_bad_share": config.max_bad_share,
         },
         bad,
